@@ -1,6 +1,6 @@
 """A planned experiment: what is played and how the drive answers, within its limits, and what its log will tell."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,6 +26,8 @@ MAX_SIGNALS = 4
 """Panels of signals [1]: more do not fit a page beside the intervals."""
 INCHES_A_PARAMETER = 0.24
 """Height of a parameter's line [inch]: less and their names touch."""
+TICKS = (1.0, 2.0, 5.0)
+"""Numbers on a logarithmic axis, of each decade: more touch, one alone leaves short axes bare."""
 NEAR_LIMIT = 0.35
 """Share of a panel's range [1] within which a limit is drawn: a farther one would squeeze the signal."""
 
@@ -81,6 +83,9 @@ def _draw_signal(panel: "Axes", design: ExperimentDesign, name: str) -> None:
 
 def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
     """A line a parameter: half its interval before and after, in percent of its value."""
+    from matplotlib import ticker
+
+    ticks: Any = ticker  # its locators have no types
     table = design.table
     size = np.abs(table["value"].to_numpy(dtype=float))
     places = np.arange(len(table))
@@ -95,6 +100,11 @@ def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
         panel.plot(before, places, "o", color=GREY, ms=5, label="95 % now")
     panel.plot(after, places, "o", color=BLUE, ms=5, label="95 % with the planned log")
     panel.set_xscale("log")
+    panel.xaxis.set_major_locator(ticks.LogLocator(subs=TICKS, numticks=8))
+    panel.xaxis.set_minor_locator(ticks.NullLocator())
+    panel.xaxis.set_major_formatter(ticks.FuncFormatter(lambda value, _: f"{value:g}"))
+    for place in places[size == 0]:
+        panel.text(0.01, place, "its value is 0", transform=panel.get_yaxis_transform(), color=GREY, va="center")
     asked = table["target"].to_numpy(dtype=bool)
     names = [f"{n} (asked)" if wanted else str(n) for n, wanted in zip(table.index, asked, strict=True)]
     panel.set_yticks(places, names)
