@@ -1,9 +1,12 @@
-"""`find_date`: when a log was taken, as its time stamps or its name say; a file's own time is that of a copy."""
+"""`find_date`: when a log was taken, as sidecar, time stamps or name say; a file's own time is that of a copy."""
 
 import re
-from datetime import datetime
+import tomllib
+from collections.abc import Mapping
+from datetime import date, datetime, time
 from pathlib import Path
 
+from pneuopt.logs.sidecar_keys import DATE
 from pneuopt.quantities.errors import LogError
 
 _NAMED_DAY = r"(?P<year>20\d\d)(?P<mark>[-_.]?)(?P<month>\d\d)(?P=mark)(?P<day>\d\d)"
@@ -20,13 +23,14 @@ def find_date(path: str | Path) -> datetime:
     Parameters
     ----------
     path : str or Path
-        Its first time stamp with a date counts, ISO 8601; else the date in its name, "run_2026-03-12.csv" or
-        "20260312_1030.csv". When the file was changed is not asked: that is often the time of a copy.
+        The `date` of its sidecar counts, "run_01.toml" of "run_01.tdms"; else its first time stamp with a date, ISO
+        8601, where it is a text; else the date in its name, "run_2026-03-12.csv" or "20260312_1030.csv". When the file
+        was changed is not asked: that is often the time of a copy.
 
     Raises
     ------
     LogError
-        If neither says it.
+        If none of them says it, or the sidecar's is no date.
 
     Examples
     --------
@@ -34,13 +38,35 @@ def find_date(path: str | Path) -> datetime:
     (datetime.datetime(2026, 3, 12, 0, 0), datetime.datetime(2026, 3, 12, 10, 30))
     """
     path = Path(path)
-    found = _stamp(path) or _date_in_name(path.stem)
+    found = _date_in_sidecar(path.with_suffix(".toml")) or _stamp(path) or _date_in_name(path.stem)
     if found is None:
         raise LogError(
             f"{path}: neither its time column nor its name says when it was taken; name it as run_2026-03-12"
-            f"{path.suffix}, or give --dates 2026-03-12,... with a date a log"
+            f'{path.suffix}, write date = "2026-03-12" into {path.stem}.toml, or give --dates 2026-03-12,... with a '
+            "date a log"
         )
     return found
+
+
+def read_date(sections: Mapping[str, object], side: Path) -> datetime | None:
+    """The `date` that a sidecar states, as a text or as TOML's own; None where it states none."""
+    given = sections.get(DATE)
+    if given is None or isinstance(given, datetime):
+        return None if given is None else given.replace(tzinfo=None)
+    if isinstance(given, date):
+        return datetime.combine(given, time())
+    try:
+        return datetime.fromisoformat(str(given)).replace(tzinfo=None)
+    except ValueError:
+        raise LogError(f'{side}: {DATE} must be a date, as {DATE} = "2026-03-12"; got {str(given)[:60]!r}') from None
+
+
+def _date_in_sidecar(side: Path) -> datetime | None:
+    """What a sidecar says; one that cannot be read is refused where the log is read."""
+    try:
+        return read_date(tomllib.loads(side.read_text("utf-8-sig")), side) if side.is_file() else None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError):
+        return None
 
 
 def _stamp(path: Path) -> datetime | None:

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pneuopt.logs.budget import read_bytes
+from pneuopt.logs.dates import read_date
 from pneuopt.logs.experiments import Experiment, experiment_from_table
 from pneuopt.logs.plant_channels import Plant
 from pneuopt.logs.readers import read_table
-from pneuopt.logs.sidecar_keys import ACCEPTED_CHECKS, INTERSAMPLE_KEY, SIDECAR_KEYS
+from pneuopt.logs.sidecar_keys import ACCEPTED_CHECKS, DATE, INTERSAMPLE_KEY, SIDECAR_KEYS
 from pneuopt.logs.table import Table
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.intersample import Intersample
@@ -129,7 +130,10 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
         f'{side}: {ACCEPTED_CHECKS} must list checks, as {ACCEPTED_CHECKS} = ["work"]; got {str(accept)[:60]!r}',
         LogError,
     )
-    for key, section in ((key, section) for key, section in sections.items() if key != ACCEPTED_CHECKS):
+    read_date(sections, side)
+    for key, section in sections.items():
+        if key in (ACCEPTED_CHECKS, DATE):
+            continue
         require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
     return side, sections
 

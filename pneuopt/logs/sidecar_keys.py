@@ -7,6 +7,7 @@ from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.keys import Key, Takes, table
 
 ACCEPTED_CHECKS = "accept"  # the checks that the log need not pass
+DATE = "date"  # when the log was taken
 
 
 def _column_key(channel: str, unit: str) -> Key:
@@ -19,6 +20,7 @@ INTERSAMPLE_KEY = Key(
 )
 SIDECAR_KEYS: Mapping[str, Key] = {
     ACCEPTED_CHECKS: Key("checks that this log need not pass", Takes.LIST, usual=[], example='["work"]'),
+    DATE: Key("when this log was taken, for track; before its stamps and its name", Takes.TEXT, example='"2026-03-12"'),
     "columns": table(
         "which column is which channel; false leaves one out; the header says the others",
         {channel: _column_key(channel, unit) for channel, unit in CHANNELS.items()},
