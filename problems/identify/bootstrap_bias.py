@@ -83,7 +83,7 @@ def figure(found: Found) -> "Figure":
     from pneuopt.plotting import BLUE, GREY, axes_grid, legend_above
 
     names = list(next(iter(found.values())).index)
-    fig, axes = axes_grid(1, len(found), [2.6], width=2.4 * len(found) + 1.5)
+    fig, axes = axes_grid(1, len(found), [2.6], width=max(6.4, 2.4 * len(found) + 1.5))
     for ax, (name, table) in zip(axes[0], found.items(), strict=True):
         at = np.arange(len(names))
         ax.axvline(0, color="0.6", linewidth=0.8)
