@@ -2,9 +2,11 @@
 
 import numpy as np
 import pandas as pd
+from matplotlib.lines import Line2D
 
 from pneuopt.identification.experiment_design import ExperimentDesign
 from pneuopt.plotting import plot_experiment
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
 
 
@@ -18,6 +20,14 @@ def design(before: float) -> ExperimentDesign:
     return ExperimentDesign("position_reference", (run, run), (), table, limits, {}, "", {}, units)
 
 
+def x(line: Line2D) -> Array:
+    return np.asarray(line.get_xdata(), dtype=np.float64)
+
+
+def y(line: Line2D) -> Array:
+    return np.asarray(line.get_ydata(), dtype=np.float64)
+
+
 VALUES = (("friction.coulomb", 40.0), ("load.mass", 1.0))
 
 
@@ -26,9 +36,9 @@ def test_each_limited_signal_has_a_panel_and_each_parameter_a_line() -> None:
     assert [p.get_ylabel() for p in signals] == ["position\nreference [mm]", "position [mm]", "force [N]"]
     assert [t.get_text() for t in intervals.get_yticklabels()] == ["friction.coulomb (asked)", "load.mass"]
     dashed = [line for line in signals[1].lines if line.get_linestyle() == "--"]
-    assert [line.get_ydata()[0] for line in dashed] == [121.0]  # type: ignore[index]  # the other limit is far away
-    assert max(line.get_xdata()[-1] for line in signals[0].lines) > 1.9  # type: ignore[operator,index]  # second run
-    np.testing.assert_allclose(intervals.lines[-1].get_xdata(), [1.96, 1.96], rtol=1e-3)
+    assert [y(line)[0] for line in dashed] == [121.0]  # the other limit is far away
+    assert max(x(line)[-1] for line in signals[0].lines) > 1.9  # the second run
+    np.testing.assert_allclose(x(intervals.lines[-1]), 1.96, rtol=1e-3)
 
 
 def test_without_logs_in_hand_there_is_no_interval_before() -> None:
