@@ -46,7 +46,7 @@ from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.studies.processes import Processes
 from pneuopt.studies.sample_time import (
-    SAMPLE_TIME,
+    SAMPLE_TIME_AXIS,
     evaluate_at_sample_time,
     loop_at_sample_time,
     with_sample_time,
@@ -82,7 +82,7 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     task, parameters = read_fit_and_tuning(study.drive, study.tuning)
     warn_of_status(study.tuning, "tuning")
     (cases, axes), units = _read_cases(study, task, parameters), metric_units(task.loop)
-    if any(SAMPLE_TIME in values for values in cases.values()):
+    if any(SAMPLE_TIME_AXIS in values for values in cases.values()):
         parameters = with_sample_time(task.loop, parameters)
     check_names("metric", study.show, units, f"{file}: [metrics] show")
     with keep_cases(study, outputs, len(cases), computing.resume) as journal, computing.open() as executor:
@@ -130,8 +130,8 @@ def _compute_cases(
         left = [n for n in study.show if n not in LANE_METRICS]
         remedy = "leave it out, or leave out [study] batch"
         require(not left, f"{study.path}: [metrics] show: {', '.join(left)} is not read off responses; {remedy}")
-        alike = SAMPLE_TIME not in parameters
-        require(alike, f"{study.path}: [study] a batch has one sample time: leave out batch, or {SAMPLE_TIME}")
+        alike = SAMPLE_TIME_AXIS not in parameters
+        require(alike, f"{study.path}: [study] a batch has one sample time: leave out batch, or {SAMPLE_TIME_AXIS}")
         with progress("running", quiet=quiet) as report_progress:
             found = evaluate_batch(
                 task.loop,
@@ -153,7 +153,7 @@ def _compute_cases(
 
 def _read_cases(study: Study, task: Tuning, parameters: ParameterSet) -> tuple[Cases, tuple[SweptAxis, ...]]:
     """The cases of a study, and the parameters in which they differ; a sample time can be named, but not spread."""
-    if SAMPLE_TIME in study.axes or ("table" in study.cases and task.loop.pid.sample_time is not None):
+    if SAMPLE_TIME_AXIS in study.axes or ("table" in study.cases and task.loop.pid.sample_time is not None):
         parameters = with_sample_time(task.loop, parameters)
     if study.cases:
         cases = read_study_cases(study, parameters)

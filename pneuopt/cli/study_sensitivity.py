@@ -34,8 +34,7 @@ def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Comp
     warn_of_status(study.tuning, "tuning")
     asked, units = read_sensitivity(study, parameters), metric_units(task.loop)
     check_names("metric", study.show, units, f"{study.path}: [metrics] show")
-    band = study.band or task.specification.band
-    slopes = None
+    band, slopes = study.band or task.specification.band, None
     if asked.local:  # at once, as it refuses metrics without a slope
         slopes = local_sensitivity(task.loop, task.references, parameters, asked.spreads, metrics=study.show, band=band)
     count = asked.count * (len(axis_labels(parameters, asked.spreads)) + 2)
@@ -56,24 +55,29 @@ def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Comp
             progress=report_progress,
             journal=journal,
         )
+    status = _write(study, outputs, found, slopes)
+    if journal is not None and status != EXIT_INTERRUPTED:
+        journal.path.unlink(missing_ok=True)
+    return status
+
+
+def _write(study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSensitivity | None) -> int:
+    """Show and write what was found; returns the exit status."""
     verdict, status = _verdict(found.cases)
     report = lead_report(verdict, status) + found.summary()
-    if slopes is not None:
-        report += slopes.summary()
     writers: Writers = {}
     if outputs.output is not None:
         writers[outputs.output] = partial(write_text, text=format_csv(_join(found, slopes), {}))
-    hashes = file_hashes(study.path, study.drive, study.tuning)
-    tables: dict[str, Any] = {"verdict": verdict, "shares": records(found.table)}
-    tables |= {"figures": records(found.figures)}
-    tables |= {} if slopes is None else {"slopes": records(slopes.table)}
-    tables |= {"cases": records(found.cases), "provenance": hashes}
+    tables: dict[str, Any] = {"verdict": verdict, "shares": records(found.table), "figures": records(found.figures)}
+    if slopes is not None:
+        report += slopes.summary()
+        tables["slopes"] = records(slopes.table)
+    tables["cases"] = records(found.cases)
+    tables["provenance"] = file_hashes(study.path, study.drive, study.tuning)
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
     drawn = partial(plot_sensitivity, found, slopes)
     page = partial(sensitivity_page, study, report, drawn)
     finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    if journal is not None and stopped is None:
-        journal.path.unlink(missing_ok=True)
     return status
 
 

@@ -28,7 +28,7 @@ INCHES_A_PARAMETER = 0.24
 """Height of a parameter's line [inch]: less and their names touch."""
 TICKS = (1.0, 2.0, 5.0)
 """Numbers on a logarithmic axis, of each decade: more touch, one alone leaves short axes bare."""
-NEAR_LIMIT = 0.35
+SHOWN_LIMIT_SHARE = 0.35
 """Share of a panel's range [1] within which a limit is drawn: a farther one would squeeze the signal."""
 
 
@@ -74,7 +74,7 @@ def _draw_signal(panel: "Axes", design: ExperimentDesign, name: str) -> None:
             panel.axvline(begin, color=GREY, lw=0.8)
         begin += float(run.t[-1] + run.t[1])
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
-    room = NEAR_LIMIT * (highest - lowest)
+    room = SHOWN_LIMIT_SHARE * (highest - lowest)
     for end in design.limits.get(name, ()):
         if lowest - room <= factor * end <= highest + room:
             panel.axhline(factor * end, color=RED, ls="--", lw=0.8)

@@ -18,7 +18,7 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet
 if TYPE_CHECKING:
     import pandas as pd
 
-SAMPLE_TIME = "pid.sample_time"
+SAMPLE_TIME_AXIS = "pid.sample_time"
 """Its name in a study, as a tuning.toml has it."""
 
 
@@ -31,17 +31,19 @@ def with_sample_time(loop: ClosedLoop, parameters: ParameterSet) -> ParameterSet
         If the controller is continuous.
     """
     step = loop.pid.sample_time
-    require(step is not None, f"{SAMPLE_TIME}: the controller is continuous; give [pid] a sample_time in the tuning")
+    require(
+        step is not None, f"{SAMPLE_TIME_AXIS}: the controller is continuous; give [pid] a sample_time in the tuning"
+    )
     assert step is not None
-    return parameters | ParameterSet({SAMPLE_TIME: Parameter(step, "s", lower=0.0)})
+    return parameters | ParameterSet({SAMPLE_TIME_AXIS: Parameter(step, "s", lower=0.0)})
 
 
 def loop_at_sample_time(loop: ClosedLoop, parameters: ParameterSet) -> tuple[ClosedLoop, ParameterSet]:
     """The loop with the sample time of a case, and the case's other parameters; without one, both as they are."""
-    if SAMPLE_TIME not in parameters:
+    if SAMPLE_TIME_AXIS not in parameters:
         return loop, parameters
-    sampled = replace(loop, pid=replace(loop.pid, sample_time=parameters.value(SAMPLE_TIME)))
-    return sampled, parameters.select(n for n in parameters if n != SAMPLE_TIME)
+    sampled = replace(loop, pid=replace(loop.pid, sample_time=parameters.value(SAMPLE_TIME_AXIS)))
+    return sampled, parameters.select(n for n in parameters if n != SAMPLE_TIME_AXIS)
 
 
 def evaluate_at_sample_time(
