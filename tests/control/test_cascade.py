@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.compensation import Compensator
 from pneuopt.control.dead_zone_inverse import DeadZoneInverse
 from pneuopt.control.feedforward import Feedforward
@@ -162,12 +163,29 @@ def test_the_rigs_controller_is_the_loops_own() -> None:
     run = Trajectory(t, {"reference": 0.1 + 0.2 * t, "reference_speed": np.full(len(t), 0.2)})
     sensors = dict.fromkeys(("position", "pressure_a", "pressure_b"), Sensor())
     start = loop.initial(p, reference=0.1)
-    log = record(Rig(loop, sensors, encoder=Encoder(COUNT, LAG)), run, p, initial=start).experiment.trajectory
-    sent = simulate(loop, run, p, initial=start)
-    np.testing.assert_allclose(log["valve_voltage"], sent["control"], atol=2e-2)  # the sample's end, and one count
+    rig = Rig(loop, sensors, encoder=Encoder(COUNT, LAG))
+    log = record(rig, run, p, initial=start, rtol=1e-9).experiment.trajectory
+    sent = simulate(loop, run, p, initial=start, rtol=1e-9)
+    np.testing.assert_allclose(log["valve_voltage"], sent["control"], atol=1e-7)
     assert np.ptp(sent["control"]) > 0.3
     with pytest.raises(ModelError, match=r"reads position, which no sensor measures|needs 'position'"):
         Rig(cascade(), {"speed": Sensor()})
+
+
+def test_new_gains_on_a_running_loop_do_not_bump() -> None:
+    loop = cascade(PressureFeedback(), DeadZoneInverse(), sensor=Encoder(COUNT, LAG))
+    old = given_values(loop, {"pressure_feedback.gain": 2e-6, "dead_zone_inverse.width": 0.1})
+    new = old.with_values({"position_loop.Kp": 9.0, "pid.Kp": 3.0, "pid.b": 1.0, "pressure_feedback.gain": 1e-6})
+    x = loop.initial(old, reference=0.1)
+    x[1] += 0.02
+    after = bumpless_transfer(loop, x, old, new, reference=0.102)
+    pending = names(loop.states).index("pid.pending")
+    sent = [
+        float(loop.update(0.0, z, [0.102, 0.0], loop.parameter_vector(p))[pending]) for z, p in ((x, old), (after, new))
+    ]
+    assert sent[1] == pytest.approx(sent[0], abs=1e-9)
+    bumped = float(loop.update(0.0, x, [0.102, 0.0], loop.parameter_vector(new))[pending])
+    assert abs(bumped - sent[0]) > 0.01
 
 
 def test_search_and_certificate_agree() -> None:
