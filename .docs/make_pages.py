@@ -195,8 +195,17 @@ def scripts() -> Iterator[tuple[str, str, str]]:
             yield group, first.strip("`"), second
 
 
+def figures_of(script: Path) -> list[Path]:
+    """What a script has drawn: with `--out out` in this checkout, else as it stands beside the script or in `.docs`."""
+    places = [ROOT / ".docs" / "figures", script.parent, ROOT / "out"]  # a later one replaces an earlier one's figures
+    stems = {own.stem for own in script.parent.glob("*.py")} - {script.stem}
+    found = {f.name: f for place in places for f in sorted(place.glob(f"{script.stem}*.png"))}
+    longer = [stem for stem in stems if stem.startswith(script.stem)]  # b32_partial.png is no figure of b32.py
+    return [f for name, f in found.items() if not any(name.startswith(stem) for stem in longer)]
+
+
 def write_gallery() -> None:
-    """Every claim script with its result and its figures: of the checkout, and those that `--out out` has drawn."""
+    """Every claim script with its result, its figures (`figures_of`) and the command that draws them."""
     lead = section("Results").partition("|")[0].strip()
     parts = ["# Gallery", "", localise(lead, "", "gallery.md"), ""]
     for group, call, result in scripts():
@@ -205,16 +214,16 @@ def write_gallery() -> None:
             continue
         path = ROOT / call.split()[0]
         text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
-        figures = [*path.parent.glob(f"{path.stem}*.png"), *sorted((ROOT / "out").glob(f"{path.stem}*.png"))]
         parts += [
             f"### {path.stem.replace('_', ' ')}",
             "",
             localise(result[:1].upper() + result[1:], "", "gallery.md") + ".",
             "",
         ]
-        for figure in figures:
+        for figure in figures_of(path):
             copy_figure(figure.relative_to(ROOT).as_posix())
             parts += [f"![The figure of {path.stem}](figures/{figure.name})", ""]
+            parts += [f"*Drawn by* `python {call} --out out`", ""]
         parts += [text, ""]
     write("gallery.md", "\n".join(parts))
 

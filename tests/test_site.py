@@ -11,6 +11,8 @@ import pytest
 import pneuopt
 
 ROOT = Path(__file__).parents[1]
+MIN_FIGURES = 6
+MAX_FIGURE_BYTES = 120_000
 
 
 def load(name: str) -> ModuleType:
@@ -55,6 +57,15 @@ def test_a_broken_link_is_named(tmp_path: Path) -> None:
         "b.html: c.html is not there",
     ]
     assert (inside, outside) == (3, 1)
+
+
+def test_the_gallery_of_a_clean_clone_shows_what_scripts_have_drawn(pages: ModuleType) -> None:
+    scripts = [ROOT / call.split()[0] for _, call, _ in pages.scripts() if call]
+    shown = {figure for script in scripts for figure in pages.figures_of(script)}
+    committed = set((ROOT / ".docs" / "figures").glob("*.png"))
+    assert committed <= {ROOT / ".docs" / "figures" / figure.name for figure in shown}, "each is of a script in README"
+    assert len(shown) >= MIN_FIGURES
+    assert all(figure.stat().st_size < MAX_FIGURE_BYTES for figure in committed)
 
 
 @pytest.mark.slow
