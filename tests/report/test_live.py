@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,10 +32,11 @@ from pneuopt.report.live import live_script, to_script
 from pneuopt.report.live_rest import RestFinder
 from pneuopt.report.page import render_page
 from pneuopt.report.tuning_page import LoopView, simulation_page
+from problems.demo.moving_page import t32_loop
+from problems.shared.live_page import compare_settings, live_data, random_settings
 from tests.report.reading import HOSTILE, read_page
 
 NODE = shutil.which("node")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 needs_node = pytest.mark.skipif(NODE is None, reason="node runs the script")
 POINTS = 300
 AGREEMENT = 1e-6  # of each signal's largest value
@@ -99,57 +99,6 @@ def test_responses_are_those_of_simulate(options: dict[str, Any], tmp_path: Path
     assert largest_difference(loop, [p], replace(STEP, at=0.05), tmp_path) < AGREEMENT
 
 
-def live_data(script: str) -> Any:
-    """What the page's script knows of its loop."""
-    return json.loads(script.partition("const DATA = ")[2].partition(";\n")[0])
-
-
-def settings(data: Any, parameters: ParameterSet, count: int) -> list[ParameterSet]:
-    """Random places of all sliders at once, as the page moves them."""
-    rng, found = np.random.default_rng(0), []
-    for _ in range(count):
-        shares = ((s, rng.uniform()) for s in data["sliders"])
-        found.append(parameters.with_values({s["name"]: slider_value(s, share) for s, share in shares}))
-    return found
-
-
-def slider_value(slider: Any, share: float) -> float:
-    low, high = slider["low"], slider["high"]
-    return float(low * (high / low) ** share if slider["isLog"] else low + (high - low) * share)
-
-
-def compare_settings(
-    loop: ClosedLoop, parameters: ParameterSet, references: list[Step], count: int, run: Callable[[str], Any]
-) -> float:
-    """The largest difference between a page at random settings and `simulate` there, from the rest that each finds."""
-    script, worst = live_script(loop, references, parameters), 0.0
-    loop, data = add_disturbances(loop, references), live_data(script)
-    cases = settings(data, parameters, count)
-    for k, reference in enumerate(references):
-        jobs = to_script([loop.parameter_vector(p).tolist() for p in cases])
-        call = f"const r = DATA.references[{k}]; const b = findRest(p, r);"
-        call += f" const f = b && simulateLoop(p, b, r, r.horizon, {POINTS});"
-        call += " return f && [...f.states, ...f.outputs].map((a) => Array.from(a));"
-        found = run(f"{script}\nconst told = {jobs}.map((a) => {{ const p = Float64Array.from(a); {call} }});")
-        for p, signals in zip(cases, found, strict=True):
-            assert signals is not None, reference.label
-            worst = max(worst, difference(loop, reference, p, signals))
-    return worst
-
-
-def difference(loop: ClosedLoop, reference: Step, p: ParameterSet, signals: list[list[float]]) -> float:
-    """Of a page's signals to `simulate`, each as a share of its largest value."""
-    x0 = loop.initial(p, reference=reference.initial, start=reference.start)
-    inputs = loop_inputs(loop, reference, sample_spacing(loop, reference, p))
-    t, worst = np.linspace(0, reference.horizon, POINTS + 1), 0.0
-    run = simulate(loop, inputs, p, initial=x0, t_out=t, max_steps=np.inf)
-    names = [q.name for q in (*loop.states, *loop.outputs)]
-    for name, signal in zip(names, signals, strict=True):
-        size = max(float(np.abs(run[name]).max()), 1e-9)
-        worst = max(worst, float(np.abs(run[name] - np.array(signal)).max()) / size)
-    return worst
-
-
 @needs_node
 @pytest.mark.parametrize("reference", [STEP, replace(STEP, size=0.1, initial=0.1), HELD], ids=lambda r: r.label)
 @pytest.mark.parametrize("pid", [PID(), PID(sample_time=1e-3)], ids=["continuous", "sampled"])
@@ -169,7 +118,7 @@ def test_a_drive_s_rest_moves_with_supply_and_load(tmp_path: Path) -> None:
     script = live_script(loop, starts, p)
     data, disturbed = live_data(script), add_disturbances(loop, starts)
     assert {"supply.pressure", "load.force", "friction.coulomb"} <= {s["name"] for s in data["sliders"]}
-    cases = settings(data, p, 20)
+    cases = random_settings(data, p, 20)
     jobs = to_script([disturbed.parameter_vector(q).tolist() for q in cases])
     call = f"{jobs}.map((p) => DATA.references.map((r) => Array.from(findRest(Float64Array.from(p), r))))"
     found = run_script(f"{script}console.log(JSON.stringify({call}));", tmp_path)
@@ -187,33 +136,6 @@ def test_a_setting_that_no_command_holds_has_no_rest(tmp_path: Path) -> None:
     heavy = to_script(loop.parameter_vector(p.with_values({"load.force": 200.0})).tolist())
     told = f"console.log(JSON.stringify(findRest(Float64Array.from({heavy}), DATA.references[0])));"
     assert run_script(script + told, tmp_path) is None
-
-
-def run_in_chromium(script: str, folder: Path) -> Any:
-    """What the script leaves as ``told``, from a page in a headless browser."""
-    page = folder / "settings.html"
-    text = f'<!DOCTYPE html><meta charset="utf-8"><pre id="told"></pre><section id="live"></section><script>{script}'
-    text += 'document.getElementById("told").textContent = JSON.stringify(told);</script>'
-    page.write_text(text, encoding="utf-8")
-    profile = folder / "profile"
-    options = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --dump-dom"
-    call = [CHROMIUM or "chromium", *options.split(), f"--user-data-dir={profile}", page.as_uri()]
-    done = subprocess.run(call, capture_output=True, text=True, check=False)
-    return json.loads(done.stdout.partition('<pre id="told">')[2].partition("</pre>")[0])
-
-
-def t32_loop() -> tuple[ClosedLoop, ParameterSet]:
-    drive, hardware = t32()
-    loop = ClosedLoop(drive.system(), PID(sample_time=1e-3), Dither(160.0))
-    own = {"pid.Kp": 4.0, "pid.Ki": 20.0, "pid.lower": -5.0, "pid.upper": 5.0, "dither.amplitude": 0.3}
-    return loop, loop.complete(hardware).with_values(own)
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium shows the page")
-@pytest.mark.slow
-def test_fifty_settings_of_every_slider_in_a_browser(tmp_path: Path) -> None:
-    loop, p = t32_loop()
-    assert compare_settings(loop, p, [Step(0.2)], 50, lambda script: run_in_chromium(script, tmp_path)) < AGREEMENT
 
 
 @needs_node
