@@ -209,7 +209,7 @@ def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> 
     require(
         not near,
         f"{table.path}: column {name!r} looks like the channel {near!r}; write it so, "
-        "or list the columns to use in a sidecar",
+        f"or list the columns to use in a sidecar: pneuopt init --from {table.path} writes one",
         LogError,
     )
 

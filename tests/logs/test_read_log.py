@@ -160,7 +160,7 @@ def test_missing_samples_and_any_start_time(tmp_path: Path) -> None:
         ("time [s],presure_a_bar(g)\n" + BODY, "'presure_a_bar(g)' looks like the channel 'pressure_a'"),
         ("time [s],Pressure_c [bar(g)]\n" + BODY, "looks like the channel 'pressure_"),
         ("time [s],velocity [m/s]\n" + BODY, "looks like the channel 'speed'"),
-        ("t [s],position [mm]\n" + BODY, "looks like the channel 'time'"),
+        ("t [s],position [mm]\n" + BODY, "'time'; write it so, or list the columns to use in a sidecar: pneuopt init"),
         (b"PK\x03\x04\0\0", "not a text file"),
         ((HEADER + BODY).encode("utf-16")[2:], "export the log as CSV in UTF-8"),
     ],
