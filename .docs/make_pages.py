@@ -195,6 +195,12 @@ def scripts() -> Iterator[tuple[str, str, str]]:
             yield group, first.strip("`"), second
 
 
+def escape_asterisks(text: str) -> str:
+    """A docstring for Markdown: "rows frame.*" names rows, it begins no emphasis; code keeps its asterisks."""
+    lines = (line if line.startswith("    ") else re.sub(r"(?<=[\w.])\*", r"\\*", line) for line in text.splitlines())
+    return "\n".join(lines)
+
+
 def figures_of(script: Path) -> list[Path]:
     """What a script has drawn: with `--out out` in this checkout, else as it stands beside the script or in `.docs`."""
     places = [ROOT / ".docs" / "figures", script.parent, ROOT / "out"]  # a later one replaces an earlier one's figures
@@ -224,7 +230,7 @@ def write_gallery() -> None:
             copy_figure(figure.relative_to(ROOT).as_posix())
             parts += [f"![The figure of {path.stem}](figures/{figure.name})", ""]
             parts += [f"*Drawn by* `python {call} --out out`", ""]
-        parts += [text, ""]
+        parts += [escape_asterisks(text), ""]
     write("gallery.md", "\n".join(parts))
 
 

@@ -59,6 +59,11 @@ def test_a_broken_link_is_named(tmp_path: Path) -> None:
     assert (inside, outside) == (3, 1)
 
 
+def test_rows_that_a_docstring_names_stay_as_they_are(pages: ModuleType) -> None:
+    text = "Rows frame.*: of a frame.\n\n    a.* b\n\nRows price.*: *all*."
+    assert pages.escape_asterisks(text) == "Rows frame.\\*: of a frame.\n\n    a.* b\n\nRows price.\\*: *all\\*."
+
+
 def test_the_gallery_of_a_clean_clone_shows_what_scripts_have_drawn(pages: ModuleType) -> None:
     scripts = [ROOT / call.split()[0] for _, call, _ in pages.scripts() if call]
     shown = {figure for script in scripts for figure in pages.figures_of(script)}
