@@ -11,7 +11,7 @@ import pytest
 import pneuopt
 
 ROOT = Path(__file__).parents[1]
-MIN_FIGURES = 6
+MIN_FIGURES = 10
 MAX_FIGURE_BYTES = 120_000
 
 
