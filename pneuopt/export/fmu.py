@@ -11,10 +11,10 @@ from pathlib import Path
 
 import casadi as ca
 
-from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
 from pneuopt.export.header import check_name
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import require
+from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # of the files in an FMU: the same model makes the same bytes
@@ -46,9 +46,11 @@ def export_fmu(system: System, parameters: ParameterSet, x: Array | None = None,
     Raises
     ------
     InputError
-        If the name is no identifier, or the state has another shape.
+        If the name is no identifier, or the state has another shape; `ModelError` for a friction that sticks.
     """
     check_name(name)
+    sticks = "a friction that sticks (Karnopp) has no ODE: export the drive with the smooth friction that it wraps"
+    require(FRICTION_DIRECTION not in system.parameters, sticks, ModelError)
     start = system.rest_state(parameters, {}) if x is None else x
     require(len(start) == len(system.states), f"x has {len(start)} entries, the plant {len(system.states)} states")
     builder = _build(system, parameters, start, name)

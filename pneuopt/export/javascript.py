@@ -10,6 +10,7 @@ from importlib import resources
 import casadi as ca
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.system import FRICTION_DIRECTION
 from pneuopt.export.expression_writer import (
     ARITHMETIC,
     COMPARED,
@@ -70,8 +71,10 @@ def write_loop_javascript(loop: ClosedLoop) -> str:
     Raises
     ------
     NotImplementedError
-        If the loop has an operation that JavaScript has no word for.
+        If the loop has an operation that JavaScript has no word for, or a friction that sticks (`Karnopp`).
     """
+    if FRICTION_DIRECTION in loop.parameters:
+        raise NotImplementedError("a friction that sticks is simulated from event to event, which the page does not do")
     sampled = loop.pid.sample_time is not None
     system = loop.hold_system() if sampled else loop.system()
     sizes = len(loop.states), len(loop.inputs), len(loop.parameters)

@@ -21,6 +21,7 @@ from pneuopt.export.targets import Language, export_controller
 from pneuopt.models import catalog
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
+from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -43,6 +44,8 @@ def test_a_bad_name_and_a_bad_state_are_refused() -> None:
     system = ForceDrive(Stribeck()).system()
     with pytest.raises(InputError, match="a block's name"):
         export_fmu(system, system.parameters, name="a b")
+    with pytest.raises(InputError, match="friction that sticks"):
+        export_fmu(ForceDrive(Karnopp(Stribeck())).system(), system.parameters)
     with pytest.raises(InputError, match="x has 3 entries, the plant 2 states"):
         export_fmu(system, system.parameters, np.zeros(3))
 

@@ -26,6 +26,7 @@ from pneuopt.files.tuning import read_tuning
 from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
+from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.report.fit_page import Source
 from pneuopt.report.live import live_script, to_script
@@ -194,6 +195,13 @@ def test_a_load_force_has_a_slider_and_hardware_has_none() -> None:
 def test_a_loop_without_a_start_has_no_script() -> None:
     loop, p = axis_loop()
     assert live_script(loop, [replace(STEP, initial=10.0)], p) == "", "its limit of 150 N holds no such speed"
+
+
+def test_a_friction_that_sticks_has_no_script() -> None:
+    """It is simulated from event to event; its equations alone slide on."""
+    loop = ClosedLoop(ForceDrive(Karnopp(Stribeck())).system(), PID(sample_time=1e-3))
+    p = loop.complete(loop.parameters.with_values({"pid.Kp": 300.0, "pid.Ki": 5000.0}))
+    assert live_script(loop, [STEP], p) == ""
 
 
 def test_what_a_rest_leaves_undetermined_has_no_slider() -> None:
