@@ -1,14 +1,14 @@
 """Metrics of a step response, with python-control's keys, relative to the step's size."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from math import nan
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pneuopt.evaluation.dither_mean import TAIL_SHARE, period_mean, tail
+from pneuopt.evaluation.crossings import Samples, first_crossing_times, pick_samples, settling_times, times_in_bands
+from pneuopt.evaluation.dither_mean import period_mean, tail
 from pneuopt.evaluation.dither_ripple import remove_ripple
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, StepEnvelope
@@ -202,7 +202,7 @@ def batch_metrics(
     centre, width = steady, band * np.abs(steady - initial)
     if band_centre is BandCentre.REFERENCE:
         centre, width = np.full_like(steady, reference_final), np.full_like(steady, band * abs(size))
-    settled, settled_raw = (_settling_times(samples, centre, width) for samples in (smooth, raw))
+    settled, settled_raw = (settling_times(samples, centre, width) for samples in (smooth, raw))
     only_mean = np.isnan(settled_raw) & (settled > raw.t[-1] - MIN_SETTLED_PERIODS * (dither_period or 0.0))
     record = _to_step_record(
         raw,
@@ -222,13 +222,13 @@ def batch_metrics(
         **({} if scale is None else _deviation_metrics(smooth, reference_final, scale)),
         "SteadyStateValue": steady,
         **({"Ripple": np.maximum(ripple, np.ptp(tail(raw.t, raw.y), axis=1))} if _wants(only, "Ripple") else {}),
-        **({"SettlingTimes": _times_in_bands(smooth, centre, width, np.divide(wider, band))} if wider else {}),
+        **({"SettlingTimes": times_in_bands(smooth, centre, width, np.divide(wider, band))} if wider else {}),
         **{name: _largest(name, record) for name in ROW_METRICS if _wants(only, name) and _is_shown(name, record)},
     }
 
 
 def _to_step_record(
-    raw: "_Samples",
+    raw: "Samples",
     error: Array,
     final_error: Array,
     command: Array | None,
@@ -272,21 +272,13 @@ def _largest(name: str, record: StepRecord) -> Array:
     return metric.largest(record)
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """Samples from the step on, a row a response; t is counted from the step."""
-
-    t: Array
-    y: Array
-
-
-def _cut_record(t: Array, y: Array, start: float, band: float) -> _Samples:
+def _cut_record(t: Array, y: Array, start: float, band: float) -> Samples:
     require(bool(np.all(np.diff(t) > 0)), "time must increase strictly")
     require(bool(np.all(np.isfinite(y))), "the response holds NaN or infinite values; a simulation that fails has none")
     require(0 < band < 1, f"band is a fraction between 0 and 1, got {band:g}; 2 % is 0.02")
     first = _first_index_since(t, start)
     require(len(t) - first >= 3, f"fewer than three samples after the step at {start:g} s")
-    return _Samples(t[first:] - start, y[:, first:])
+    return Samples(t[first:] - start, y[:, first:])
 
 
 def _wants(only: Collection[str] | None, *metrics: str) -> bool:
@@ -298,17 +290,17 @@ def _first_index_since(t: Array, start: float) -> int:
 
 
 def _remove_ripple(
-    raw: _Samples, initial: float, period: float | None, averaged: Array | None
-) -> tuple[_Samples, Array, Array]:
+    raw: Samples, initial: float, period: float | None, averaged: Array | None
+) -> tuple[Samples, Array, Array]:
     """The response without its dither's ripple, its final values, and the ripple from peak to peak."""
     if period is None:
         return raw, raw.y[:, -1], np.zeros(len(raw.y))
     means = _period_averages(raw, initial, period) if averaged is None else averaged
     found = remove_ripple(raw.t, raw.y, means, period)
-    return _Samples(raw.t, found.signal), found.final, found.ripple
+    return Samples(raw.t, found.signal), found.final, found.ripple
 
 
-def _period_averages(record: _Samples, initial: float, period: float) -> Array:
+def _period_averages(record: Samples, initial: float, period: float) -> Array:
     last = record.t[-1] - period / 2
     require(
         period > 0 and last > record.t[0] + period,
@@ -318,7 +310,7 @@ def _period_averages(record: _Samples, initial: float, period: float) -> Array:
 
 
 def _rise_metrics(
-    record: _Samples, initial: float, reference: float, steady: Array, only: Collection[str] | None
+    record: Samples, initial: float, reference: float, steady: Array, only: Collection[str] | None
 ) -> dict[str, Array]:
     """Time from 10 to 90 % of the step, and the range after 90 % of the change to the final value; NaN without."""
     if not _wants(only, "RiseTime", "SettlingMin", "SettlingMax"):
@@ -329,7 +321,7 @@ def _rise_metrics(
         share = (record.y - initial) / np.where(reference == initial, nan, reference - initial)
     reached, rises = (z >= 0.9).any(axis=1), (share >= 0.9).any(axis=1)
     after = np.arange(len(record.t)) >= np.argmax(z >= 0.9, axis=1)[:, None]
-    rise = _first_crossing_times(record.t, share, 0.9) - _first_crossing_times(record.t, share, 0.1)
+    rise = first_crossing_times(record.t, share, 0.9) - first_crossing_times(record.t, share, 0.1)
     lowest, highest = np.where(after, record.y, np.inf).min(axis=1), np.where(after, record.y, -np.inf).max(axis=1)
     return {
         "RiseTime": np.where(rises, rise, nan),
@@ -338,48 +330,14 @@ def _rise_metrics(
     }
 
 
-def _first_crossing_times(t: Array, z: Array, level: float) -> Array:
-    """Instants at which each row first reaches the level; meaningless in rows that never do."""
-    k = np.argmax(z >= level, axis=1)
-    before = np.maximum(k - 1, 0)
-    low, high = _pick_samples(z, before), _pick_samples(z, k)
-    with np.errstate(all="ignore"):
-        between = t[before] + (t[k] - t[before]) * (level - low) / (high - low)
-    return np.asarray(np.where(k == 0, t[0], between))
-
-
-def _times_in_bands(record: _Samples, centre: Array, width: Array, factors: Array) -> Array:
-    """Settling times in bands wider by some factors, shape (m, n_factors)."""
-    return np.stack([_settling_times(record, centre, factor * width) for factor in factors], axis=1)
-
-
-def _settling_times(record: _Samples, centre: Array, width: Array) -> Array:
-    """Instant of the last crossing of the band, linear between samples; NaN if it lies in the record's last share."""
-    t, y = record.t, record.y
-    outside = np.abs(y - centre[:, None]) > width[:, None]
-    k = len(t) - 1 - np.argmax(outside[:, ::-1], axis=1)
-    after = np.minimum(k + 1, len(t) - 1)
-    last, following = _pick_samples(y, k), _pick_samples(y, after)
-    edge = centre + width * np.sign(last - centre)
-    with np.errstate(all="ignore"):
-        settled = t[k] + (t[after] - t[k]) * (edge - last) / (following - last)
-    settled = np.where(outside[:, -1] | ~(settled <= (1 - TAIL_SHARE) * t[-1]), nan, settled)
-    return np.where(outside.any(axis=1), settled, 0.0)
-
-
-def _pick_samples(rows: Array, k: NDArray[np.intp]) -> Array:
-    """One sample of each row."""
-    return np.asarray(rows[np.arange(len(rows)), k], dtype=float)
-
-
 def _overshoot_metrics(
-    record: _Samples, steady: Array, reference: float, initial: float, only: Collection[str] | None
+    record: Samples, steady: Array, reference: float, initial: float, only: Collection[str] | None
 ) -> dict[str, Array]:
     if not _wants(only, "OvershootFinal", "Undershoot", "Peak", "PeakTime"):
         return {}
     size, change = reference - initial, steady - initial
     k = np.argmax(record.y * np.sign(size), axis=1)
-    peak = _pick_samples(record.y, k)
+    peak = pick_samples(record.y, k)
     with np.errstate(all="ignore"):
         beyond = np.where(change * size > 0, 100 * np.maximum(0.0, (peak - steady) / change), nan)
     return {
@@ -390,10 +348,10 @@ def _overshoot_metrics(
     }
 
 
-def _deviation_metrics(record: _Samples, reference: float, size: float) -> dict[str, Array]:
+def _deviation_metrics(record: Samples, reference: float, size: float) -> dict[str, Array]:
     """Peak deviation of a response to a disturbance, which takes the place of rise and overshoot."""
     k = np.argmax(np.abs(record.y - reference), axis=1)
-    peak, none = _pick_samples(record.y, k), np.zeros(len(record.y))
+    peak, none = pick_samples(record.y, k), np.zeros(len(record.y))
     beyond = 100 * np.abs(peak - reference) / abs(size)
     found = {"OvershootFinal": beyond, "Peak": peak, "PeakTime": record.t[k]}
     return found | {"RiseTime": none, "Undershoot": none}
