@@ -47,6 +47,7 @@ from .evaluation.limit_cycle import LimitCycle, find_limit_cycle
 from .evaluation.margins import Margins, frequency_response, margins
 from .evaluation.metrics import BandCentre, step_metrics
 from .evaluation.monte_carlo import monte_carlo
+from .evaluation.motion_requirements import Compliance, FollowingError, FollowingErrorRMS, OvershootDistance
 from .evaluation.record import Recording, record
 from .evaluation.requirements import (
     IAE,
@@ -189,6 +190,7 @@ __all__ = [
     "ClosedLoop",
     "Code",
     "CompensatorVerdict",
+    "Compliance",
     "ControlRate",
     "ConvergenceError",
     "Coulomb",
@@ -212,6 +214,8 @@ __all__ = [
     "Feedforward",
     "Finding",
     "FirstOrder",
+    "FollowingError",
+    "FollowingErrorRMS",
     "ForceDrive",
     "Form",
     "FrictionFeedforward",
@@ -251,6 +255,7 @@ __all__ = [
     "NoiseGain",
     "Normal",
     "Overshoot",
+    "OvershootDistance",
     "ParallelForm",
     "Parameter",
     "ParameterSet",

@@ -158,7 +158,7 @@ class Step:
 
     def values(self, t: Array) -> Array:
         """The value before and after the step at any instants, shape (n,) [s]."""
-        return np.where(t >= self.at, self.final, self.initial)
+        return np.where(t >= self.at - 1e-12 * max(1.0, self.at), self.final, self.initial)
 
     def trajectory(self, step: float) -> Trajectory:
         """The column "reference" on the grid 0, step, 2 step, ... to the horizon, held from sample to sample.

@@ -216,13 +216,15 @@ def _describe_unrest(ending: Ending, cycle: LimitCycle | None, until: str) -> tu
 def correct_metrics(ending: Ending, metrics: Mapping[str, float]) -> dict[str, float]:
     """The metrics of the horizon, less what the continuation refutes.
 
-    SettlingTime is NaN where the mean leaves the band again or the loop does not settle, and Overshoot is that of the
-    continuation where it is larger.
+    SettlingTime is NaN where the mean leaves the band again or the loop does not settle, and the overshoot is that of
+    the continuation where it is larger.
     """
     largest = ending.largest_overshoot
     times = [n for n in ("SettlingTime", "SettlingTimeRaw") if n in metrics]
     refuted = dict.fromkeys(times, nan) if ending.refutes(metrics["SettlingTime"]) else {}
-    higher = {"Overshoot": 100 * largest} if largest > metrics["Overshoot"] / 100 + BAND_TOLERANCE * ending.band else {}
+    higher = {"Overshoot": 100 * largest, "OvershootDistance": largest * abs(ending.course.reference.nominal_size)}
+    if largest <= metrics["Overshoot"] / 100 + BAND_TOLERANCE * ending.band:
+        higher = {}
     return {**metrics, **refuted, **higher}
 
 

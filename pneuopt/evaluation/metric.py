@@ -65,6 +65,8 @@ class Metric:
         Whether `TwoPhase` has an equation for it.
     shown : bool
         Whether the screen shows it and a study may ask for it.
+    positions : bool
+        Whether it says something of a loop on a position only, so that the screen shows it of no other.
 
     Raises
     ------
@@ -87,6 +89,7 @@ class Metric:
     channels: tuple[str, ...] = ()
     exact: bool = False
     shown: bool = True
+    positions: bool = False
 
     def __post_init__(self) -> None:
         require(bool(self.name), f"a metric needs a name, the one in {self.unit!r} has none")

@@ -48,6 +48,8 @@ def step_metrics(
     final: float | None = None,
     envelope: Envelope = (),
     scale: float | None = None,
+    target: ArrayLike | None = None,
+    push: float = 0.0,
 ) -> dict[str, float]:
     """Compute the metrics of a step response.
 
@@ -81,6 +83,10 @@ def step_metrics(
         Stands for the step's size where a disturbance begins at `start` and the reference stays [unit]. Overshoot is
         then the largest deviation on either side, Peak the signal there, SettlingTime the time until the signal is back
         in the band, RiseTime and Undershoot 0. In the envelope, 0 lies by `scale` below the reference.
+    target : array_like, shape (n,), optional
+        The reference over time, where it moves; by default it is `reference_final` from `start` on [unit].
+    push : float
+        By how much the load's force steps at `start`, for Compliance [N].
 
     Returns
     -------
@@ -102,6 +108,12 @@ def step_metrics(
             Beyond the reference, in % of the step; beyond the final value, in % of the change (python-control's).
         Undershoot
             Below `initial`, in % of the step.
+        OvershootDistance
+            Beyond the reference, or the largest deviation under a disturbance alone [unit].
+        FollowingError, FollowingErrorRMS
+            Largest and root mean square distance from `target`, from `start` to the record's end [unit].
+        Compliance
+            Largest distance from the reference over the size of `push` [unit/N]; 0 without.
         Peak, PeakTime
             Extreme in the step's direction [unit], and when, from `start` [s].
         SteadyStateValue, SteadyStateError
@@ -151,6 +163,8 @@ def step_metrics(
         final=final,
         envelope=envelope,
         scale=scale,
+        target=None if target is None else np.asarray(target, dtype=float),
+        push=push,
     )
     return {name: float(value[0]) for name, value in found.items()}
 
@@ -174,6 +188,8 @@ def batch_metrics(
     scale: float | None = None,
     meter: Mapping[str, Array] | None = None,
     wider: Sequence[float] = (),
+    target: Array | None = None,
+    push: float = 0.0,
 ) -> dict[str, Array]:
     """Compute the metrics of many step responses on one grid at once; see `step_metrics`.
 
@@ -213,6 +229,9 @@ def batch_metrics(
         sample_time,
         envelope,
         is_step=scale is None,
+        size=size,
+        wanted=None if target is None else (target[_first_index_since(t, start) :] - reference_final) / size,
+        push=push,
     )
     return {
         **_rise_metrics(smooth, initial, reference_final, steady, only),
@@ -237,6 +256,9 @@ def _to_step_record(
     envelope: Envelope,
     *,
     is_step: bool,
+    size: float,
+    wanted: Array | None,
+    push: float,
 ) -> StepRecord:
     """Record of the responses from which the metrics with rows are computed."""
     return StepRecord(
@@ -249,6 +271,9 @@ def _to_step_record(
         sample_time=sample_time,
         envelope=envelope,
         is_step=is_step,
+        size=size,
+        wanted=wanted,
+        push=push,
     )
 
 

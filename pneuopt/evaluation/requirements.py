@@ -22,6 +22,7 @@ from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.energy import EnergyUse
 from pneuopt.evaluation.metric import AtLeast, AtMost, Metric, Sense, Source
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
+from pneuopt.evaluation.motion_requirements import Compliance, FollowingError, FollowingErrorRMS, OvershootDistance
 from pneuopt.evaluation.step_record import (
     StepRecord,
     ValuesAndSlopes,
@@ -248,7 +249,11 @@ REQUIREMENT_KINDS: tuple[type[Requirement], ...] = (
     SettlingTime,
     RiseTime,
     Overshoot,
+    OvershootDistance,
     SteadyStateError,
+    FollowingError,
+    FollowingErrorRMS,
+    Compliance,
     StepEnvelope,
     IAE,
     ISE,

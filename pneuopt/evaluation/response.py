@@ -9,6 +9,7 @@ from pneuopt.control.reference import Reference
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
 from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.metrics import BandCentre, Envelope, step_metrics
+from pneuopt.evaluation.motion_requirements import PUSH
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -52,6 +53,8 @@ def measure(
         sample_time=loop.pid.sample_time,
         envelope=envelope,
         scale=None if reference.changes else reference.nominal_size,
+        target=reference.values(response.t),
+        push=reference.disturbance.get(PUSH, 0.0),
     )
 
 

@@ -52,6 +52,12 @@ class StepRecord:
         Instants after the step [s], each with the lower and upper bound from then on, as fractions of the step.
     is_step : bool
         False where the reference stays and a disturbance moves the signal.
+    size : float
+        What the errors are fractions of, with the sign of the reference's change [measured unit].
+    wanted : ndarray, shape (K,), optional
+        Distance of the reference from its end at the nodes, as a fraction of the size; without it there is none.
+    push : float
+        By how much the load's force steps [N].
     """
 
     t: Array
@@ -64,6 +70,9 @@ class StepRecord:
     sample_time: float | None = None
     envelope: Sequence[tuple[float, float, float]] = ()
     is_step: bool = True
+    size: float = 1.0
+    wanted: Array | None = None
+    push: float = 0.0
 
     @cached_property
     def nodes(self) -> Array:

@@ -16,6 +16,7 @@ from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.dither_mean import DitherPeriodMean
 from pneuopt.evaluation.meter import meter_outputs
 from pneuopt.evaluation.metrics import BandCentre, Envelope, batch_metrics
+from pneuopt.evaluation.motion_requirements import FOLLOWING_METRICS, PUSH
 from pneuopt.evaluation.response import MAX_READINGS_A_SAMPLE
 from pneuopt.quantities.arrays import Array
 
@@ -177,6 +178,9 @@ def read_metrics(
     settings["scale"] = None if reference.changes else reference.nominal_size
     given = (grid.t, signal, reference.final, reference.initial)
     settings["control"], meter = y[:, :, CONTROL_OUTPUT], meter_values(y, channels)
+    if FOLLOWING_METRICS & set(only):
+        settings["target"] = reference.values(grid.t)
+    settings["push"] = reference.disturbance.get(PUSH, 0.0)
     shares = [band_share(band, reference) for band in bands]
     settings["wider"] = shares[1:]
     found = batch_metrics(*given, band=shares[0], envelope=envelope, only=only, meter=meter, **settings)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pneuopt.evaluation.dither_mean import DitherPeriodMean, end_mean
 from pneuopt.evaluation.dither_ripple import RIPPLE_ALLOWANCE, extend_means, ripple_and_slopes, wave_instants
 from pneuopt.evaluation.metrics import Envelope
+from pneuopt.evaluation.motion_requirements import PUSH
 from pneuopt.evaluation.step_record import StepRecord, ValuesAndSlopes
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.readings import CONTROL_OUTPUT, INTEGRAL_OUTPUT, SIGNAL_OUTPUT, ReferenceGrid, meter_values
@@ -87,6 +88,9 @@ class Lanes:
             self.grid.sample_time,
             self.envelope,
             reference.changes,
+            size,
+            (reference.values(self.nodes + reference.at) - reference.final) / size,
+            reference.disturbance.get(PUSH, 0.0),
         )
 
     def _to_gains(self, by_column: Array) -> Array:

@@ -3,7 +3,7 @@
 import re
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -41,6 +41,12 @@ ROWS = {
     "SettlingTime": Row(0.78, '{ band = "2 %", max = "300 ms" }', 0.3),
     "RiseTime": Row(0.8 / 2, '"200 ms"', 0.2),
     "Overshoot": Row(20.0, '"5 %"', 0.05),
+    "OvershootDistance": Row(0.2, '"5 mm/s"', 0.005),
+    "FollowingError": Row(0.6, '"5 mm/s"', 0.005),
+    "FollowingErrorRMS": Row(
+        ((0.6**3 + (0.6**3 - 0.18**3) / 2 + 0.18**3 + 0.01**3) / 6 + 5e-5) ** 0.5, '"5 mm/s"', 0.005
+    ),
+    "Compliance": Row(1.0 / 50, '"5 mm/s/N"', 0.005),
     "SteadyStateError": Row(1.0, '"2 %"', 0.02),
     "StepEnvelope": Row(0.7, '{ bounds = [["0 s", "-50 %", "150 %"]], max = 0.9 }', 0.9),
     "IAE": Row(0.25 + 0.01 + 0.02 + 5e-5 + 0.0119, '"150 ms"', 0.15),
@@ -87,6 +93,8 @@ def response() -> dict[str, float]:
         control=(4 - t)[None],
         envelope=ENVELOPE,
         meter=shown,
+        target=np.interp(t, [0.0, 1.0], [0.0, 1.0]),
+        push=-50.0,
     )
     return {name: value.item() for name, value in found.items()}
 
@@ -116,7 +124,8 @@ def synthetic_record(q: np.ndarray) -> StepRecord:
     meter = dict.fromkeys((c for m in METRICS.values() for c in m.channels), signal)
     last = (values[:, -1:], slopes[:, -1:])
     at_nodes = (values[:, ::4], slopes[:, ::4])
-    return StepRecord(t, at_nodes, last, np.eye(2)[None], signal, meter, stride=4, envelope=ENVELOPE)
+    settings: Any = {"size": -0.2, "wanted": np.cos(t[::4]), "push": 50.0}
+    return StepRecord(t, at_nodes, last, np.eye(2)[None], signal, meter, stride=4, envelope=ENVELOPE, **settings)
 
 
 @KINDS
@@ -181,7 +190,7 @@ horizon = "1 s"
 def test_the_certificate_has_it_and_the_screen_shows_it_with_its_unit(kind: type[Requirement]) -> None:
     name = kind.metric.name
     assert name in certified().index
-    if kind.metric.unit == "{measured}":  # ripple is on the screen with a dither only
+    if kind.metric.unit == "{measured}" or kind.metric.positions:  # on the screen with a dither, or a position, only
         return
     text = report_metrics(certified(), relevant_units(AXIS)).to_text(200)
     line = next(line for line in text.splitlines() if line.split()[:1] == [name])

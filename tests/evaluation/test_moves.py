@@ -55,3 +55,23 @@ def test_a_response_begins_where_its_move_does() -> None:
     before = run.t <= 0.2
     np.testing.assert_allclose(run["position"][before], 0.05, atol=1e-9)
     assert run["position"][-1] == pytest.approx(-0.05, abs=1e-4)
+
+
+def test_a_move_is_measured_in_the_units_of_its_user() -> None:
+    loop, values = position_loop(1e-3)
+    found = evaluate(loop, MOVE, values)[MOVE.label]
+    run = respond(loop, MOVE, values)
+    off = run["position"] - MOVE.values(run.t)
+    assert found["FollowingError"] == pytest.approx(np.abs(off).max())
+    assert found["FollowingErrorRMS"] == pytest.approx(math.sqrt(np.trapezoid(off**2, run.t) / MOVE.horizon), rel=1e-6)
+    assert found["OvershootDistance"] == pytest.approx(found["Overshoot"] / 100 * 0.1)
+    assert found["Compliance"] == 0
+
+
+def test_a_loop_yields_to_a_load_as_its_gain_says() -> None:
+    """At rest a PD controller is a spring of Kp: 50 N move it by 50/4000 m, after an overshoot that hardly counts."""
+    loop, values = position_loop()
+    push = Step(0.0, initial=0.1, scale=0.01, disturbance={"load.force": -50.0})
+    found = evaluate(loop, push, values)[push.label]
+    assert found["Compliance"] == pytest.approx(1 / 4000, rel=0.2)
+    assert found["OvershootDistance"] == pytest.approx(50 * found["Compliance"])

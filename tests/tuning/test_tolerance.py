@@ -8,7 +8,8 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.band import Tolerance, band_share
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import Overshoot, PeakControl, SettlingTime
+from pneuopt.evaluation.motion_requirements import FollowingError, OvershootDistance
+from pneuopt.evaluation.requirements import PeakControl, SettlingTime
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.quantities.errors import InputError
@@ -36,13 +37,14 @@ def test_moves_are_tuned_to_a_tolerance() -> None:
     """The search's time and the certificate's are one, on moves of which a fraction would mean something else each."""
     loop, values = position_loop()
     moves = [Move(d, speed=1.0, acceleration=20.0, jerk=1000.0, dwell=0.3) for d in (0.1, -0.02)]
-    limits = [Overshoot(0.05), PeakControl(400.0)]
+    limits = [OvershootDistance(1e-4), PeakControl(400.0), FollowingError(0.02)]
     best = tune(loop, moves, values, minimise=SettlingTime(Tolerance(1e-4)), subject_to=limits)
     assert best.status.converged
     for move in moves:
         claimed, certified = best.claimed[move.label]["SettlingTime"], best.certified[move.label]["SettlingTime"]
         assert certified == pytest.approx(claimed, abs=2e-3)
         assert certified < move.duration + 0.1
+        assert best.certified[move.label]["OvershootDistance"] <= 1e-4
 
 
 def test_a_tolerance_as_wide_as_the_step_is_refused() -> None:
