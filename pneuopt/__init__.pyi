@@ -48,6 +48,7 @@ from .evaluation.margins import Margins, frequency_response, margins
 from .evaluation.metrics import BandCentre, step_metrics
 from .evaluation.monte_carlo import monte_carlo
 from .evaluation.motion_requirements import Compliance, FollowingError, FollowingErrorRMS, OvershootDistance
+from .evaluation.move_check import check_move, shortest_move
 from .evaluation.record import Recording, record
 from .evaluation.requirements import (
     IAE,
@@ -324,6 +325,7 @@ __all__ = [
     "catalog",
     "certificate",
     "check",
+    "check_move",
     "check_rest",
     "coarse_delay",
     "compare_logs",
@@ -394,6 +396,7 @@ __all__ = [
     "search_again",
     "select_model",
     "sensitivity",
+    "shortest_move",
     "simulate",
     "simulate_stick_slip",
     "split",

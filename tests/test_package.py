@@ -195,6 +195,8 @@ PUBLIC_NAMES = [
     "FollowingError",
     "FollowingErrorRMS",
     "OvershootDistance",
+    "check_move",
+    "shortest_move",
     "Recording",
     "Reference",
     "Report",

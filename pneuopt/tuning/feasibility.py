@@ -16,6 +16,7 @@ from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.counts import describe_counts, sees_speed
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.margins import frequency_response
+from pneuopt.evaluation.move_check import check_motion
 from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
 from pneuopt.evaluation.response import highest_dither_frequency
 from pneuopt.evaluation.specification import Specification
@@ -48,8 +49,8 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
     ------
     InputError
         If a limit lies beyond the horizon, the dither cannot be sampled, the settling band is below half a count of an
-        encoder, the stroke is too short for a reference, no command holds it, or none that the limits allow, or all
-        gains allowed have the wrong sign.
+        encoder, the stroke is too short for a reference or the drive too weak for a move, no command holds it, or none
+        that the limits allow, or all gains allowed have the wrong sign.
     """
     _check_dither(loop, space)
     for case in cases:
@@ -58,6 +59,7 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
     for case in cases:
         _check_counts(loop, case, space, spec)
         check_travel(loop, case, space.parameters)
+        check_motion(loop, case, space.parameters)
         _check_hold(loop, case, space, spec)
     _check_sign(loop, cases[0], space)
 
