@@ -23,6 +23,7 @@ from .control.knocker import Knocker
 from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
 from .control.motion_feedforward import MotionFeedforward
+from .control.move_sequence import MoveSequence
 from .control.moves import Move, MoveProfile
 from .control.pid import PID, AntiWindup
 from .control.position_loop import PositionLoop
@@ -253,6 +254,7 @@ __all__ = [
     "MotionFeedforward",
     "Move",
     "MoveProfile",
+    "MoveSequence",
     "NoiseGain",
     "Normal",
     "Overshoot",

@@ -197,6 +197,7 @@ PUBLIC_NAMES = [
     "OvershootDistance",
     "check_move",
     "shortest_move",
+    "MoveSequence",
     "Recording",
     "Reference",
     "Report",

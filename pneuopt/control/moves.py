@@ -1,6 +1,6 @@
 """`Move`: from rest at one value to rest at another, within limits of speed, acceleration and jerk."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import Enum
 from functools import cached_property
@@ -10,11 +10,13 @@ from typing import Self
 import numpy as np
 
 from pneuopt.control.profiles import PlannedMotion, plan_minimum_jerk, plan_s_curve
-from pneuopt.control.reference import describe_circumstances, disturbance_columns, reference_samples
+from pneuopt.control.reference import Reference, describe_circumstances, disturbance_columns, reference_samples
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
+
+Motion = Callable[[Array], tuple[Array, Array, Array]]
 
 
 class MoveProfile(Enum):
@@ -108,6 +110,11 @@ class Move:
         return self.at + self.duration + self.dwell
 
     @property
+    def origin(self) -> float:
+        """Value at time 0 [unit of the measured signal]."""
+        return self.initial
+
+    @property
     def final(self) -> float:
         """Value after the move [unit of the measured signal]."""
         return self.initial + self.distance
@@ -173,12 +180,27 @@ class Move:
         >>> Move(1.0, speed=1.0, acceleration=1.0, dwell=1.0).trajectory(1.0)["reference"].tolist()
         [0.0, 0.5, 1.0, 1.0]
         """
-        k, first = reference_samples(self, step)
-        names = "reference", REFERENCE_SPEED, REFERENCE_ACCELERATION
-        t: Array = np.asarray(k * step, dtype=np.float64)
-        columns = dict(zip(names, self.motion(t), strict=True))
-        return Trajectory(t, columns | disturbance_columns(self, k >= first))
+        return sample_motion(self, self.motion, step, between=False)
 
     def with_horizon(self, horizon: float) -> Self:
         """The same with another end of the experiment [s]."""
         return replace(self, dwell=horizon - self.at - self.duration)
+
+
+def sample_motion(reference: Reference, motion: Motion, step: float, *, between: bool = True) -> Trajectory:
+    """The reference, its speed and its acceleration held on a grid, and its disturbances; as `Move.trajectory`.
+
+    Parameters
+    ----------
+    reference : Reference
+    motion : callable
+        Of instants [s] the reference, its speed and its acceleration.
+    step : float
+        Spacing of the grid [s].
+    between : bool
+        Whether the reference may begin to change between two samples.
+    """
+    k, first = reference_samples(reference, step, between=between)
+    t: Array = np.asarray(k * step, dtype=np.float64)
+    columns = dict(zip(("reference", REFERENCE_SPEED, REFERENCE_ACCELERATION), motion(t), strict=True))
+    return Trajectory(t, columns | disturbance_columns(reference, k >= first))

@@ -26,8 +26,12 @@ class Reference(Protocol):
         """Instant at which the reference begins to change, or the disturbance comes [s]."""
 
     @property
+    def origin(self) -> float:
+        """Value at time 0, at which the experiment begins [unit of the measured signal]."""
+
+    @property
     def initial(self) -> float:
-        """Value until then [unit of the measured signal]."""
+        """Value just before the instant `at` [unit of the measured signal]."""
 
     @property
     def final(self) -> float:
@@ -128,6 +132,11 @@ class Step:
         require(self.horizon > self.at, f"Step: horizon {self.horizon:g} s must lie after the step at {self.at:g} s")
 
     @property
+    def origin(self) -> float:
+        """Value at time 0 [unit of the measured signal]."""
+        return self.initial
+
+    @property
     def final(self) -> float:
         """Value after the step [unit of the measured signal]."""
         return self.initial + self.size
@@ -199,8 +208,10 @@ def describe_circumstances(reference: Reference) -> list[str]:
     return begun + [f"{n} {v:+g}" for n, v in reference.disturbance.items()]
 
 
-def reference_samples(reference: Reference, step: float) -> tuple[NDArray[np.int_], int]:
-    """Numbers of the samples of a grid with spacing `step` [s], and of the one at which the reference changes.
+def reference_samples(reference: Reference, step: float, *, between: bool = False) -> tuple[NDArray[np.int_], int]:
+    """Numbers of the samples of a grid with spacing `step` [s], and of the first since the reference changes.
+
+    With `between` that instant may lie between two samples.
 
     Raises
     ------
@@ -209,9 +220,9 @@ def reference_samples(reference: Reference, step: float) -> tuple[NDArray[np.int
     """
     kind, at, horizon = type(reference).__name__, reference.at, reference.horizon
     require(0 < step < horizon, f"the grid's spacing {step:g} s must lie between 0 and {horizon:g} s")
-    first = round(at / step)
+    first = int(np.ceil(at / step - 1e-9)) if between else round(at / step)
     require(
-        abs(first * step - at) <= 1e-9 * max(at, step),
+        between or abs(first * step - at) <= 1e-9 * max(at, step),
         f"{kind}: at = {at:g} s falls between two samples of {step:g} s; use {first * step:g} s",
     )
     return np.arange(int(np.ceil(horizon / step - 1e-9)) + 1), first

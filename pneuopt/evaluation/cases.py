@@ -62,7 +62,7 @@ class TuningCase:
         """
         values, step = self.case_parameters(parameters), self.reference
         try:
-            return loop.initial(values, reference=step.initial, start=step.start)
+            return loop.initial(values, reference=step.origin, start=step.start)
         except ConvergenceError as error:
             raise ConvergenceError(f"{self._message_prefix}{error}", error.solution) from None
         except HardwareError as error:

@@ -122,10 +122,10 @@ def _operating_points(
     if loop.feedback.name == axis.position:
         half = (reference.initial + reference.final) / 2
         fast = reference.size / (reference.horizon - reference.at) if speed is None else speed
-        return {axis.position: half, axis.speed: fast}, {axis.position: reference.initial, **reference.start}
+        return {axis.position: half, axis.speed: fast}, {axis.position: reference.origin, **reference.start}
     start = {n: v for n, v in reference.start.items() if n == axis.position}
     fast = (reference.final or reference.initial) if speed is None else speed
-    return {axis.speed: fast, **start}, {axis.speed: reference.initial, **reference.start}
+    return {axis.speed: fast, **start}, {axis.speed: reference.origin, **reference.start}
 
 
 def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:

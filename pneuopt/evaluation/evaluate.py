@@ -193,7 +193,7 @@ def respond(loop: ClosedLoop | Rig, reference: Reference, parameters: ParameterS
 
 def _respond(loop: ClosedLoop, rig: Rig | None, reference: Reference, parameters: ParameterSet) -> Trajectory:
     run = loop_inputs(loop, reference, sample_spacing(loop, reference, parameters))
-    start = loop.initial(parameters, reference=reference.initial, start=reference.start)
+    start = loop.initial(parameters, reference=reference.origin, start=reference.start)
     if rig is not None:
         return record(rig, run, parameters, initial=start).truth
     count = POINTS_PER_READING * readings_a_sample(loop, reference) * (len(run) - 1) + 1

@@ -14,6 +14,7 @@ from math import copysign, inf
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.simulate import simulate
@@ -34,7 +35,7 @@ PUSH_SAMPLES = 300
 LONGEST_PUSH = 60.0  # [s], of what hardly moves: a shorter one refuses creeping drives, a longer one takes long
 PUSH_TOLERANCE = 1e-7  # of the simulation: its figures are shown with three digits
 # Bisections of a speed or a share of the limits. Fewer make the figures coarse; each more costs an equilibrium.
-BISECTION_STEPS = 20
+MOVE_BISECTIONS = 20
 # Largest factor on a move's speeds that is tried for the shortest move: a larger one would end beyond any drive.
 MOST_FACTOR = 64.0
 # Share of what full command can that a message and the shortest move allow: nearer 1 the samples of a run refuse what
@@ -42,14 +43,14 @@ MOST_FACTOR = 64.0
 ALLOWED_SHARE = 0.98
 
 
-def check_move(loop: ClosedLoop, move: Move, parameters: ParameterSet) -> None:
+def check_move(loop: ClosedLoop, move: Move | MoveSequence, parameters: ParameterSet) -> None:
     """Refuse a move that the stroke, the valve or the force cannot make.
 
     Parameters
     ----------
     loop : ClosedLoop
         On the position of an axis; others are not checked, nor is a command without limits.
-    move : Move
+    move : Move or MoveSequence
     parameters : ParameterSet
 
     Raises
@@ -64,9 +65,10 @@ def check_move(loop: ClosedLoop, move: Move, parameters: ParameterSet) -> None:
 
 def check_motion(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> None:
     """Refuse a case whose move the valve or the force cannot make; `check_travel` sees to the stroke."""
-    move = case.reference
-    if isinstance(move, Move):
-        can = _abilities(loop, case, parameters)
+    reference = case.reference
+    moves = reference.chain if isinstance(reference, MoveSequence) else (reference,)
+    for move in (m for m in moves if isinstance(m, Move)):
+        can = _abilities(loop, replace(case, reference=move), parameters)
         obstacle = "" if can is None else can.find_obstacle(move)
         require(not obstacle, f"reference {case.label}: {obstacle}")
 
@@ -100,7 +102,7 @@ def shortest_move(loop: ClosedLoop, move: Move, parameters: ParameterSet) -> Mov
     low, high = 0.0, 1.0
     while high < MOST_FACTOR and not can.find_obstacle(scale_move(move, high)):
         low, high = high, 2 * high
-    for _ in range(BISECTION_STEPS if low < MOST_FACTOR else 0):
+    for _ in range(MOVE_BISECTIONS if low < MOST_FACTOR else 0):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if can.find_obstacle(scale_move(move, middle)) else (middle, high)
     require(low > 0, f"reference {move.label}: {can.find_obstacle(move)}")
@@ -156,7 +158,7 @@ class _Abilities:
         if self._moves_steadily(speed):
             return ""
         low, high = 0.0, speed
-        for _ in range(BISECTION_STEPS):
+        for _ in range(MOVE_BISECTIONS):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self._moves_steadily(middle) else (low, middle)
         most, wanted = (self._write(v, "/s") for v in (low, speed))

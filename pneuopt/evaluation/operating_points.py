@@ -196,8 +196,8 @@ def _find_points(
 
     if not is_affine(loop.plant):
         axis = loop.plant.axis
-        at_rest = set_sliding_direction(loop, parameters, reference.initial)
-        x, command = find_rest(loop, at_rest, reference.initial, reference.start)
+        at_rest = set_sliding_direction(loop, parameters, reference.origin)
+        x, command = find_rest(loop, at_rest, reference.origin, reference.start)
         v = None if axis is None else names(loop.plant.states).index(axis.speed)
         moves = v is not None and abs(x[v]) > RESTING_SPEED * loop.plant.states[v].nominal
         yield OperatingPoint(AT_THE_START if moves else AT_REST, float(t[0]), x, {loop.command.name: command})

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from pneuopt.control.moves import Move, MoveProfile
 from pneuopt.control.reference import Step
-from pneuopt.quantities.keys import Key, choice, table
+from pneuopt.quantities.keys import Key, Takes, choice, table
 
 _PUSH = Key("by how much it changes", unit="{own}", example='"50 N"')
 _KNOWN = Key("its value at time 0", unit="{own}", example='"250 mm"')
@@ -32,6 +32,13 @@ MOVE_KEYS: Mapping[str, Key] = {
         unit="{difference}",
         example='"200 mm"',
         condition="in place of step and horizon",
+    ),
+    "moves": Key(
+        "distances of moves one after the other; metrics are of the last",
+        Takes.LIST,
+        "{difference}",
+        example='["200 mm", "-200 mm"]',
+        condition="in place of move",
     ),
     "speed": Key("its largest speed", unit="{measured}/s", example='"0.5 m/s"', condition="required of a move"),
     "acceleration": Key(

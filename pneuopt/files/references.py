@@ -1,10 +1,11 @@
 """The [[reference]] sections of a tuning.toml: steps, moves and disturbances."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move
 from pneuopt.control.reference import Reference, Step
 from pneuopt.files.reference_keys import MOVE_KEYS, REFERENCE_KEYS, STEP_KEYS
@@ -12,6 +13,8 @@ from pneuopt.files.toml import construct_at, read_fixed_value
 from pneuopt.files.tuning_keys import signal_units
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.keys import Key, Takes
+from pneuopt.quantities.unit_algebra import difference_unit
+from pneuopt.quantities.units import read_value
 
 
 def read_references(entries: Any, loop: ClosedLoop, path: str | Path) -> tuple[Reference, ...]:
@@ -34,9 +37,10 @@ def read_references(entries: Any, loop: ClosedLoop, path: str | Path) -> tuple[R
 def _reference(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Reference:
     """Read one [[reference]]."""
     check_names("key", entry, REFERENCE_KEYS, where)
-    moves = "move" in entry
+    moves = "move" in entry or "moves" in entry
     keys, kind, end = (MOVE_KEYS, "move", "dwell") if moves else (STEP_KEYS, "step", "horizon")
-    require(not (moves and "step" in entry), f"{where} has a step and a move; write a section [[reference]] for each")
+    one = sum(key in entry for key in ("step", "move", "moves")) <= 1
+    require(one, f"{where} has more than one of step, move and moves; write a section [[reference]] for each")
     for key in entry:
         message = f"{where} {key} does not belong to a {kind}, which ends by {end}; a {kind} has {', '.join(keys)}"
         require(key in keys, message)
@@ -46,8 +50,28 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Refere
     known = _numbers(entry, keys, loop, where) | _circumstances(entry, loop, where)
     if moves:
         known |= _profile(entry, where)
-        return construct_at(lambda: Move(known.pop("move"), **known), where)
+        distances = _distances(entry, loop, where) if "moves" in entry else [known.pop("move")]
+        return construct_at(lambda: _chain_moves(distances, known), where)
     return construct_at(lambda: Step(known.pop("step", 0.0), **known), where)
+
+
+def _distances(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> list[float]:
+    """Read the distances of several moves."""
+    given, unit = entry["moves"], difference_unit(loop.feedback.unit)
+    require(isinstance(given, list) and len(given) > 0, f'{where} moves must be a list, ["200 mm", "-200 mm"]')
+    return [read_value(distance, unit, where=f"{where} moves") for distance in given]
+
+
+def _chain_moves(distances: Sequence[float], settings: Mapping[str, Any]) -> Reference:
+    """One move, or a sequence of moves that share limits and dwell."""
+    first, *others = distances
+    if not others:
+        return Move(first, **settings)
+    begins = {n: settings[n] for n in ("at", "initial", "start") if n in settings}
+    shared = {n: value for n, value in settings.items() if n not in begins and n != "disturbance"}
+    last = {"disturbance": settings.get("disturbance", {})}
+    moves = [Move(distance, **shared, **(last if k == len(others) else {})) for k, distance in enumerate(others, 1)]
+    return MoveSequence([Move(first, **begins, **shared), *moves])
 
 
 def _profile(entry: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -141,7 +141,7 @@ class PointFinder:
         order, quiet = list(self.loop.parameters), p.copy()
         quiet[:, [order.index(n) for n in (DITHER_AMPLITUDE, DITHER_OFFSET) if n in order]] = 0.0
         u = np.zeros((len(p), 1, grid.u.shape[1]))
-        u[:, 0, 0] = grid.reference.initial
+        u[:, 0, 0] = grid.reference.origin
         none = np.zeros((len(p), 1))
         control = self.rollout.run(own.states[:, 0], u, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
         return np.column_stack([own.states[:, 0, : len(self.loop.plant.states)], control])

@@ -13,7 +13,7 @@ from pneuopt.tuning.space import Space
 def starts_before_step(cases: Sequence[TuningCase], loop: ClosedLoop, space: Space) -> list[Array | None]:
     """Of each case the state before the step; references that begin alike share it, as a rest takes milliseconds."""
     found = dict[tuple[Hashable, ...], Array | None]()
-    keys = [(case.scenario, case.reference.initial, *sorted(case.reference.start.items())) for case in cases]
+    keys = [(case.scenario, case.reference.origin, *sorted(case.reference.start.items())) for case in cases]
     for key, case in zip(keys, cases, strict=True):
         if key not in found:
             found[key] = _gain_independent_rest(case, loop, space)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
 from pneuopt.evaluation.move_check import check_move, scale_move, shortest_move
@@ -50,6 +51,9 @@ def test_a_move_that_cannot_be_made_is_refused_with_what_can(move: Move, words: 
     feasible = Move(0.1, speed=0.5, acceleration=5.0, jerk=200.0, initial=0.05)
     check_move(loop, feasible, values)
     check_move(loop, replace(feasible, distance=-0.1, initial=0.2), values)
+    back = replace(move, initial=0.0)
+    with pytest.raises(InputError):
+        check_move(loop, MoveSequence([feasible, back]), values)
 
 
 def test_force_less_friction_bounds_the_acceleration() -> None:

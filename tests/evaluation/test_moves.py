@@ -1,11 +1,13 @@
 """What a loop makes of moves."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
@@ -66,6 +68,20 @@ def test_a_move_is_measured_in_the_units_of_its_user() -> None:
     assert found["FollowingErrorRMS"] == pytest.approx(math.sqrt(np.trapezoid(off**2, run.t) / MOVE.horizon), rel=1e-6)
     assert found["OvershootDistance"] == pytest.approx(found["Overshoot"] / 100 * 0.1)
     assert found["Compliance"] == 0
+
+
+def test_a_sequence_is_measured_from_its_last_move_on() -> None:
+    loop, values = position_loop(1e-3)
+    both = MoveSequence([replace(MOVE, initial=0.05, dwell=0.4), replace(MOVE, distance=-0.1)])
+    alone = Move(-0.1, speed=0.5, acceleration=5.0, jerk=100.0, initial=0.15, dwell=0.6)
+    found = evaluate(loop, [both, alone], values)
+    assert both.at == pytest.approx(MOVE.duration + 0.4)
+    for n in ("SettlingTime", "FollowingError", "SteadyStateValue", "PeakControl", "RiseTime"):
+        assert found[both.label][n] == pytest.approx(found[alone.label][n], rel=0.02), n
+    run = respond(loop, both, values)
+    assert run["position"][0] == pytest.approx(0.05)
+    assert run["position"].max() == pytest.approx(0.15, abs=2e-3)
+    assert certificate(loop, both, values).findings == ()
 
 
 def test_a_loop_yields_to_a_load_as_its_gain_says() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move, MoveProfile
 from pneuopt.evaluation.band import Tolerance
 from pneuopt.files.tuning import read_tuning
@@ -44,6 +45,14 @@ def test_a_band_may_be_in_the_measured_unit(tmp_path: Path, text: str, band: flo
     assert read_tuning(written(tmp_path, given), ForceDrive(Coulomb()).system()).specification.band == band
 
 
+def test_a_reference_may_be_several_moves(tmp_path: Path) -> None:
+    drive = ForceDrive(Coulomb()).system()
+    several = MOVE.replace('move = "-200 mm"', 'moves = ["200 mm", "-100 mm"]')
+    first = Move(0.2, speed=0.5, acceleration=5.0, jerk=100.0, at=0.1, initial=0.05, dwell=2.0)
+    second = replace(first, distance=-0.1, at=0.0, initial=0.0, disturbance={"load.force": 20.0})
+    assert read_tuning(written(tmp_path, several), drive).references == (MoveSequence([first, second]),)
+
+
 def test_a_reference_may_be_a_move(tmp_path: Path) -> None:
     drive = ForceDrive(Coulomb()).system()
     push = {"load.force": 20.0}
@@ -59,7 +68,9 @@ def test_a_reference_may_be_a_move(tmp_path: Path) -> None:
     [
         ('dwell = "2 s"', 'horizon = "2 s"', "horizon does not belong to a move, which ends by dwell"),
         ('move = "-200 mm"', 'step = "-200 mm"', "speed does not belong to a step, which ends by horizon"),
-        ('move = "-200 mm"', 'step = "1 mm"\nmove = "1 mm"', "has a step and a move"),
+        ('move = "-200 mm"', 'step = "1 mm"\nmove = "1 mm"', "has more than one of step, move and moves"),
+        ('move = "-200 mm"', 'moves = "-200 mm"', "moves must be a list"),
+        ('move = "-200 mm"', 'moves = ["-200 mm", "0 mm"]', "Move: distance must not be zero"),
         ('speed = "0.5 m/s"', "", "[[reference]] 1 has no speed"),
         ('jerk = "100 m/s^3"', 'profile = "ramp"', "unknown profile 'ramp'"),
         (
