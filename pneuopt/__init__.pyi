@@ -23,6 +23,7 @@ from .control.knocker import Knocker
 from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
 from .control.motion_feedforward import MotionFeedforward
+from .control.motion_path import MotionPath
 from .control.move_sequence import MoveSequence
 from .control.moves import Move, MoveProfile
 from .control.pid import PID, AntiWindup
@@ -79,6 +80,7 @@ from .export.fmu import export_fmu
 from .export.targets import Language, export_controller
 from .export.vendor_blocks import Block
 from .files.drive import read_drive, write_fit
+from .files.path import read_path
 from .files.results import load_result
 from .files.tuning import read_tuning, write_tuned
 from .identification.assumptions import Assumption
@@ -252,6 +254,7 @@ __all__ = [
     "ModelSelection",
     "MotionDrive",
     "MotionFeedforward",
+    "MotionPath",
     "Move",
     "MoveProfile",
     "MoveSequence",
@@ -388,6 +391,7 @@ __all__ = [
     "read_cases",
     "read_drive",
     "read_log",
+    "read_path",
     "read_tuning",
     "record",
     "resample",

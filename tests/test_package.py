@@ -198,6 +198,8 @@ PUBLIC_NAMES = [
     "check_move",
     "shortest_move",
     "MoveSequence",
+    "MotionPath",
+    "read_path",
     "Recording",
     "Reference",
     "Report",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.motion_path import MotionPath
 from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
@@ -91,3 +92,14 @@ def test_a_loop_yields_to_a_load_as_its_gain_says() -> None:
     found = evaluate(loop, push, values)[push.label]
     assert found["Compliance"] == pytest.approx(1 / 4000, rel=0.2)
     assert found["OvershootDistance"] == pytest.approx(50 * found["Compliance"])
+
+
+def test_a_path_that_returns_is_followed() -> None:
+    loop, values = position_loop(1e-3)
+    t = np.linspace(0, 2, 41)
+    path = MotionPath(t, 0.1 + 0.05 * (1 - np.cos(np.pi * t)), dwell=0.5)
+    found = evaluate(loop, path, values)["path"]
+    run = respond(loop, path, values)
+    assert found["FollowingError"] == pytest.approx(np.abs(run["position"] - path.values(run.t)).max())
+    assert found["FollowingError"] < 0.02
+    assert found["SteadyStateValue"] == pytest.approx(0.1, abs=1e-4)
