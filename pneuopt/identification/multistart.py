@@ -134,7 +134,8 @@ def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
     if parts is None:
         return
     rough, stages = problem.candidates()[0], problem.method.stages
-    method = replace(problem.method, stages=(stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)))
+    few = stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)
+    method = replace(problem.method, stages=few, max_misfit=HOPELESS_MISFIT, allows_state_noise=False)
     short = solve_least_squares(problem.transcription(rough), method)
     yield problem, short, rough.label
     is_near = short.jumps is None and 2 * short.stats["cost"] <= MAX_CHI_SQUARE_RATIO * short.count

@@ -105,6 +105,24 @@ def test_a_short_search_that_is_cut_near_the_noise_goes_on(monkeypatch: pytest.M
     assert not label.endswith("of a part")
 
 
+def test_a_short_search_ends_where_it_leads_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is for easy logs: neither a hopeless start nor noise of the states is followed there, which took a minute."""
+    methods: list[LeastSquares] = []
+
+    def spied(transcription: Transcription, method: LeastSquares) -> Fit:
+        methods.append(method)
+        return solve_least_squares(transcription, method)
+
+    monkeypatch.setattr(multistart, "solve_least_squares", spied)
+    problem, _ = posed()
+    (log,) = problem.experiments
+    precise = replace(problem, experiments=(replace(log, noise={n: v / 30 for n, v in log.noise.items()}),))
+    _, short, _ = next(multistart._tries_of_long_logs(precise))
+    assert not short.status.converged
+    assert short.stats["iterations"] <= problem.method.stages[0].iterations
+    assert [method.allows_state_noise for method in methods] == [False]
+
+
 def test_ctrl_c_in_the_short_search_ends_all() -> None:
     def interrupt(_: str) -> None:
         raise KeyboardInterrupt
