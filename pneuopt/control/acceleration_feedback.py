@@ -20,7 +20,7 @@ MIN_FILTER_TIME = 1e-4  # [s]; below, the loop is too stiff to integrate, and a 
 
 @dataclass(frozen=True)
 class AccelerationFeedback:
-    """``u_a = -gain a``, a the measured signal's filtered derivative: of a speed the first, of a position the second.
+    """Feedback ``u_a = -gain a`` of the signal's filtered derivative a: of a speed the first, of a position the second.
 
     Each derivative is ``(s - f)/filter`` with ``df/dt = (s - f)/filter``; with a sampled PID, h its sample time,
     ``f = (filter f_ + h s)/(filter + h)``, the suffix _ the sample before (backward Euler). It damps a piston on its

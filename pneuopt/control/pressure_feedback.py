@@ -21,7 +21,7 @@ PRESSURE_NOMINAL = 1e5  # [Pa] a usual differential pressure, which scales the s
 
 @dataclass(frozen=True)
 class PressureFeedback:
-    """``u_p = -gain (d - slow)`` with ``d = p_a - p_b`` and ``d(slow)/dt = (d - slow)/time``: high-passed feedback.
+    """High-passed feedback of ``d = p_a - p_b``: ``u_p = -gain (d - slow)`` with ``d(slow)/dt = (d - slow)/time``.
 
     The differential pressure is the piston's acceleration but for friction and load, and comes without differentiating
     an encoder: the usual third state of a servo-pneumatic axis beside position and speed. The high-pass takes away what

@@ -16,6 +16,11 @@ from pneuopt.quantities.parameters import ParameterSet, Quantity
 
 SAMPLE_TIME = 1e-3
 """Of a first controller, and of usual values that count in samples [s]: a common one; longer ones slow a loop down."""
+_CONDITIONS = {"Tt": "with limits, for back-calculation", "reset_band": "with reset_ratio"}
+_SECTION_CONDITIONS = {
+    "position_loop": "where a position is controlled",
+    "pressure_feedback": "where the plant shows both pressures",
+}
 _LIMITS = ("lower", "upper")  # parameters that a file states as a pair, limits
 
 
@@ -39,6 +44,8 @@ def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping
         "feedforward": _parameter_keys(Feedforward().parameters(measured, command), "gain"),
         **{name: _parameter_keys(part().parameters(signal, command), part.size) for name, part in COMPENSATORS.items()},
     }
+    for section, condition in _SECTION_CONDITIONS.items():
+        parts[section] = {n: replace(key, condition=condition) for n, key in parts[section].items()}
     return {n: replace(key, keys={**key.keys, **parts.get(n, {})}) for n, key in TUNING_KEYS.items()}
 
 
@@ -50,7 +57,7 @@ def _pid_keys(command: str, measured: str) -> dict[str, Key]:
         for name in (n for n in pid if n not in _LIMITS and n not in found):
             forms = [f'"{f.value}"' for f in Form if name in f.gains]
             own = f"form = {' or '.join(forms)}" if 0 < len(forms) < len(Form) else ""
-            found[name] = parameter_key(pid[name], own or ("with limits, for back-calculation" if name == "Tt" else ""))
+            found[name] = parameter_key(pid[name], own or _CONDITIONS.get(name, ""))
     return found
 
 
