@@ -7,9 +7,10 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.keys import flag
-from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 GRAVITY = 9.80665  # standard acceleration of gravity, 3rd CGPM, 1901 [m/s^2]
+LOAD_FORCE = Quantity("load_force", "N", nominal=100.0)
 LOAD_KEYS = {
     "spring": flag("whether a spring acts on the load"),
     "inclined": flag("whether positive motion goes up an incline"),
@@ -54,8 +55,16 @@ class Load:
         }
         return ParameterSet({**always, **(spring if self.spring else {}), **(incline if self.inclined else {})})
 
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """With a spring "load_force" [N], with which the piston presses on it: what a load cell there reads."""
+        return (LOAD_FORCE,) if self.spring else ()
+
+    def spring_force(self, position: ca.SX, p: Symbols) -> ca.SX:
+        """Force [N] on the spring at a position [m]; 0 without one."""
+        return p["stiffness"] * (position - p["rest_position"]) if self.spring else ca.SX(0)
+
     def acceleration(self, driving: ca.SX, position: ca.SX, p: Symbols) -> ca.SX:
         """Acceleration [m/s^2] at a position [m] under a driving force less friction [N]."""
-        pull = p["stiffness"] * (position - p["rest_position"]) if self.spring else 0
         weight = GRAVITY * ca.sin(p["inclination"]) if self.inclined else 0
-        return (driving - p["force"] - pull) / p["mass"] - weight
+        return (driving - p["force"] - self.spring_force(position, p)) / p["mass"] - weight

@@ -14,7 +14,7 @@ from pneuopt.dynamics.system import Symbols, System, define, names, parameter_ve
 from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
 from pneuopt.models.friction import FrictionModel, Stribeck, law_inputs
 from pneuopt.models.linear import VALVE_VOLTAGE
-from pneuopt.models.load import Load
+from pneuopt.models.load import LOAD_FORCE, Load
 from pneuopt.models.needs import LOAD_EXCITATION
 from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak, volumes
@@ -54,7 +54,8 @@ class PneumaticDrive:
 
     States: position [m] from the end where chamber a is smallest, speed, pressure_a and pressure_b (absolute), with
     `Thermal` chambers temperature_a and temperature_b, then the valve's and the friction's. Input: valve_voltage [V],
-    which drives forwards above valve.centre (0 V by default). Outputs: position, speed, pressure_a, pressure_b.
+    which drives forwards above valve.centre (0 V by default). Outputs: position, speed, pressure_a, pressure_b, and
+    with a spring on the load load_force, with which the piston presses on it.
 
     Parameters
     ----------
@@ -194,7 +195,7 @@ class PneumaticDrive:
 
     @cached_property
     def _system(self) -> System:
-        outputs = (POSITION, SPEED, *PRESSURE_SIGNALS)
+        outputs = (POSITION, SPEED, *PRESSURE_SIGNALS, *self.load.outputs)
         starts = PneumaticStarts(self.system, self.friction, _air_force)
         system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._find_rest)
         warnings = partial(
@@ -221,7 +222,8 @@ class PneumaticDrive:
         rates = {"position": v, "speed": acceleration, **self._chamber_rates(x, u, p)}
         rates |= {f"valve.{n}": rate for n, rate in spool.items()}
         rates |= {f"friction.{n}": rate for n, rate in friction.rates.items()}
-        return rates, {q.name: x[q.name] for q in (POSITION, SPEED, *PRESSURE_SIGNALS)}
+        pressed = {q.name: self.load.spring_force(y, without_prefix(p, "load")) for q in self.load.outputs}
+        return rates, {q.name: x[q.name] for q in (POSITION, SPEED, *PRESSURE_SIGNALS)} | pressed
 
     def _chamber_rates(self, x: Symbols, u: Symbols, p: Symbols) -> dict[str, ca.SX]:
         """Rates of the chambers' states."""
@@ -297,11 +299,22 @@ class PneumaticDrive:
         return ca.Function("glide", [*given.values(), stack(p)], [ca.densify(v) for v in found])
 
     def _find_rest(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
-        others = ", ".join(sorted(outputs.keys() - {"position", "speed", "pressure_b"}))
-        require(
-            not others, f"a cylinder starts from position, speed and pressure_b, not from {others}; leave {others} out"
-        )
-        return self.rest(parameters, **outputs)
+        known = ("position", "speed", "pressure_b", *names(self.load.outputs))
+        others = ", ".join(sorted(outputs.keys() - set(known)))
+        told = f"a cylinder starts from {', '.join(known[:-1])} and {known[-1]}, not from {others}; leave {others} out"
+        require(not others, told)
+        start = dict(outputs)
+        if LOAD_FORCE.name in start:
+            start["position"] = self._pressed_position(parameters, start.pop(LOAD_FORCE.name), "position" in start)
+        return self.rest(parameters, **start)
+
+    def _pressed_position(self, parameters: ParameterSet, force: float, stated: bool) -> float:
+        """Position at which the spring on the load is pressed with a force [N]."""
+        require(not stated, "a spring's force says where the piston is; start from load_force or position, not both")
+        used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
+        stiffness = used.value("load.stiffness")
+        require(stiffness > 0, f"load.stiffness is {stiffness:g} N/m: without a spring there is no force to control")
+        return used.value("load.rest_position") + force / stiffness
 
 
 # factor of a search over the rounding of the valve's edges [1]: a smaller one takes more trials, a larger one leaves

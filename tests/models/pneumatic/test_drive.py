@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names, parameter_vector
@@ -20,7 +21,7 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import InputError, PhysicsWarning
+from pneuopt.quantities.errors import InputError, PhysicsWarning, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -331,3 +332,30 @@ def test_a_position_that_no_stroke_holds_is_doubted() -> None:
         (told,) = drive.system().log_warnings({"run": Log(log.with_columns({"position": column}), drive.parameters)})
         assert told.startswith("run: position runs from ")
         assert told.endswith("outside the stroke, 0 to 200 mm: check its sign, unit and zero, and cylinder.stroke")
+
+
+def test_a_spring_on_the_load_shows_the_force_on_it() -> None:
+    """A force loop rests where the spring has the wanted force, with the air in balance with it."""
+    drive = PneumaticDrive(load=Load(spring=True))
+    system = drive.system()
+    p = drive.parameters.with_values({"load.stiffness": 1e5, "load.rest_position": 0.1})
+    assert [q.unit for q in system.outputs if q.name == "load_force"] == ["N"]
+    loop = ClosedLoop(system, PID(1e-3), measured="load_force")
+    values = (loop.parameters | p).with_values({"pid.Kp": 1e-3})
+    x = dict(zip((q.name for q in loop.states), loop.initial(values, reference=150.0), strict=True))
+    assert x["position"] == pytest.approx(0.1 + 150.0 / 1e5, rel=1e-12)
+    air = Trajectory([0.0, 1.0], {n: [x[n]] * 2 for n in ("pressure_a", "pressure_b")})
+    assert drive.air_force(air, p)[0] == pytest.approx(150.0, rel=1e-5)
+    run = simulate(loop, Step(20.0, initial=150.0, horizon=0.2).trajectory(1e-3), values, initial=list(x.values()))
+    assert run["load_force"] == pytest.approx(1e5 * (run["position"] - 0.1), rel=1e-12)
+
+
+def test_a_force_loop_needs_a_spring() -> None:
+    plain, pressed = (PneumaticDrive(load=Load(spring=k)) for k in (False, True))
+    with pytest.raises(UnknownNameError, match="load_force"):
+        ClosedLoop(plain.system(), PID(), measured="load_force")
+    with pytest.raises(InputError, match=r"load\.stiffness is 0 N/m: without a spring there is no force to control"):
+        pressed.system().rest_hook(pressed.parameters, {"load_force": 100.0})
+    held = pressed.parameters.with_values({"load.stiffness": 1e5})
+    with pytest.raises(InputError, match="start from load_force or position, not both"):
+        pressed.system().rest_hook(held, {"load_force": 100.0, "position": 0.1})
