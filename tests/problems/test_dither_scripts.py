@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pneuopt.quantities.trajectories import Trajectory
 from problems.dither import averaged_dither, dither_map, margins_under_dither
-from problems.friction import hunting, stiction_windup
+from problems.friction import force_loop, hunting, stiction_windup
 
 
 def test_friction_makes_the_papers_gains_overshoot_by_40_percent() -> None:
@@ -79,3 +80,24 @@ def test_hunting(tmp_path: Path) -> None:
     rows = hunting.main(hunting.Job(ends, [gains])).set_index("name")["value"]
     assert (rows["static.hunting"], rows["coulomb.hunting"], rows["coulomb.resting"]) == (1, 0, 1)
     hunting.figure(hunting.Job(ends, [gains])).savefig(tmp_path / "hunting.png")
+
+
+def test_force_loop(tmp_path: Path) -> None:
+    """Gains by hand: the dither makes the force finer, the integral does not."""
+    plain = {"pid.Kp": 5e-3, "dead_zone_inverse.smoothing": 2e-3}
+    gains = {"proportional": plain, "dither": plain | {"dither.amplitude": 0.5, "dither.frequency": 100.0}}
+    gains |= {"feedforward": plain | {"feedforward.gain": 0.05, "feedforward.time": 0.01}}
+    gains |= {"integral": plain | {"pid.Ki": force_loop.INTEGRAL}}
+    job = force_loop.Job(gains, {n: force_loop.follow(g) for n, g in gains.items()})
+    rows = force_loop.main(job).set_index("name")["value"]
+    assert rows["dither.resolution"] < 0.6 * rows["proportional.resolution"] < 0.6 * rows["integral.resolution"]
+    force_loop.figure(job).savefig(tmp_path / "force.png")
+
+
+def test_a_force_that_settles_has_a_time() -> None:
+    """5 N above each level for 0.1 s, then at it."""
+    n, count = force_loop.samples(force_loop.DWELL), len(force_loop.LEVELS)
+    force = np.repeat(force_loop.LEVELS, n) + np.tile(np.where(np.arange(n) < 100, 5.0, 0.0), count)
+    run = Trajectory(1e-3 * np.arange(n * count + 1), {"load_force": np.append(force, 0.0)})
+    assert force_loop.settling(run) == pytest.approx(0.1)
+    assert force_loop.resolution(run) == 0

@@ -355,7 +355,7 @@ def test_a_force_loop_needs_a_spring() -> None:
     with pytest.raises(UnknownNameError, match="load_force"):
         ClosedLoop(plain.system(), PID(), measured="load_force")
     with pytest.raises(InputError, match=r"load\.stiffness is 0 N/m: without a spring there is no force to control"):
-        pressed.system().rest_hook(pressed.parameters, {"load_force": 100.0})
+        pressed.system().rest_state(pressed.parameters, {"load_force": 100.0})
     held = pressed.parameters.with_values({"load.stiffness": 1e5})
     with pytest.raises(InputError, match="start from load_force or position, not both"):
-        pressed.system().rest_hook(held, {"load_force": 100.0, "position": 0.1})
+        pressed.system().rest_state(held, {"load_force": 100.0, "position": 0.1})
