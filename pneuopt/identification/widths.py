@@ -47,7 +47,7 @@ MAX_TRIAL_SAMPLES = 8000  # of all logs: more take time and tell no more, fewer 
 EXCERPTS = 4  # stretches in which a longer log is tried: fewer may miss where it sticks, more are short
 # foreseen cost over that with the given width [1], below which no search with tight gaps confirms a narrower one:
 # higher trusts equations far from their optimum, lower takes minutes where a sample takes a hundred integration steps
-FORESEEN_RATIO = 0.5
+FORESEEN_RATIO = 0.6
 # fall of the squared residuals that counts, in variances (chi-square with one degree of freedom exceeds it once in a
 # thousand); lower follows chance, higher keeps wrong widths
 SIGNIFICANT_FALL = 10.8
@@ -205,7 +205,7 @@ def _is_confirmed(race: "_Race", width: Width, given: _Trial, best: _Trial) -> b
     """Whether tighter gaps, too, prefer a width to the given one; they are searched only where that is not foreseen."""
     if best is given or _is_foreseen(width, given, best):
         return True
-    trial, other = (race.run(t.widths, race.confirming_stages) for t in (best, given))
+    trial, other = (race.run(t.widths, confirms=True) for t in (best, given))
     is_wider = trial.widths[width.name] > other.widths[width.name]
     if is_wider and other.cost < inf and trial.misfit > MAX_WIDENED_MISFIT:
         return False
@@ -249,11 +249,16 @@ class _Race:
             return None
         return self.run({**trial.widths, **scaled})
 
-    def run(self, widths: dict[str, float], stages: tuple[Stage, ...] = (TRIAL_STAGE,)) -> _Trial:
-        """A short search from the model's first start, which depends on the widths, too."""
+    def run(self, widths: dict[str, float], *, confirms: bool = False) -> _Trial:
+        """A short search from the model's first start, which depends on the widths, too.
+
+        One that confirms goes on to tight gaps, whatever they cost: costs compare at the same gaps only.
+        """
+        stages = self.confirming_stages if confirms else (TRIAL_STAGE,)
         problem = replace(self._problem, parameters=self._problem.parameters.with_values(widths))
         # an empty last stage: the last one of a method would iterate to its end
-        method = replace(problem.method, stages=(*stages, replace(stages[-1], iterations=0)))
+        stages = (*stages, replace(stages[-1], iterations=0))
+        method = replace(problem.method, stages=stages, allows_state_noise=not confirms)
         transcription = problem.transcription(problem.candidates()[0])
         is_narrower = any(v < self._problem.parameters.value(n) for n, v in widths.items())
         if is_narrower and is_too_stiff(transcription, method, implicit=False):

@@ -183,3 +183,24 @@ def test_a_stretch_has_the_holes_that_lie_in_it() -> None:
     parts = excerpts([log])
     assert [round(e.trajectory.t[0]) for e in parts] == [0, 5, 15]  # nothing is known of the third
     assert [e.holes for e in parts] == [((700, 900),), ((500, 500), (1900, 2000)), ((500, 900),)]
+
+
+def test_widths_are_confirmed_at_the_same_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that takes tight gaps for noise of the states ends at loose ones, where any width costs little.
+
+    Once a wide width stayed so: its cost at loose gaps stood beside that of a narrow one at tight gaps.
+    """
+    system, log = po.ForceDrive(po.Stribeck()).system(), sticking()
+    posed = problem(system, log, system.parameters.with_values({"load.mass": 5.0}).freed(*FREE))
+    gaps = list[float]()
+
+    def record(transcription: Transcription, method: LeastSquares) -> Fit:
+        fit = solve_least_squares(transcription, method)
+        if len(method.stages) > 2:
+            gaps.append(fit.stats["gap_deviation"])
+        return fit
+
+    monkeypatch.setattr(widths, "solve_least_squares", record)
+    monkeypatch.setattr(widths, "_is_foreseen", lambda *_: False)
+    choose_widths(posed)
+    assert gaps == [LeastSquares().stages[widths.CONFIRMING_STAGES - 1].gap] * 2
