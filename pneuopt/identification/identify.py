@@ -49,6 +49,7 @@ from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.budget import CpuBudget
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 from pneuopt.shooting.solution import Fit
 
@@ -174,11 +175,14 @@ def _fit_and_review(
         began = fit_holding_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
     chosen = ChosenWindow(window, window, window, fit.stats["gap_share"]) if math.isfinite(window) else None
+    restarts = False
     if not doubts.found and (windowed := fit_in_windows(held, fit)):
+        restarts = 2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
     held, fit = hold_order(held, fit, label)
-    result = replace(mark_order(held, review_fit(held, *_result(held, fit, label, loss))), widths=widths, window=chosen)
+    reviewed = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
+    result = replace(mark_order(held, reviewed), widths=widths, window=chosen)
     if problem.method.budget is not None:
         result = replace(result, status=problem.method.budget.name_end(result.status))
     if doubts.found:
@@ -298,9 +302,12 @@ def _fit_states(
 
 
 def _result(
-    problem: EstimationProblem, fit: Fit, label: str, loss: Loss | None
+    problem: EstimationProblem, fit: Fit, label: str, loss: Loss | None, *, restarts: bool
 ) -> tuple[IdentificationResult, tuple[str, ...]]:
-    """The result of a fit, and the names of the parameters that rest on a prior, not on the logs."""
+    """The result of a fit, and the names of the parameters that rest on a prior, not on the logs.
+
+    `restarts` says that windows follow logs that the model does not follow from end to end.
+    """
     free = fit.parameters.free_names
     estimates = problem.unknowns().with_values({n: fit.parameters.value(n) for n in free}).select(free)
     shared = [n for n in free if n in problem.parameters]
@@ -310,7 +317,8 @@ def _result(
     squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
     dof = max(1, fit.count - len(free) - starts)
     variance = squares / dof
-    misfit = suspect_widths(diagnose_misfit(problem, fit, variance, dof), problem, fit, variance)
+    diagnosed = replace(diagnose_misfit(problem, fit, variance, dof), restarts=restarts)
+    misfit = suspect_widths(diagnosed, problem, fit, variance)
     covariance = misfit.covariance
     leaning = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:

@@ -84,6 +84,8 @@ class Misfit:
         The widths of the model that the logs reject.
     biased : ndarray of bool, shape (k,), or None
         The estimates that such a width biases; None without one.
+    restarts : bool
+        Whether windows that start anew follow the logs where the model, over whole logs, does not.
     is_slow, lone
         As of a `RobustCovariance`; `lone` by name.
     """
@@ -101,6 +103,7 @@ class Misfit:
     lone: tuple[str, ...] = ()
     rejected_widths: tuple[str, ...] = ()
     biased: Mask | None = None
+    restarts: bool = False
 
     @property
     def is_suspect(self) -> bool:
@@ -112,7 +115,7 @@ class Misfit:
 
     def mark(self, index: int, *, is_optimum: bool) -> Mark:
         """The mark of an estimate, which may be at an optimum or at a bound."""
-        is_missed = self.noisy_states or self.level > MODEL_ERROR_LEVEL
+        is_missed = self.noisy_states or self.restarts or self.level > MODEL_ERROR_LEVEL
         is_biased = self.biased is not None and bool(self.biased[index])
         if self.signals or is_biased or is_missed or not is_optimum:
             return Mark.BIAS_POSSIBLE
@@ -133,6 +136,8 @@ class Misfit:
         found = []
         if self.signals:
             found.append(f"residuals depend on {join_names(self.signals)}: model error, estimates may be biased")
+        if self.restarts:
+            found.append("over whole logs the model misses more than their noise: estimates from windows may be biased")
         if self.rejected_widths:
             widths = f"{join_names(self.rejected_widths)} that the logs reject"
             found.append(f"the model has a value of {widths}: the estimates that it moves may be biased")

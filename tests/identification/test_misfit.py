@@ -196,3 +196,14 @@ def test_an_estimate_without_a_deviation_is_not_exact() -> None:
     status = Status(Code.CONVERGED, ("converged",))
     found = identification._estimates(own, np.diag([1.0, np.nan]), none, none, status, plain)
     assert found["mark"].tolist() == [Mark.EXACT, Mark.BIAS_POSSIBLE]
+
+
+def test_windows_that_start_anew_where_whole_logs_do_not_fit_leave_a_bias_possible() -> None:
+    """Short windows hide what adds up over a log: their residuals are noise, and five of six intervals were wrong."""
+    plain = Misfit(None, np.full(2, 9.0), 1.0, np.zeros((2, 2)), 1.0, noisy_states=False, is_excessive=False)
+    assert plain.mark(0, is_optimum=True) is Mark.EXACT
+    anew = replace(plain, restarts=True)
+    assert anew.mark(0, is_optimum=True) is Mark.BIAS_POSSIBLE
+    assert anew.sentences == (
+        "over whole logs the model misses more than their noise: estimates from windows may be biased",
+    )
