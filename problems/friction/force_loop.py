@@ -148,11 +148,12 @@ def figure(job: Job) -> "Figure":
     for name, (colour, label) in shown.items():
         run = job.runs[name]
         force.plot(run.t, run["load_force"], color=colour, lw=1.0, label=label)
-        command.plot(run.t, run["control"], color=colour, lw=0.8)
+        if name != "dither":
+            command.plot(run.t, run["control"], color=colour, lw=0.8)
     t = SAMPLE_TIME * np.arange(len(LEVELS) * samples(DWELL))
     force.plot(t, np.repeat(LEVELS, samples(DWELL)), color="k", lw=0.8, ls="--", label="wanted")
-    force.set(ylabel="force [N]", ylim=(190.0, 235.0))
-    command.set(xlabel="time [s]", ylabel="valve [V]", ylim=(-2.5, 2.5))
+    force.set(ylabel="force [N]", ylim=(196.0, 226.0))
+    command.set(xlabel="time [s]", ylabel="valve [V],\nthose without dither")
     legend_above(picture, force, columns=5)
     return picture
 
