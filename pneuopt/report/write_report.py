@@ -76,7 +76,8 @@ def write_report(
     Examples
     --------
     >>> import tempfile
-    >>>     >>> class Found(Shown):
+    >>> from pneuopt.quantities.report import Line, Report
+    >>> class Found(Shown):
     ...     def summary(self):
     ...         return Report((Line("nothing is wrong"),))
     >>> place = Path(tempfile.mkdtemp()) / "found.html"
