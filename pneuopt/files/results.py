@@ -6,6 +6,7 @@ from typing import Any
 from pneuopt.evaluation.certificate import Certificate
 from pneuopt.evaluation.compensator_verdict import CompensatorVerdict
 from pneuopt.evaluation.dither_verdict import DitherVerdict
+from pneuopt.evaluation.rest_check import RestCheck
 from pneuopt.identification.compare_logs import LogComparison
 from pneuopt.identification.experiment_design import ExperimentDesign
 from pneuopt.identification.result import IdentificationResult
@@ -18,7 +19,7 @@ RESULT_KINDS: dict[str, type] = {
     kind.__name__: kind
     for kind in (
         *(IdentificationResult, ModelSelection, LogComparison, ExperimentDesign),
-        *(TuningResult, DesignValidation, Certificate, DitherVerdict, CompensatorVerdict),
+        *(TuningResult, DesignValidation, Certificate, RestCheck, DitherVerdict, CompensatorVerdict),
     )
 }
 

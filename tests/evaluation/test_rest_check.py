@@ -1,6 +1,7 @@
 """Whether a loop comes to rest is read off break-aways and standstills: hunting, its cure, and what pushes on."""
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
 from pneuopt.evaluation.rest_check import RestCheck, RestKind, check_rest
 from pneuopt.evaluation.rig import Rig, Sensor
+from pneuopt.files.results import load_result
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.karnopp import Karnopp
@@ -129,6 +131,14 @@ def test_scenarios_are_watched_and_tabled() -> None:
     found = check_rest(loop, STEP, values, scenarios={"smooth seal": {"friction.static": COULOMB}}, duration=30.0)
     assert found.to_frame()["kind"].tolist() == ["hunts", "rests"]
     assert str(found).startswith("the loop does not come to rest in 1 of 2 cases, watched for 30 s\n")
+
+
+def test_it_is_read_as_it_was_saved(tmp_path: Path) -> None:
+    found = watch()
+    found.save(tmp_path / "rest.json")
+    again = load_result(tmp_path / "rest.json")
+    assert (repr(again), again.rests) == (repr(found), found.rests)
+    assert again.cases[0].kind is RestKind.HUNTS
 
 
 def test_a_rig_with_an_encoder_rests_within_its_count() -> None:
