@@ -103,7 +103,9 @@ def compare_languages(seeds: Iterable[int]) -> tuple[dict[str, float], int]:
         controller, block = space["PidX"](), FunctionBlock(text["pid_x.st"])
         controller.start(*run.inputs[0].tolist(), run.centre)
         block.variables["start_output"] = run.centre
-        outputs = [block.call(setpoint=r, measured=y)["output"] for r, y in run.inputs.tolist()]
+        given = [v.name for v in controller_program(run.loop, run.parameters, run.centre).inputs]
+        rows = [dict(zip(given, row, strict=True)) for row in run.inputs.tolist()]
+        outputs = [block.call(**row)["output"] for row in rows]
         found = {
             "c": difference,
             "python": relative_difference([controller.step(*row) for row in run.inputs.tolist()], run),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from problems.demo.export_controllers import Job, files_of, main, run_c
+from problems.demo.export_controllers import Job, compare_languages, files_of, main, run_c
 from problems.shared.random_controllers import run_library
 
 METRICS = pd.Series({"SettlingTime": 0.16, "Overshoot": 1.0, "MaxSensitivity": 1.2})
@@ -44,3 +44,11 @@ def test_a_controller_is_compared_and_a_wrong_one_found(tmp_path: Path) -> None:
     difference, clean = run_c(wrong, tmp_path)
     assert not clean
     assert difference > 1e-6
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler on the path")
+def test_a_controller_of_many_inputs_goes_through_all_languages() -> None:
+    """The fourth is given the reference's rates and both pressures besides."""
+    assert run_library(4).inputs.shape[1] > 4
+    worst, unclean = compare_languages([4])
+    assert (max(worst.values()) <= 1e-12, unclean) == (True, 0)
