@@ -47,7 +47,7 @@ MAX_TRIAL_SAMPLES = 8000  # of all logs: more take time and tell no more, fewer 
 EXCERPTS = 4  # stretches in which a longer log is tried: fewer may miss where it sticks, more are short
 # foreseen cost over that with the given width [1], below which no search with tight gaps confirms a narrower one:
 # higher trusts equations far from their optimum, lower takes minutes where a sample takes a hundred integration steps
-FORESEEN_RATIO = 0.6
+FORESEEN_RATIO = 0.5
 # fall of the squared residuals that counts, in variances (chi-square with one degree of freedom exceeds it once in a
 # thousand); lower follows chance, higher keeps wrong widths
 SIGNIFICANT_FALL = 10.8
