@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.control.command import CommandParts, pid_reference
-from pneuopt.control.wiring import Signals, evaluate_plant
+from pneuopt.control.wiring import JoinedSignals, Signals, evaluate_plant
 from pneuopt.dynamics.system import FRICTION_DIRECTION, Symbols, System, define, names, parameter_vector
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, require
@@ -16,28 +16,8 @@ from pneuopt.quantities.parameters import ParameterSet, Quantity
 INTEGRAL_STATE = "pid.integral"
 
 
-class WiredLoop(CommandParts, Protocol):
+class WiredLoop(CommandParts, JoinedSignals, Protocol):
     """What of a `ClosedLoop` its equilibrium depends on."""
-
-    @property
-    def plant(self) -> System:
-        """Without the controller."""
-        ...
-
-    @property
-    def command(self) -> Quantity:
-        """The plant's input that the controller drives."""
-        ...
-
-    @property
-    def feedback(self) -> Quantity:
-        """The plant's output that is fed back."""
-        ...
-
-    @property
-    def pid_signal(self) -> Quantity:
-        """The plant's output that the PID controls."""
-        ...
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:

@@ -55,8 +55,8 @@ def check_algebraic_loop(plant: System, command: str, output: str) -> None:
     )
 
 
-class CascadedLoop(Protocol):
-    """What of a `ClosedLoop` decides whether it can be a cascade."""
+class JoinedSignals(Protocol):
+    """The signals of a `ClosedLoop` at which plant and controller meet."""
 
     @property
     def plant(self) -> System:
@@ -65,18 +65,22 @@ class CascadedLoop(Protocol):
 
     @property
     def command(self) -> Quantity:
-        """The input that is driven."""
+        """The plant's input that the controller drives."""
         ...
 
     @property
     def feedback(self) -> Quantity:
-        """The output that the loop is judged by."""
+        """The plant's output that is fed back, by which the loop is judged."""
         ...
 
     @property
     def pid_signal(self) -> Quantity:
-        """The output that the PID controls."""
+        """The plant's output that the PID controls."""
         ...
+
+
+class CascadedLoop(JoinedSignals, Protocol):
+    """What of a `ClosedLoop` decides whether it can be a cascade."""
 
     @property
     def outer(self) -> object:
