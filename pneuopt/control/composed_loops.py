@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import expm
 
 from pneuopt.control.averaged_plant import AveragedPlant
 from pneuopt.control.command import added_command, pid_reference
@@ -91,7 +90,7 @@ class ComposedLoops:
         A, B = A * scale / scale[:, None], (B / scale)[..., None]
         own = p[:, [list(loop.parameters).index(n) for n in loop.plant.parameters]]
         slopes, shown = self._outputs(x.T, u.T, own.T)
-        C = slopes.full().reshape(len(loop.plant.outputs), len(x), -1, order="F").transpose(1, 0, 2) * scale
+        C = _split_columns(slopes.full(), len(x)) * scale
         if isinstance(loop.sensor, SensorLag):
             rate = 1 / np.reshape(loop.sensor_lag(p.T), (-1, 1, 1)) + np.zeros((len(x), 1, 1))
             k, n = names(loop.plant.outputs).index(loop.pid_signal.name), A.shape[-1]
@@ -119,12 +118,7 @@ class ComposedLoops:
         y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
         seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])
         v = uncompensated_command(loop, p.T, seen, seen, bare, read)
-        sizes = [self._law.size_out(k) for k in range(4)]
-        found = [
-            M.full().reshape(rows, len(p), columns, order="F").transpose(1, 0, 2)
-            for M, (rows, columns) in zip(self._law(shown.T, v[None], p.T), sizes, strict=True)
-        ]
-        return _Laws(*found)
+        return _Laws(*(_split_columns(M.full(), len(p)) for M in self._law(shown.T, v[None], p.T)))
 
     @cached_property
     def _law(self) -> ca.Function:
@@ -148,6 +142,9 @@ class ComposedLoops:
         return ca.Function("law", [stack(y), v, stack(p)], [ca.densify(block) for block in blocks])
 
 
+# Norm of a matrix and terms of the series of its exponential, whose remainder is then .5^17/17!, below rounding: a
+# larger norm needs more terms, a smaller one more squarings, each of which doubles the rounding.
+LARGEST_TAYLOR_NORM, TAYLOR_TERMS = 0.5, 16
 _COMMANDS = ("pid.command", "pid.pending")  # states that hold the command: the hold and the delay have their own
 
 
@@ -168,6 +165,11 @@ class _Laws(NamedTuple):
     def noise(self) -> Matrices:
         """From the noise alone."""
         return self.A, self.B[..., -1:], self.C, self.D[..., -1:]
+
+
+def _split_columns(joined: Array, m: int) -> Array:
+    """Matrices of shape (m, rows, columns) from those that a Function of m points has joined side by side."""
+    return joined.reshape(len(joined), m, joined.shape[1] // m).transpose(1, 0, 2)
 
 
 def _linear_law(loop: ClosedLoop) -> ClosedLoop:
@@ -247,8 +249,25 @@ def _hold(A: Array, B: Array, h: float) -> tuple[Array, Array]:
     both = np.concatenate([np.concatenate([A, B], axis=2), np.zeros((m, 1, n + 1))], axis=1)
     sound = np.isfinite(both).all(axis=(1, 2))
     moved = np.full_like(both, np.nan)
-    moved[sound] = expm(both[sound] * h)
+    moved[sound] = _exponentials(both[sound] * h)
     return moved[:, :n, :n], moved[:, :n, n:]
+
+
+def _exponentials(A: Array) -> Array:
+    """Exponentials of small matrices, shape (m, n, n): Taylor's series of A/2^k, squared k times.
+
+    C. Moler & C. Van Loan, Nineteen dubious ways to compute the exponential of a matrix, twenty-five years later, SIAM
+    Rev. 45 (2003) 3-49, methods 1 and 3. SciPy's own takes 20 ms a matrix where BLAS has threads that wait for a CPU.
+    """
+    largest = float(np.abs(A).sum(axis=-1).max(initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(max(largest, 1e-300) / LARGEST_TAYLOR_NORM))))
+    scaled, one = A / 2.0**squarings, np.eye(A.shape[-1])
+    found = np.broadcast_to(one, A.shape)
+    for k in range(TAYLOR_TERMS, 0, -1):
+        found = one + scaled @ found / k
+    for _ in range(squarings):
+        found = found @ found
+    return np.asarray(found)
 
 
 def _bilinear(system: Matrices, h: float) -> Matrices:

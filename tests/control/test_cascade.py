@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.compensation import Compensator
+from pneuopt.control.composed_loops import ComposedLoops, _exponentials
 from pneuopt.control.dead_zone_inverse import DeadZoneInverse
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.friction_feedforward import Direction, FrictionFeedforward
@@ -39,6 +41,7 @@ from pneuopt.tuning.space import search_space
 
 H, COUNT, LAG = 1e-3, 1e-5, 4e-3
 OUTER = {"position_loop.Kp": 5.0, "position_loop.weight": 0.9}
+MANY = ((3.0, 1.0), (5.0, 2.0), (8.0, 3.0))  # [kg], [V s/m]
 GAINS = {"pid.Kp": 2.0, "pid.Ki": 4.0, "pid.b": 0.8}
 
 
@@ -199,6 +202,26 @@ def test_search_and_certificate_agree() -> None:
     certified = evaluate(loop, step, given)[step.label]
     for name in ("SettlingTime", "Overshoot", "PeakControl", "MaxSensitivity"):
         assert claimed[name] == pytest.approx(certified[name], rel=5e-3, abs=2e-3), name
+
+
+def test_many_loops_at_once_are_linearised_as_each_alone() -> None:
+    loop = cascade(PressureFeedback(), DeadZoneInverse(), sensor=Encoder(COUNT, LAG))
+    sets = [given_values(loop, {"load.mass": m, "pid.Kp": k, "pressure_feedback.gain": 2e-6}) for m, k in MANY]
+    p = np.array([loop.parameter_vector(each) for each in sets])
+    x = np.array([loop.initial(each, reference=0.1)[: len(loop.plant.states)] for each in sets])
+    linearise, u = ComposedLoops(loop), np.linspace(0.2, 0.4, len(sets))[:, None]
+    together = linearise(p, x, u)
+    for k in range(len(sets)):
+        alone = linearise(p[k : k + 1], x[k : k + 1], u[k : k + 1])
+        for found, wanted in zip((*together.loop, *together.noise), (*alone.loop, *alone.noise), strict=True):
+            np.testing.assert_allclose(found[k], wanted[0], rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+
+
+def test_exponentials_are_scipys() -> None:
+    A = np.random.default_rng(1).standard_normal((4, 7, 7)) * np.array([1e-3, 0.3, 3.0, 10.0])[:, None, None]
+    for found, wanted in zip(_exponentials(A), expm(A), strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-12 * np.abs(wanted).max())
+    assert _exponentials(np.empty((0, 3, 3))).shape == (0, 3, 3)
 
 
 def test_a_file_makes_it(tmp_path: Path) -> None:
