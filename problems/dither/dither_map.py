@@ -247,4 +247,4 @@ if __name__ == "__main__":
     job = run()
     for verdict in job.verdicts.values():
         print(verdict)
-    sys.exit(finish(main(job), options, lambda: {"dither_map": figure(job), "dither_responses": responses(job)}))
+    sys.exit(finish(main(job), options, lambda: {"dither_map": figure(job), "dither_map_responses": responses(job)}))

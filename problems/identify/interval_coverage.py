@@ -211,4 +211,4 @@ if __name__ == "__main__":
     parser.add_argument("--case", choices=tuple(CASES), action="append", help="all by default")
     options = parser.parse_args()
     draws = run(options.count, options.first, tuple(options.case or CASES), options.out)
-    sys.exit(finish(main(draws), options, lambda: {"coverage": figure(draws)}))
+    sys.exit(finish(main(draws), options, lambda: {"interval_coverage": figure(draws)}))

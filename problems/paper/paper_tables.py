@@ -76,7 +76,11 @@ def figures() -> "Mapping[str, Figure]":
     left.set_ylabel("speed (transducer) [V]")
     bode, (gain, phase) = plt.subplots(2, 1, figsize=(6, 5), sharex=True, layout="constrained")
     _draw_bode(gain, phase)
-    return {"paper_steps": steps, "paper_bode": bode, "paper_loop": plot_loop(closed_loop(PID_2)[0])}
+    return {
+        "paper_tables_steps": steps,
+        "paper_tables_bode": bode,
+        "paper_tables_loop": plot_loop(closed_loop(PID_2)[0]),
+    }
 
 
 def _bode() -> list[Claim]:

@@ -255,7 +255,11 @@ if __name__ == "__main__":
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     options = parser.parse_args()
     parts = {name: PARTS[name](options.seeds) for name in options.parts}
-    drawn = lambda: {  # noqa: E731
-        f"robust_{name}": figure(part, getattr(part.task.minimise, "band", 0.02)) for name, part in parts.items()
-    }
-    sys.exit(finish(main(parts), options, drawn))
+    bands = {name: getattr(part.task.minimise, "band", 0.02) for name, part in parts.items()}
+    sys.exit(
+        finish(
+            main(parts),
+            options,
+            lambda: {f"robust_tuning_{name}": figure(part, bands[name]) for name, part in parts.items()},
+        )
+    )

@@ -53,3 +53,21 @@ def test_a_script_that_runs_finds_the_checkout_and_is_no_library(script: str) ->
     text = (ROOT / script).read_text(encoding="utf-8")
     assert ("sys.path.append(str(Path(__file__).parents[2]))" in text) == ("__main__" in text)
     assert "__main__" not in text or not script.startswith("problems/shared/")
+
+
+def figure_names(script: str) -> list[str]:
+    """How the names of a script's figures begin, as its function `figures` or what it hands to `finish` states them."""
+    tree = ast.parse((ROOT / script).read_text(encoding="utf-8"))
+    makers = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef) and n.name == "figures"]
+    made: list[ast.expr | None] = [n.value for maker in makers for n in ast.walk(maker) if isinstance(n, ast.Return)]
+    handed = [n.args[2:] for n in ast.walk(tree) if isinstance(n, ast.Call) and ast.unparse(n.func) == "finish"]
+    made += [n.body for arguments in handed for n in arguments if isinstance(n, ast.Lambda)]
+    keys = [key for value in made if isinstance(value, ast.Dict) for key in value.keys]
+    keys += [value.key for value in made if isinstance(value, ast.DictComp)]
+    return [ast.unparse(key).removeprefix("f").strip("'\"") for key in keys if key is not None]
+
+
+@pytest.mark.parametrize("script", [s for s in SCRIPTS if "shared" not in s and s != "problems/demo/rig_demo.py"])
+def test_a_figure_is_named_after_its_script_so_that_the_gallery_finds_it(script: str) -> None:
+    stem = Path(script).stem
+    assert [name for name in figure_names(script) if not name.startswith(stem)] == []

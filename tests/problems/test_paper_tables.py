@@ -86,7 +86,7 @@ def test_the_whole_script_and_its_figures() -> None:
     frame = paper_tables.main().set_index("name")
     assert frame["holds"].all()
     assert frame.loc["gain_from_table1.factor", "value"] == pytest.approx(0.5, abs=0.005)
-    assert set(paper_tables.figures()) == {"paper_steps", "paper_bode", "paper_loop"}
+    assert set(paper_tables.figures()) == {"paper_tables_steps", "paper_tables_bode", "paper_tables_loop"}
 
 
 def test_scipy_agrees_on_the_plain_step() -> None:
