@@ -78,6 +78,11 @@ def test_the_same_page_is_the_same_to_the_letter() -> None:
     assert render_page(page()) == render_page(page())
 
 
+def test_a_figure_lets_the_shadow_through_that_shows_a_phone_where_it_goes_on() -> None:
+    drawn = read_page(render_page(page())).named("path")[0]
+    assert drawn["style"] == "fill: none", "the sheet behind the axes"
+
+
 def test_a_page_without_figures() -> None:
     read = read_page(render_page(page(), draws=False))
     assert not read.named("figure")
