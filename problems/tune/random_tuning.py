@@ -101,6 +101,8 @@ def _worst(metrics: "pd.DataFrame") -> float:
 
 def figure(rows: "pd.DataFrame") -> "Figure":
     """Each solved problem: certified settling time over brute force's, and how far the claim was off."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     picture, ((left, right),) = axes_grid(1, 2, (3.4,), width=9.0)
     solved = rows[rows["outcome"] == "solved"]
     ends = np.array([0.8 * solved["known"].min(), 1.25 * solved["known"].max()])
@@ -113,6 +115,10 @@ def figure(rows: "pd.DataFrame") -> "Figure":
     right.axhline(1e-3, color=GREY, lw=0.8, ls="--")
     left.set(xlabel="brute force [s]", ylabel="tuned, certified [s]", title="settling time")
     right.set(xlabel="settling time, certified [s]", ylabel="|claimed - certified| [s]", title="the claim")
+    for axis in (left.xaxis, left.yaxis, right.xaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     legend_above(picture, left)
     return picture
 
