@@ -242,7 +242,11 @@ def figure(rows: "pd.DataFrame") -> "Figure":
             ratio = (part["tuned"] / rival[part.index]).to_numpy(dtype=float)
             axes.plot(np.flatnonzero(ratio < inf), ratio[ratio < inf], "o", ms=4, color=colour, label=str(kind))
         axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
-        axes.set(xlabel="problem", ylabel="tuned over rival", title=name)
+        axes.set(xlabel="problem of its kind", ylabel="tuned over rival", title=name)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    top = max(axes.get_ylim()[1] for axes in (left, right))
+    for axes in (left, right):
+        axes.set_ylim(0, max(top, 1.1))
     legend_above(picture, left)
     return picture
 
