@@ -94,7 +94,8 @@ class Dither:
         require(
             frequency < nyquist,
             f"dither.frequency {frequency:g} Hz cannot be sampled every {sample_time * 1e3:g} ms: it must lie below "
-            f"the Nyquist frequency {nyquist:g} Hz; lower it, sample faster, or use Dither(analogue=True)",
+            f"the Nyquist frequency {nyquist:g} Hz; lower it, sample faster, or let a generator behind the "
+            "controller add it (analogue = true)",
         )
 
     def wave(self, t: ca.SX, p: Symbols) -> ca.SX:

@@ -33,6 +33,7 @@ from pneuopt.quantities.units import write_value
 BAND, OVERSHOOT, SENSITIVITY = "2 %", "5 %", 1.6  # what a first tuning asks for: usual, and within reach of most drives
 SWEEP = (0.8, 1.0, 1.2)  # of a first study's parameter, times its value: near enough that one design may hold
 _DIGITS = 6
+_SAMPLES_A_DITHER_PERIOD = 5  # of a slow controller, for which the usual dither would be too fast
 _EXAMPLE_SPREAD = 'distribution = "normal", spread = "5 %"'
 _OTHER_FILES = ("drive", "tuning", "study", "rig")
 
@@ -162,7 +163,8 @@ def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, 
     stated["pid.limits"] = "[" + ", ".join(_quote(write_value(end, command)) for end in ends) + "]"
     if first.dither is not None:
         frequency, most = first.dither
-        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz"))}
+        frequency = min(frequency, 1.0 / (_SAMPLES_A_DITHER_PERIOD * (loop.pid.sample_time or SAMPLE_TIME)))
+        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz", _DIGITS))}
         least = {"amplitude": 0.0, "offset": -most}
         free = {n: Parameter(0.0, command, lower, most) for n, lower in least.items()}
         stated |= {f"dither.{n}": _value_text(p, free=True, bounds=True) for n, p in free.items()}

@@ -51,7 +51,9 @@ def to_svg(figure: "Figure", name: str, alt: str) -> str:
     formulas = any(text.get_parse_math() and text.get_text().count("$") > 1 for text in texts)
     content = io.BytesIO()
     with rc_context({"svg.hashsalt": HASH_SALT, "svg.fonttype": "path" if formulas else "none"}):
-        figure.savefig(content, format="svg", transparent=True, dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
+        figure.savefig(
+            content, format="svg", transparent=True, dpi=RASTER_DPI, metadata={"Date": None, "Creator": None}
+        )
     return _as_element(content.getvalue(), name, alt)
 
 

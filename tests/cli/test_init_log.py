@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from pneuopt.files.drive import read_drive
+from pneuopt.files.first_files import first_files, first_kinds
 from pneuopt.files.tuning import read_tuning
 from pneuopt.identification.checks import check_logs
 from pneuopt.logs.read_log import read_log
+from pneuopt.quantities.parameters import ParameterSet
 from tests.cli.test_init import run
 
 
@@ -103,3 +105,16 @@ def test_a_log_that_does_not_is_met_with_a_question(tmp_path: Path) -> None:
     code, output = run("init", "--from", str(log), "-o", str(tmp_path))
     assert (code, "rename it; drive.toml is the name of another file" in output) == (2, True)
     assert not (tmp_path / "drive.toml").exists()
+
+
+@pytest.mark.parametrize("kind", sorted(first_kinds()))
+@pytest.mark.parametrize("sample_time", [1e-4, 1e-3, 5e-3, 0.02])
+def test_the_first_dither_can_be_sampled_by_a_controller_as_slow_as_the_log(
+    kind: str, sample_time: float, tmp_path: Path
+) -> None:
+    files = first_files(kind, ParameterSet({}), {}, sample_time=sample_time)
+    for name in ("drive.toml", "tuning.toml"):
+        (tmp_path / name).write_text(files[name], encoding="utf-8")
+    loop = read_tuning(tmp_path / "tuning.toml", read_drive(tmp_path / "drive.toml")[0].system()).loop
+    if loop.dither is not None:
+        loop.dither.check(loop.parameters.value("dither.frequency"), loop.pid.sample_time)
