@@ -235,6 +235,8 @@ def _log(rng: np.random.Generator, low: float, high: float) -> float:
 
 def figure(rows: "pd.DataFrame") -> "Figure":
     """Each problem's tuned objective over the best rule's and over differential evolution's."""
+    from matplotlib.ticker import MaxNLocator
+
     picture, ((left, right),) = axes_grid(1, 2, (3.4,), width=9.0)
     rivals = {"best rule": best_rule(rows), "differential evolution": rows["de"]}
     for axes, (name, rival) in zip((left, right), rivals.items(), strict=True):
@@ -243,7 +245,7 @@ def figure(rows: "pd.DataFrame") -> "Figure":
             axes.plot(np.flatnonzero(ratio < inf), ratio[ratio < inf], "o", ms=4, color=colour, label=str(kind))
         axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
         axes.set(xlabel="problem of its kind", ylabel="tuned over rival", title=name)
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     top = max(axes.get_ylim()[1] for axes in (left, right))
     for axes in (left, right):
         axes.set_ylim(0, max(top, 1.1))
