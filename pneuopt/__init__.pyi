@@ -19,6 +19,7 @@ from .control.forms import (
     to_standard,
 )
 from .control.friction_feedforward import Direction, FrictionFeedforward
+from .control.gain_schedule import GainSchedule
 from .control.knocker import Knocker
 from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
@@ -225,6 +226,7 @@ __all__ = [
     "FrictionFeedforward",
     "FullSpace",
     "GainMargin",
+    "GainSchedule",
     "Huber",
     "IdentificationResult",
     "InputError",

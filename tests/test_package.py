@@ -19,6 +19,7 @@ PUBLIC_NAMES = [
     "AccelerationFeedback",
     "DOptimal",
     "ExperimentDesign",
+    "GainSchedule",
     "PositionLoop",
     "PressureFeedback",
     "next_experiment",

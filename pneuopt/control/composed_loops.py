@@ -19,6 +19,7 @@ from pneuopt.control.averaged_plant import AveragedPlant
 from pneuopt.control.command import added_command, pid_reference
 from pneuopt.control.compensation import Instant, acting_always, uncompensated_command
 from pneuopt.control.dither import DITHER_OFFSET
+from pneuopt.control.gain_schedule import schedule_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sampled import controller_update
 from pneuopt.control.sensor import Encoder, SensorLag
@@ -75,7 +76,11 @@ class ComposedLoops:
             The operating points, the command among the inputs.
         """
         plant, shown = self._plants(p, x, u)
-        law = self._laws(p, shown, u[:, names(self.loop.plant.inputs).index(self.loop.command.name)])
+        law = self._laws(
+            self._frozen(p.T, shown.T).full().T,
+            shown,
+            u[:, names(self.loop.plant.inputs).index(self.loop.command.name)],
+        )
         h, direct = self.loop.pid.sample_time, np.zeros((*plant[2].shape[:2], 1))
         if h is None:
             return OpenLoops(_join((*plant, direct), law.feedback), law.noise)
@@ -99,6 +104,14 @@ class ComposedLoops:
             C = np.concatenate([C, np.zeros((*C.shape[:2], 1))], axis=2)
             C[:, k] = np.eye(1, n + 1, n)
         return (A, B, C), shown.full().T
+
+    @cached_property
+    def _frozen(self) -> ca.Function:
+        """``(p, y) -> p`` with the gains that a schedule has at the plant's outputs."""
+        loop = self.loop
+        y, p = ({n: ca.SX.sym(n) for n in own} for own in (names(loop.plant.outputs), loop.parameters))
+        frozen = schedule_gains(loop, p, y[loop.pid_signal.name], {}, y)
+        return ca.Function("frozen", [stack(p), stack(y)], [stack(frozen)])
 
     @cached_property
     def _average(self) -> AveragedPlant:
@@ -176,7 +189,7 @@ def _linear_law(loop: ClosedLoop) -> ClosedLoop:
     """The loop without what its linearisation leaves out: limits, dead band, resets, counts, dither, pulses."""
     sensor = replace(loop.sensor, resolution=0.0) if isinstance(loop.sensor, Encoder) else loop.sensor
     pid = replace(loop.pid, limits=False, dead_band=False, reset=False)
-    return replace(loop, pid=pid, sensor=sensor, dither=None, compensators=acting_always(loop))
+    return replace(loop, pid=pid, sensor=sensor, dither=None, compensators=acting_always(loop), schedule=None)
 
 
 def _lagging(loop: ClosedLoop) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from pneuopt.control.compensation import (
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import ParallelForm, parallel_gains
+from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop_equations import continuous_rates, held_rates
 from pneuopt.control.loop_start import start_state
 from pneuopt.control.pid import PID
@@ -72,6 +73,8 @@ class ClosedLoop:
         `FrictionFeedforward`, `DeadZoneInverse`, `MotionFeedforward`, `PressureFeedback`, `AccelerationFeedback`.
     outer : PositionLoop, optional
         Makes the loop a cascade: it is judged by the position, whose error sets the speed that the PID controls.
+    schedule : GainSchedule, optional
+        Gains that change with the position and the load.
 
     Raises
     ------
@@ -91,6 +94,7 @@ class ClosedLoop:
     feedforward: Feedforward | None = None
     compensators: tuple[Compensator, ...] = ()
     outer: PositionLoop | None = None
+    schedule: GainSchedule | None = None
 
     def __post_init__(self) -> None:
         if self.sensor is not None:
@@ -110,7 +114,8 @@ class ClosedLoop:
             check_algebraic_loop(self.plant, self.command.name, name)
         twice = [q.name for q in self.motion_inputs if q.name in names(self.plant.inputs)]
         require(not twice, f"the plant has inputs {', '.join(twice)} of its own; rename them", ModelError)
-        _ = self.parameters
+        if self.schedule:
+            self.schedule.check(self.parameters)
 
     def __repr__(self) -> str:
         model = self.system() if self.pid.sample_time is None else self.discrete()
@@ -153,6 +158,8 @@ class ClosedLoop:
         }
         if self.outer:
             parts[self.outer.section] = self.outer.parameters(self.feedback.unit, measured)
+        if self.schedule:
+            parts["schedule"] = self.schedule.plant_parameters(self.plant)
         return reduce(or_, (own.with_prefix(name) for name, own in parts.items()), self.plant.parameters)
 
     @property
@@ -171,7 +178,7 @@ class ClosedLoop:
     def tunable_sections(self) -> tuple[str, ...]:
         """Prefixes of the parameters that a tuning may change: the controller's, not the sensor's or the plant's."""
         outer = (self.outer.section,) if self.outer else ()
-        return ("pid", *outer, "dither", "feedforward", *(c.section for c in self.compensators))
+        return ("pid", *outer, "dither", "feedforward", *(c.section for c in self.compensators), "schedule")
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
@@ -192,7 +199,9 @@ class ClosedLoop:
     def readings(self) -> tuple[str, ...]:
         """The plant's outputs that the controller reads beside what its PID controls, in the plant's order."""
         used = {n for part in self.compensators for n in part.reads(self.sensed_signal)}
-        used |= {self.feedback.name} if self.outer and not isinstance(self.sensor, Encoder) else set()
+        if not isinstance(self.sensor, Encoder):  # which has the position itself
+            used |= {self.feedback.name} if self.outer else set()
+            used |= {self.schedule.position} - {self.pid_signal.name} if self.schedule else set()
         return tuple(n for n in names(self.plant.outputs) if n in used)
 
     @property
@@ -204,7 +213,9 @@ class ClosedLoop:
     def is_composed(self) -> bool:
         """Whether more than a PID of one signal is fed back, so that the loop is linearised by `ComposedLoops`."""
         on = self.sensed_signal
-        return bool(self.outer) or any(part.acts_always and part.states(on, self.command) for part in self.compensators)
+        return bool(self.outer or self.schedule) or any(
+            part.acts_always and part.states(on, self.command) for part in self.compensators
+        )
 
     def system(self) -> System:
         """The loop as one ODE, with a continuous PID.
@@ -277,6 +288,8 @@ class ClosedLoop:
         if self.feedforward:
             time = value["feedforward.time"]
             require(time > 0, f"feedforward.time must be positive, got {time:g} s; without it set its gain to zero")
+        if self.schedule:
+            self.schedule.check_values(without_prefix(value, "schedule"))
         check_values(self.compensators, self.parameters, value)
         Tf = float(self.gains(list(value.values()))[3])
         self.pid.check({**without_prefix(value, "pid"), "Tf": Tf}, self.command.unit)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 
 from pneuopt.control.command import added_command, pid_reference
+from pneuopt.control.gain_schedule import schedule_gains
 from pneuopt.control.wiring import Signals, evaluate_plant
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import with_prefix, without_prefix
@@ -17,6 +18,7 @@ def continuous_rates(loop: "ClosedLoop", t: ca.SX, x: Symbols, u: Symbols, p: Sy
     """Rates and outputs of a loop with a continuous PID."""
     shown = evaluate_plant(loop.plant, loop.command.name, t, x, u, p, ca.SX(0))[1]
     seen = x["sensor.reading"] if loop.sensor else shown[loop.pid_signal.name]
+    p = schedule_gains(loop, p, seen, {}, shown)
     u = pid_reference(loop, u, shown[loop.feedback.name], p)
     moved, added = added_command(loop, t, x, u, seen, shown, p)
     rates, command = loop.pid.rates(without_prefix(x, "pid"), u["reference"], seen, added, without_prefix(p, "pid"))

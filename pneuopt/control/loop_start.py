@@ -7,6 +7,7 @@ import numpy as np
 
 from pneuopt.control.command import pid_reference
 from pneuopt.control.compensation import Instant, uncompensated_command
+from pneuopt.control.gain_schedule import schedule_gains
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.control.wiring import check_initial_command
 from pneuopt.dynamics.system import names
@@ -40,6 +41,8 @@ def start_state(
     y = dict(zip(names(loop.plant.outputs), shown.full().ravel().tolist(), strict=True))
     sensor = loop.sensor.start(y, loop.sensed_signal, without_prefix(value, "sensor")) if loop.sensor else []
     seen = sensor[0] if sensor else y[loop.pid_signal.name]
+    value = dict(schedule_gains(loop, value, seen, {}, y))
+    p = np.array([float(v) for v in value.values()])
     wanted = float(pid_reference(loop, {"reference": reference}, y[loop.feedback.name], value)["reference"])
     v = float(uncompensated_command(loop, p, wanted, seen, command, [y[n] for n in loop.readings])[0])
     own = loop.pid.start(wanted, seen, v, {**without_prefix(value, "pid"), "Kp": float(loop.gains(p)[0])})

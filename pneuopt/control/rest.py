@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.control.command import CommandParts, pid_reference
+from pneuopt.control.gain_schedule import ScheduledParts, schedule_gains
 from pneuopt.control.wiring import JoinedSignals, Signals, evaluate_plant
 from pneuopt.dynamics.system import FRICTION_DIRECTION, Symbols, System, define, names, parameter_vector
 from pneuopt.quantities.arrays import Array
@@ -16,7 +17,7 @@ from pneuopt.quantities.parameters import ParameterSet, Quantity
 INTEGRAL_STATE = "pid.integral"
 
 
-class WiredLoop(CommandParts, JoinedSignals, Protocol):
+class WiredLoop(CommandParts, JoinedSignals, ScheduledParts, Protocol):
     """What of a `ClosedLoop` its equilibrium depends on."""
 
     @property
@@ -139,6 +140,7 @@ def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSe
         moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
         shown = evaluate_plant(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1]
         y, read = shown[loop.pid_signal.name], ca.vertcat(*(shown[n] for n in loop.readings))
+        p = schedule_gains(loop, p, y, {}, shown)
         r = pid_reference(loop, u, shown[loop.feedback.name], p)["reference"]
         every = ca.vertcat(*p.values())
         gains = loop.gains(every)

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import casadi as ca
 
 from pneuopt.control.command import CommandParts, added_command, added_terms, pid_reference
+from pneuopt.control.gain_schedule import GainSchedule, schedule_gains
 from pneuopt.control.reset_integral import reset_integral
 from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.control.wiring import Signals
@@ -26,6 +27,11 @@ class ControllerParts(CommandParts, Protocol):
     @property
     def feedback(self) -> Quantity:
         """The plant's output that the loop is judged by, and an outer loop controls."""
+        ...
+
+    @property
+    def schedule(self) -> GainSchedule | None:
+        """Gains that change with the position."""
         ...
 
     @property
@@ -72,6 +78,7 @@ def controller_update(
         else {}
     )
     measured = seen["reading"] if seen else y[loop.sensed_signal.measured.name]
+    p = dict(schedule_gains(loop, p, measured, seen, y))
     position = measured if loop.outer is None else seen["count"] if "count" in seen else y[loop.feedback.name]
     x = {**x, **_reset(loop, without_prefix(x, "pid"), u["reference"] - position, without_prefix(p, "pid"))}
     if loop.outer is not None:

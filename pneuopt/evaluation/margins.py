@@ -275,6 +275,8 @@ def sensitivity_terms(
     shaping = ", ".join(type(c).__name__ for c in acting_always(loop))
     told = "a cascade's speed loop has a response of its own; use margins(open_loop(...))"
     require(loop.outer is None, told, ModelError)
+    told = "scheduled gains change with the operating point; use margins(open_loop(...))"
+    require(loop.schedule is None, told, ModelError)
     message = f"{shaping}: its slope at the operating point counts in the sensitivity; use margins(open_loop(...))"
     require(not shaping, message, ModelError)
     free = [n for n in parameters.free_names if n in loop.plant.parameters]

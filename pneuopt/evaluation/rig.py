@@ -132,7 +132,7 @@ class Rig:
             _check_loop(self.loop)
             message = f"the controller needs {self.feedback!r}, which no sensor measures; add it to sensors"
             require(self.feedback in self.sensors, message, ModelError)
-            read = dict.fromkeys((*self.loop.readings, *([self.loop.feedback.name] if self.loop.outer else [])))
+            read = dict.fromkeys(replace(self.loop, sensor=None).readings)
             absent = ", ".join(n for n in read if n not in self.sensors)
             require(not absent, f"the controller reads {absent}, which no sensor measures; add to sensors", ModelError)
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 AxisNames = str | tuple[str, ...]
+TOGETHER = " + "  # between names of parameters that vary together, where they are one text
 Spread = float | tuple[float, float]
 Spreads = Mapping[str, Spread] | Mapping[AxisNames, Spread]
 SampleSpreads = Spreads | Mapping[str, Spread | Distribution] | Mapping[AxisNames, Spread | Distribution]
@@ -62,7 +63,8 @@ def corners(parameters: ParameterSet, spreads: Spreads) -> ScenarioValues:
     parameters : ParameterSet
         The nominal values, and the bounds.
     spreads : mapping of str, or tuple of str, to float or pair
-        The axes of the box. A key names parameters, or patterns of names, that vary together; its value is a fraction
+        The axes of the box. A key names parameters, or patterns of names, that vary together, as a tuple or as one text
+        with " + " between them; its value is a fraction
         of each parameter's value, 0.3 for +-30 %, or the least and the greatest value [SI].
 
     Returns
@@ -302,8 +304,8 @@ def _axis_names(
     out: dict[str, tuple[tuple[str, ...], Spread | Distribution]] = {}
     taken: dict[str, str] = {}
     for key, spread in spreads.items():
-        patterns = (key,) if isinstance(key, str) else key
-        axis = " + ".join(patterns)
+        patterns = tuple(key.split(TOGETHER)) if isinstance(key, str) else key
+        axis = TOGETHER.join(patterns)
         names = parameters.match_names(*patterns)
         for name in names:
             require(name not in taken, f"{name} is on two axes, {taken.get(name)!r} and {axis!r}; leave it on one")

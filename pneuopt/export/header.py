@@ -134,6 +134,12 @@ def _notes(loop: ClosedLoop, parameters: ParameterSet, centre: float) -> list[st
         notes += [
             f"A generator behind the block adds a {shape} of {size} peak at {frequency:.9g} Hz; it is not in here."
         ]
+    if loop.schedule is not None:
+        told = " and with the load told, schedule_load" if loop.schedule.load is not None else ""
+        gains = ", ".join(loop.schedule.gains)
+        notes += [
+            f"Scheduled with the position{told}: {gains}. The gains above hold in the middle, at the nominal load."
+        ]
     if loop.sensor is not None:
         notes += [f"Designed behind a sensor: {loop.sensor!r}."]
     if loop.pid.limits and math.isinf(value["pid.lower"]) and math.isinf(value["pid.upper"]):

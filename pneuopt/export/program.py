@@ -10,6 +10,7 @@ from pneuopt.control.compensation import Compensator, Instant
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form, parallel_gains
+from pneuopt.control.gain_schedule import GainSchedule, schedule_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.position_loop import PositionLoop
@@ -150,6 +151,7 @@ class _ComputedParts:
     sensed_signal: SensedSignal
     outer: PositionLoop | None
     feedback: Quantity
+    schedule: GainSchedule | None
 
 
 @dataclass(frozen=True)
@@ -182,7 +184,7 @@ def _law(loop: ClosedLoop) -> _Law:
     encoder = replace(loop.sensor, resolution=0.0) if counts and isinstance(loop.sensor, Encoder) else None
     dither = None if loop.dither is None else _WrappedDither(**vars(loop.dither))
     lead, added = loop.feedforward, loop.compensators
-    parts = _ComputedParts(loop.pid, dither, lead, added, encoder, sensed, loop.outer, loop.feedback)
+    parts = _ComputedParts(loop.pid, dither, lead, added, encoder, sensed, loop.outer, loop.feedback, loop.schedule)
     measured = sensed.outputs[encoder.position] if encoder else loop.pid_signal
     known = loop.states[len(loop.plant.states) :]
     x = symbols([q for q in known if encoder or not q.name.startswith("sensor.")]) | {SAMPLE: ca.SX.sym(SAMPLE)}
@@ -192,12 +194,14 @@ def _law(loop: ClosedLoop) -> _Law:
     t = (loop.pid.sample_time or 0.0) * x[SAMPLE]
     shown = {n: u[n] for n in loop.readings} | {measured.name: u["measured"]}
     found = controller_update(parts, t, x, u, shown, p)
-    own = without_prefix(p, "pid")
+    given: Signals = {"count": u["measured"]} if encoder else {}
+    frozen = schedule_gains(parts, p, u["measured"], given, shown)
+    own = without_prefix(frozen, "pid")
     gains = dict(zip(Form.PARALLEL.gains, parallel_gains(loop.pid.form, own), strict=True))
     converted = {} if loop.pid.form is Form.PARALLEL else {f"{n}_parallel": value for n, value in gains.items()}
     after = {**found.states, SAMPLE: x[SAMPLE] + 1}
     terms = {f"{n}_term" if n in ADDED_TERMS else n: v for n, v in found.terms.items()} | converted
-    inner = pid_reference(parts, u, shown[loop.feedback.name], p) if loop.outer else u
+    inner = pid_reference(parts, u, shown[loop.feedback.name], frozen) if loop.outer else u
     begun = _start(parts, inner, shown, {**own, "Kp": gains["Kp"]}, p[CENTRE])
     return _Law(u, x, p, measured, after, begun, terms)
 

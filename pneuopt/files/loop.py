@@ -12,10 +12,12 @@ from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
+from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, AntiWindup
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder, SensorLag
+from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import System
 from pneuopt.files.toml import construct_at, read_fixed_value, read_parameter
 from pneuopt.files.tuning_keys import LOOP_KEYS
@@ -26,7 +28,7 @@ from pneuopt.quantities.units import read_value, write_value
 
 TuningSections = Mapping[str, Any]
 
-TUNABLE_SECTIONS = ("pid", PositionLoop.section, "dither", "feedforward", *COMPENSATORS)
+TUNABLE_SECTIONS = ("pid", PositionLoop.section, "dither", "feedforward", *COMPENSATORS, GainSchedule.section)
 """Sections whose values may be free."""
 LOOP_SECTIONS = tuple(LOOP_KEYS)
 
@@ -83,7 +85,8 @@ def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
         if PositionLoop.section in table
         else None
     )
-    loop = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor)
+    schedule = _schedule(table["schedule"], plant, f"{path}: [schedule]") if "schedule" in table else None
+    loop = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
     return construct_at(lambda: loop(feedforward=lead, compensators=parts, outer=outer), str(path))
 
 
@@ -170,6 +173,24 @@ def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
 def _position_loop(table: Mapping[str, Any], where: str) -> PositionLoop:
     require("Kp" in table, f'{where} has no gain; write Kp = "10 1/s"')
     return PositionLoop()
+
+
+def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedule:
+    """A schedule of the gains whose coefficients are stated."""
+    told = 'has no {}, an end of the stroke; write low = "0 mm" and high = "200 mm", say'
+    for key in ("low", "high"):
+        require(key in table, f"{where} {told.format(key)}")
+    axis, units = plant.axis or Axis(), {q.name: q.unit for q in plant.outputs}
+    unit = units.get(axis.position, "m")
+    low, high = (read_parameter(table[key], Parameter(0.0, unit), f"{where} {key}").value for key in ("low", "high"))
+    load = None
+    if "load" in table:
+        inertia = plant.parameters.get(axis.inertia)
+        load = read_parameter(table["load"], Parameter(1.0, inertia.unit if inertia else "1"), f"{where} load").value
+    gains = GainSchedule.stated_gains(table)
+    told = "schedules no gain; write a coefficient such as Kp_slope = { value = 0, lower = -1, upper = 1, free = true }"
+    require(bool(gains), f"{where} {told}")
+    return construct_at(lambda: GainSchedule(gains, low, high, load, axis.position), where)
 
 
 def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensator:

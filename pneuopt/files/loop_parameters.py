@@ -7,6 +7,7 @@ from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
+from pneuopt.control.gain_schedule import SCHEDULED_GAINS, GainSchedule
 from pneuopt.control.pid import PID
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import SensedSignal
@@ -19,6 +20,7 @@ SAMPLE_TIME = 1e-3
 _CONDITIONS = {"Tt": "with limits, for back-calculation", "reset_band": "with reset_ratio"}
 _SECTION_CONDITIONS = {
     "position_loop": "where a position is controlled",
+    GainSchedule.section: "with low, high and a coefficient",
     "pressure_feedback": "where the plant shows both pressures",
 }
 _LIMITS = ("lower", "upper")  # parameters that a file states as a pair, limits
@@ -43,6 +45,9 @@ def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping
         "dither": _parameter_keys(Dither().parameters(command), "frequency"),
         "feedforward": _parameter_keys(Feedforward().parameters(measured, command), "gain"),
         **{name: _parameter_keys(part().parameters(signal, command), part.size) for name, part in COMPENSATORS.items()},
+        GainSchedule.section: _parameter_keys(
+            GainSchedule(SCHEDULED_GAINS, 0.0, 1.0, 1.0).parameters("m", "kg"), "low"
+        ),
     }
     for section, condition in _SECTION_CONDITIONS.items():
         parts[section] = {n: replace(key, condition=condition) for n, key in parts[section].items()}

@@ -7,7 +7,7 @@ from typing import Any
 
 from pneuopt.evaluation.distributions import DISTRIBUTIONS, Distribution
 from pneuopt.evaluation.sampling import Sampling
-from pneuopt.evaluation.scenarios import Spread
+from pneuopt.evaluation.scenarios import TOGETHER, Spread
 from pneuopt.files.budget import MAX_CASES
 from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.toml import construct_at
@@ -45,7 +45,7 @@ SAMPLED_KEY = Key(
 SAMPLES_KEY = table(
     "plants drawn from a box, or from distributions", SAMPLE_KEYS, others=SAMPLED_KEY, named="parameter"
 )
-CORNERS_KEY = table("plants at the corners of a box", {}, others=SPREAD_KEY, named="parameter")
+CORNERS_KEY = table('plants at the corners of a box; "a + b" vary together', {}, others=SPREAD_KEY, named="parameter")
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _read_spread(given: Any, pattern: str, where: str, parameters: ParameterSet,
     spot = f"{where} {pattern}"
     if not isinstance(given, list):
         return read_value(given, "1", where=spot)
-    unit = parameters[parameters.match_names(pattern)[0]].unit
+    unit = parameters[parameters.match_names(pattern.split(TOGETHER, maxsplit=1)[0])[0]].unit
     require(len(given) == 2, f'{spot}: write a fraction, "30 %", or two values, the least first')
     second = difference_unit(unit) if word in _SECOND_IS_DIFFERENCE else "1" if word in _SECOND_IS_FRACTION else unit
     with count_gauge_from(ambient_pressure(parameters)):
@@ -127,7 +127,11 @@ def _flatten(entries: Mapping[str, Any], parameters: ParameterSet, prefix: str =
     for key, entry in entries.items():
         name = f"{prefix}{key}"
         is_spread = (
-            name in parameters or "*" in name or not isinstance(entry, dict) or SPREAD_KEYS.keys() & entry.keys()
+            name in parameters
+            or "*" in name
+            or TOGETHER in name
+            or not isinstance(entry, dict)
+            or SPREAD_KEYS.keys() & entry.keys()
         )
         found |= {name: entry} if is_spread else _flatten(entry, parameters, f"{name}.")
     return found

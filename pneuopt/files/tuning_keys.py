@@ -11,6 +11,7 @@ from enum import Enum
 from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Waveform
 from pneuopt.control.forms import Form
+from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.pid import AntiWindup
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder
@@ -64,6 +65,7 @@ LOOP_KEYS: Mapping[str, Mapping[str, Key]] = {
         }
         for section, part in COMPENSATORS.items()
     },
+    GainSchedule.section: {},
 }
 """By section the keys that choose how a loop is built, and those of its sensor."""
 
@@ -75,6 +77,7 @@ LOOP_MEANINGS: Mapping[str, str] = {
     "dither": "a small oscillation added to the command",
     "feedforward": "what a change of the reference adds to the command",
     **{section: first_sentence(part) for section, part in COMPENSATORS.items()},
+    GainSchedule.section: "gains that change with the position and the load",
 }
 
 OBJECTIVE_KEYS: Mapping[str, Key] = {"weight": Key("its share of the objective", usual=1.0)}

@@ -86,6 +86,7 @@ def _draw_position_loop(sheet: Sheet, loop: ClosedLoop) -> None:
 
 def _draw_pid(sheet: Sheet, loop: ClosedLoop) -> None:
     notes = [f"PID, {loop.pid.form.value} form;", "P sees b r − y, D sees c r − y"]
+    notes += ["gains follow position and load"] if loop.schedule else []
     notes += ["the integral has a dead band"] if loop.pid.dead_band else []
     notes += ["the error's change of sign resets it"] if loop.pid.reset else []
     notes += ["it is clamped at a limit"] if loop.pid.limits and loop.pid.anti_windup is AntiWindup.CLAMPING else []

@@ -304,7 +304,8 @@ class LinearisedProblem:
         )
         loop = self._simulator.loop
         outer = (loop.outer,) if loop.outer else ()
-        sections = tuple(f"{c.section}." for c in (*outer, *acting_always(loop)))
+        scheduled = (loop.schedule,) if loop.schedule else ()
+        sections = tuple(f"{c.section}." for c in (*outer, *scheduled, *acting_always(loop)))
         felt = {*(f"pid.{gain}" for gain in loop.pid.form.gains), DITHER_AMPLITUDE, DITHER_FREQUENCY}
         shaping = [k for k, name in enumerate(names) if name in felt or name.startswith(sections)]
         found: dict[type, tuple[Array, Array]] = {

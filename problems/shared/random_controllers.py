@@ -8,6 +8,7 @@ from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
+from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, AntiWindup
 from pneuopt.control.position_loop import PositionLoop
@@ -50,6 +51,9 @@ RANGES = {
     "width": (0.004, 0.02),
     "period": (0.02, 0.08),
     "filter": (0.0, 0.01),
+    **dict.fromkeys(("Kp_slope", "Kp_curve", "K_slope", "K_curve", "position_loop_Kp_slope"), (-0.5, 0.5)),
+    **dict.fromkeys(("Kp_load", "K_load"), (-1.0, 1.0)),
+    "load": (2.0, 9.0),
 }
 
 
@@ -81,10 +85,12 @@ def random_loop(seed: int) -> tuple[ClosedLoop, ParameterSet, float]:
     measured = "position" if seed % 4 == 1 else "speed"
     outer = PositionLoop() if seed % 8 == 1 else None
     lead = None if outer else lead
+    gains = (f"pid.{form.gains[0]}", *(["position_loop.Kp"] if outer else []))
+    schedule = GainSchedule(gains, -0.04, 0.05, load=5.0 if seed % 3 else None) if seed % 4 < 2 else None
     kinds = [k for k in COMPENSATORS.values() if g.integers(2)]
     loop = ClosedLoop(
         PneumaticDrive(friction=Viscous()), pid, dither, measured=measured, sensor=sensor, feedforward=lead,
-        compensators=tuple(k() for k in kinds), outer=outer,
+        compensators=tuple(k() for k in kinds), outer=outer, schedule=schedule,
     )  # fmt: skip
     values = {
         n: g.uniform(*RANGES.get(n, RANGES[n.split(".")[1]]))

@@ -96,3 +96,7 @@ def test_every_form_and_part_is_among_the_random_controllers() -> None:
     assert {loop.pid.anti_windup for loop in loops if loop.pid.limits} == set(AntiWindup)
     assert {loop.feedforward is None for loop in loops} == {False, True}
     assert {type(loop.sensor).__name__ for loop in loops if loop.outer} == {"NoneType", "Encoder"}
+    scheduled = [(loop.pid_signal.name, loop.schedule.load, bool(loop.outer)) for loop in loops if loop.schedule]
+    assert [set(kinds) for kinds in zip(*scheduled, strict=True)] == [
+        {"position", "speed"}, {None, 5.0}, {False, True}
+    ]  # fmt: skip

@@ -12,6 +12,7 @@ from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
+from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.position_loop import PositionLoop
@@ -27,7 +28,18 @@ from pneuopt.quantities.parameters import Quantity
 
 SAMPLED = {"limits", "hold", "controller, every"}
 RIVALS = {"friction feedforward", "knocker", "dead zone inverse"}
-OPTIONS = {*SAMPLED, *RIVALS, "dither", "generator", "computing", "feedforward gain", "sensor:", "encoder", "dead band"}
+OPTIONS = {
+    *SAMPLED,
+    *RIVALS,
+    "dither",
+    "generator",
+    "computing",
+    "feedforward gain",
+    "sensor:",
+    "encoder",
+    "dead band",
+    "gains follow",
+}
 FORCE, VALVE = ForceDrive(LuGre()).system(), PneumaticDrive(friction=LuGre()).system()
 BARE = ClosedLoop(FORCE, PID(limits=False))
 
@@ -64,6 +76,10 @@ LOOPS = {
     "cascade": (
         ClosedLoop(VALVE, PID(1e-3), sensor=Encoder(), outer=PositionLoop()),
         {*SAMPLED, "encoder"},
+    ),
+    "scheduled": (
+        ClosedLoop(VALVE, PID(1e-3), measured="position", schedule=GainSchedule(("pid.Kp",), 0.0, 0.2)),
+        {*SAMPLED, "gains follow"},
     ),
     "other input": (ClosedLoop(pushed(), PID(limits=False), actuated="valve_voltage"), set()),
 }
