@@ -45,6 +45,7 @@ from .evaluation.dither_effect import dither_effect
 from .evaluation.dither_verdict import DitherVerdict, Usefulness, judge_dither
 from .evaluation.energy import EnergyUse
 from .evaluation.evaluate import evaluate, respond
+from .evaluation.excitation_run import ExcitationRun, excitation_run
 from .evaluation.expected_plants import ExpectedPlants, expected_plants
 from .evaluation.limit_cycle import LimitCycle, find_limit_cycle
 from .evaluation.margins import Margins, frequency_response, margins
@@ -212,6 +213,7 @@ __all__ = [
     "Encoder",
     "EnergyUse",
     "EventKind",
+    "ExcitationRun",
     "ExpectedPlants",
     "Experiment",
     "ExperimentDesign",
@@ -346,6 +348,7 @@ __all__ = [
     "evaluate",
     "evaluate_batch",
     "examine_logs",
+    "excitation_run",
     "expected_plants",
     "export_controller",
     "export_fmu",

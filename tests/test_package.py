@@ -197,6 +197,8 @@ PUBLIC_NAMES = [
     "FollowingErrorRMS",
     "OvershootDistance",
     "check_move",
+    "ExcitationRun",
+    "excitation_run",
     "shortest_move",
     "MoveSequence",
     "MotionPath",

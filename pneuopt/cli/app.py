@@ -16,7 +16,7 @@ from typer.models import CommandFunctionType
 from pneuopt.cli.command_help import COMMAND_HELP, epilog
 from pneuopt.cli.errors import report_errors
 from pneuopt.cli.guard import run_guarded
-from pneuopt.cli.options import Accept, Json, Plot, Quiet, ReportFile, Window
+from pneuopt.cli.options import Accept, Between, Json, Plot, Quiet, ReportFile, RunOf, RunSampleTime, RunSpeed, Window
 from pneuopt.quantities.errors import require
 
 app = typer.Typer(
@@ -64,9 +64,19 @@ def init_command(
         Path | None, typer.Option("--from", metavar="LOG", help="Fill the sidecar of this log by what it shows.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
+    run: RunOf = None,
+    between: Between = "",
+    speed: RunSpeed = "",
+    sample_time: RunSampleTime = "1ms",
 ) -> None:
-    """Write a first drive.toml, tuning.toml, study.toml, rig.toml and log.toml, with every key explained."""
+    """Write a first drive.toml, tuning.toml, study.toml, rig.toml and log.toml, or a run to play."""
     with report_errors():
+        if run is not None:
+            from pneuopt.cli.init_run import RunOptions, run_init_run
+
+            unused = {"KIND": kind, "--size": size, "--cylinder": cylinder, "--valve": valve, "--from": log}
+            raise typer.Exit(run_init_run(run, folder, RunOptions(between, speed, sample_time), force, unused))
+        require(not (between or speed), "--between and --speed are limits of a run: give --run DRIVE with them")
         from pneuopt.cli.init import run_init
 
         parts = {"size": size, "cylinder": cylinder, "valve": valve}

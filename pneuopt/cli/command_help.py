@@ -14,7 +14,11 @@ class CommandHelp(NamedTuple):
 COMMAND_HELP = {
     "init": CommandHelp(
         "Write the first files, every key explained.",
-        ("pneuopt init pneumatic --cylinder 32 --valve 700", "pneuopt init --from run_01.csv"),
+        (
+            "pneuopt init pneumatic --cylinder 32 --valve 700",
+            "pneuopt init --from run_01.csv",
+            "pneuopt init --run drive.toml --between 20mm..180mm",
+        ),
         "Then: pneuopt check drive.toml run_01.csv. What a key means: pneuopt keys KEY",
     ),
     "check": CommandHelp(

@@ -97,7 +97,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     )
     write_files({path: text for path, text in placed.items() if path not in kept}, force)
     if guessed is not None:
-        _say(f"the log's columns are those of a {name} drive; pneuopt init KIND --from LOG for another")
+        say(f"the log's columns are those of a {name} drive; pneuopt init KIND --from LOG for another")
     written = [n for n in files if folder / n not in kept]
     _show_files(folder, written, guess, unused, ask.assumed, log)
     return EXIT_SUCCESS
@@ -180,7 +180,7 @@ def _show_files(
     """Say what was written, what was assumed, and what comes next."""
     names = [name for name in written if name.endswith(".toml")]
     schemas = " and schemas/" if len(names) < len(written) else ""
-    _say(f"wrote {', '.join(names)}{schemas}" + ("" if folder == Path() else f" in {folder}"))
+    say(f"wrote {', '.join(names)}{schemas}" + ("" if folder == Path() else f" in {folder}"))
     if log is not None:
         for column in guess.columns:
             unit = f" [{column.unit}]" if column.unit else ", time stamps"
@@ -189,13 +189,13 @@ def _show_files(
             text = f"column {column.column!r}{unit}{centre}{note}"
             if column.channel in unused:
                 text = f"left out, column {column.column!r}: this kind of drive does not use it"
-            _say(f"{column.channel}: {text}", "  ")
+            say(f"{column.channel}: {text}", "  ")
         if guess.unused:
-            _say(f"not read: {', '.join(guess.unused)}", "  ")
-        _say(f"a row every {write_value(guess.sample_time, 's')}", "  ")
+            say(f"not read: {', '.join(guess.unused)}", "  ")
+        say(f"a row every {write_value(guess.sample_time, 's')}", "  ")
     for doubt in assumed:
-        _say(f"assumed, check it in [columns] of {sidecar_name(log.name) if log else ''}: {doubt}")
-    _say("Next: put what you know into drive.toml, then")
+        say(f"assumed, check it in [columns] of {sidecar_name(log.name) if log else ''}: {doubt}")
+    say("Next: put what you know into drive.toml, then")
     place = "LOG" if log is None else str(log)
     typer.echo(f"  pneuopt check drive.toml {place}")
     typer.echo(f"  pneuopt identify drive.toml {place} -o fit.toml")
@@ -203,5 +203,6 @@ def _show_files(
     typer.echo("What a key means: pneuopt keys KEY")
 
 
-def _say(text: str, indent: str = "") -> None:
+def say(text: str, indent: str = "") -> None:
+    """Print a sentence in lines of the screen's width."""
     typer.echo("\n".join(textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")))

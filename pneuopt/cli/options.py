@@ -22,3 +22,14 @@ Accept = Annotated[
     ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+RunOf = Annotated[
+    Path | None,
+    typer.Option("--run", metavar="DRIVE", help="Write a run of moves from whose log this drive is identified."),
+]
+Between = Annotated[
+    str, typer.Option(metavar="LOW..HIGH", help="Of --run: 20mm..180mm.", show_default="a tenth from either end stop")
+]
+RunSpeed = Annotated[
+    str, typer.Option(metavar="VALUE", help="Of --run, the largest: 0.3m/s.", show_default="half the drive's")
+]
+RunSampleTime = Annotated[str, typer.Option(metavar="TIME", help="Of --run, the controller's.")]

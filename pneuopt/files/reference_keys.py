@@ -34,7 +34,8 @@ MOVE_KEYS: Mapping[str, Key] = {
         condition="in place of step and horizon",
     ),
     "moves": Key(
-        "distances of moves one after the other; metrics are of the last",
+        "distances of moves one after the other, or tables { distance, speed, dwell, ... } with limits of their own; "
+        "metrics are of the last",
         Takes.LIST,
         "{difference}",
         example='["200 mm", "-200 mm"]',
@@ -51,5 +52,10 @@ MOVE_KEYS: Mapping[str, Key] = {
     "dwell": Key("from its end to the end of the experiment", unit="s", usual=Move.dwell, condition=_OF_A_MOVE),
     **_SHARED_KEYS,
 }
+OWN_MOVE_KEYS: Mapping[str, Key] = {
+    "distance": replace(MOVE_KEYS["move"], condition="of one of several moves"),
+    **{n: MOVE_KEYS[n] for n in ("speed", "acceleration", "jerk", "profile", "dwell")},
+}
+"""Those of one of several moves."""
 REFERENCE_KEYS: Mapping[str, Key] = {**STEP_KEYS, **MOVE_KEYS}
 """All of them."""

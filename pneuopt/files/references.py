@@ -8,7 +8,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move
 from pneuopt.control.reference import Reference, Step
-from pneuopt.files.reference_keys import MOVE_KEYS, REFERENCE_KEYS, STEP_KEYS
+from pneuopt.files.reference_keys import MOVE_KEYS, OWN_MOVE_KEYS, REFERENCE_KEYS, STEP_KEYS
 from pneuopt.files.toml import construct_at, read_fixed_value
 from pneuopt.files.tuning_keys import signal_units
 from pneuopt.quantities.errors import check_names, require
@@ -50,28 +50,37 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Refere
     known = _numbers(entry, keys, loop, where) | _circumstances(entry, loop, where)
     if moves:
         known |= _profile(entry, where)
-        distances = _distances(entry, loop, where) if "moves" in entry else [known.pop("move")]
-        return construct_at(lambda: _chain_moves(distances, known), where)
+        each = _each_move(entry, loop, where) if "moves" in entry else [{"distance": known.pop("move")}]
+        return construct_at(lambda: _chain_moves(each, known), where)
     return construct_at(lambda: Step(known.pop("step", 0.0), **known), where)
 
 
-def _distances(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> list[float]:
-    """Read the distances of several moves."""
+def _each_move(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> list[dict[str, Any]]:
+    """Read several moves: the distance of each, and the settings that it has for itself."""
     given, unit = entry["moves"], difference_unit(loop.feedback.unit)
     require(isinstance(given, list) and len(given) > 0, f'{where} moves must be a list, ["200 mm", "-200 mm"]')
-    return [read_value(distance, unit, where=f"{where} moves") for distance in given]
+    found = []
+    for k, move in enumerate(given, 1):
+        if not isinstance(move, dict):
+            found.append({"distance": read_value(move, unit, where=f"{where} moves")})
+            continue
+        spot = f"{where} moves {k}"
+        check_names("key", move, OWN_MOVE_KEYS, spot)
+        require("distance" in move, f'{spot} has no distance; write {{ distance = "200 mm", speed = "0.1 m/s" }}')
+        found.append(_numbers(move, OWN_MOVE_KEYS, loop, spot) | _profile(move, spot))
+    return found
 
 
-def _chain_moves(distances: Sequence[float], settings: Mapping[str, Any]) -> Reference:
-    """One move, or a sequence of moves that share limits and dwell."""
-    first, *others = distances
+def _chain_moves(each: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) -> Reference:
+    """One move, or a sequence of moves that share the limits and the dwell that they have not for themselves."""
+    first, *others = each
     if not others:
-        return Move(first, **settings)
+        return Move(**{**settings, **first})
     begins = {n: settings[n] for n in ("at", "initial", "start") if n in settings}
     shared = {n: value for n, value in settings.items() if n not in begins and n != "disturbance"}
     last = {"disturbance": settings.get("disturbance", {})}
-    moves = [Move(distance, **shared, **(last if k == len(others) else {})) for k, distance in enumerate(others, 1)]
-    return MoveSequence([Move(first, **begins, **shared), *moves])
+    moves = [Move(**{**shared, **own, **(last if k == len(others) else {})}) for k, own in enumerate(others, 1)]
+    return MoveSequence([Move(**{**begins, **shared, **first}), *moves])
 
 
 def _profile(entry: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -310,3 +310,37 @@ def test_a_question_takes_the_letter_that_it_names(answer: str, monkeypatch: pyt
     monkeypatch.setattr("pneuopt.cli.init.typer.prompt", lambda *_, **__: answer)
     ask = Asker(interactive=True)
     assert ask(Question("pressure_a", "Absolute (a), or gauge (g)?", ("bar(a)", "bar(g)"))) == "bar(g)"
+
+
+def test_a_run_is_written_and_replaces_nothing(tmp_path: Path) -> None:
+    drive = str(Path(__file__).parents[2] / "data" / "pneumatic_rig" / "drive.toml")
+    limits = ("--between", "60mm..140mm", "--speed", "0.2m/s")
+    code, said = run("init", "--run", drive, *limits, "-o", str(tmp_path))
+    assert code == 0, said
+    assert "between 60 mm and 140 mm, at 0.2 m/s at most" in said
+    assert "Log valve_voltage, position, pressure_a, pressure_b" in said
+    model, known = read_drive(drive)
+    assert read_tuning(tmp_path / "run.toml", model.system(), known).loop.feedback.name == "position"
+    assert read_log(tmp_path / "moves.csv").trajectory["position_reference"].max() == pytest.approx(0.14)
+    (tmp_path / "moves.csv").write_text("mine", encoding="utf-8")
+    code, said = run("init", "--run", drive, *limits, "-o", str(tmp_path))
+    assert (code, "--force replaces it" in said) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("pneumatic", "--run", "d.toml"), "--run reads the drive from its file: leave out KIND"),
+        (("--between", "1mm..2mm", "pneumatic"), "limits of a run: give --run DRIVE"),
+        (("--run", "{drive}", "--between", "20mm"), "--between 20mm: give both ends, as in 20mm..180mm"),
+        (("--run", "{drive}", "--between", "2mm..1mm"), "the first end must be below the second"),
+        (("--run", "{drive}", "--sample-time", "0ms"), "--sample-time 0ms: give the controller's"),
+        (("--run", "{drive}", "--speed", "1mm/s"), "does not tell viscous friction from Coulomb's; allow 50 mm/s"),
+    ],
+)
+def test_a_run_that_cannot_be_is_refused_in_a_line(tmp_path: Path, words: tuple[str, ...], said: str) -> None:
+    drive = Path(__file__).parents[2] / "data" / "pneumatic_rig" / "drive.toml"
+    given = [word.format(drive=drive) for word in words]
+    code, told = run("init", *given, "-o", str(tmp_path))
+    assert (code, said in told.replace("\n", " ")) == (2, True), told
+    assert not list(tmp_path.iterdir())

@@ -53,6 +53,15 @@ def test_a_reference_may_be_several_moves(tmp_path: Path) -> None:
     assert read_tuning(written(tmp_path, several), drive).references == (MoveSequence([first, second]),)
 
 
+def test_one_of_several_moves_may_have_limits_of_its_own(tmp_path: Path) -> None:
+    drive = ForceDrive(Coulomb()).system()
+    own = '{ distance = "-0.1 m", speed = "10 mm/s", dwell = "1 s", profile = "s-curve" }'
+    several = MOVE.replace('move = "-200 mm"', f'moves = ["200 mm", {own}]')
+    first = Move(0.2, speed=0.5, acceleration=5.0, jerk=100.0, at=0.1, initial=0.05, dwell=2.0)
+    second = replace(first, distance=-0.1, speed=0.01, dwell=1.0, at=0.0, initial=0.0, disturbance={"load.force": 20.0})
+    assert read_tuning(written(tmp_path, several), drive).references == (MoveSequence([first, second]),)
+
+
 def test_a_reference_may_be_a_move(tmp_path: Path) -> None:
     drive = ForceDrive(Coulomb()).system()
     push = {"load.force": 20.0}
@@ -71,6 +80,8 @@ def test_a_reference_may_be_a_move(tmp_path: Path) -> None:
         ('move = "-200 mm"', 'step = "1 mm"\nmove = "1 mm"', "has more than one of step, move and moves"),
         ('move = "-200 mm"', 'moves = "-200 mm"', "moves must be a list"),
         ('move = "-200 mm"', 'moves = ["-200 mm", "0 mm"]', "Move: distance must not be zero"),
+        ('move = "-200 mm"', 'moves = ["1 mm", { speed = "1 m/s" }]', "moves 2 has no distance; write { distance"),
+        ('move = "-200 mm"', 'moves = ["1 mm", { distance = "1 mm", at = "1 s" }]', "unknown key 'at'"),
         ('speed = "0.5 m/s"', "", "[[reference]] 1 has no speed"),
         ('jerk = "100 m/s^3"', 'profile = "ramp"', "unknown profile 'ramp'"),
         (
