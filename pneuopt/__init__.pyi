@@ -163,6 +163,7 @@ from .studies.journal import Journal
 from .studies.local_sensitivity import LocalSensitivity, local_sensitivity
 from .studies.neighbours import search_again, sweep_from_neighbours
 from .studies.processes import Processes
+from .studies.row_file import RowFile
 from .studies.sensitivity import Sensitivity, sensitivity
 from .studies.sweep import sweep
 from .tuning.pareto import pareto_front
@@ -297,6 +298,7 @@ __all__ = [
     "Ripple",
     "RiseTime",
     "RotaryDrive",
+    "RowFile",
     "Sampling",
     "SecondOrder",
     "Sensitivity",

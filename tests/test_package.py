@@ -213,6 +213,7 @@ PUBLIC_NAMES = [
     "ripple",
     "RiseTime",
     "RotaryDrive",
+    "RowFile",
     "samples",
     "Sampling",
     "save_figure",

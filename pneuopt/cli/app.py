@@ -224,7 +224,7 @@ def study_command(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning, and which cases, or a front.")
     ],
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="CSV, or .parquet.")] = None,
     json: Json = None,
     plot: Plot = None,
     report: ReportFile = None,

@@ -2,14 +2,17 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.evaluation.report import metric_cell
 from pneuopt.evaluation.requirements import larger_is_better
-from pneuopt.quantities.output import format_table
+from pneuopt.quantities.output import format_table, write_bytes, write_text
 from pneuopt.quantities.report import Column, Line, Report, Table, Tone, format_number
 from pneuopt.studies.outcome import INTERRUPTED_CASE
+from pneuopt.studies.row_file import PARQUET, parquet_bytes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -99,10 +102,18 @@ def lead_report(verdict: str, status: int) -> Report:
     return Report((Line(verdict, Tone.BAD if status else Tone.GOOD),))
 
 
-def format_csv(table: "pd.DataFrame", units: Mapping[str, str]) -> str:
-    """As CSV, the units in the header."""
-    header = {n: f"{n} [{unit}]" for n, unit in units.items() if unit}
-    return format_table(table.rename(columns=header))
+def table_writer(path: Path, table: "pd.DataFrame", units: Mapping[str, str]) -> Callable[[Path], None]:
+    """What writes a table with units in its header: as Parquet where the file to be is called so, else as CSV."""
+    named = table.rename(columns={n: heading(n, unit) for n, unit in units.items()})
+    if path.suffix.lower() == PARQUET:
+        columns = {str(n): named[n].tolist() for n in named}
+        return partial(write_bytes, content=parquet_bytes(columns))
+    return partial(write_text, text=format_table(named))
+
+
+def heading(name: str, unit: str) -> str:
+    """A column's name with its unit, "SettlingTime [s]"."""
+    return f"{name} [{unit}]" if unit else name
 
 
 def _format_gain(value: float) -> str:

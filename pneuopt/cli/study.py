@@ -1,7 +1,7 @@
 """`pneuopt study`: a loop certified over a grid of parameters or other cases; a front is in `study_front`."""
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from pneuopt.cli.shared import (
     read_fit_and_tuning,
     warn_of_status,
 )
-from pneuopt.cli.show_studies import format_csv, lead_report, report_cases, report_checks
+from pneuopt.cli.show_studies import heading, lead_report, report_cases, report_checks, table_writer
 from pneuopt.cli.study_front import run_front
 from pneuopt.cli.study_pages import MAX_MAP_AXES, case_page
 from pneuopt.cli.study_sensitivity import run_sensitivity
@@ -34,7 +34,7 @@ from pneuopt.files.study_cases import Cases, read_study_cases
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.plotting import plot_distribution, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
-from pneuopt.quantities.output import records, write_text
+from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.source import read_once
@@ -85,7 +85,9 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     if any(SAMPLE_TIME_AXIS in values for values in cases.values()):
         parameters = with_sample_time(task.loop, parameters)
     check_names("metric", study.show, units, f"{file}: [metrics] show")
-    with keep_cases(study, outputs, len(cases), computing.resume) as journal, computing.open() as executor:
+    column_units = partial(_column_unit, {axis.name: parameters[axis.name].unit for axis in axes}, task.loop)
+    heads = partial(_cell_heading, column_units)
+    with keep_cases(study, outputs, len(cases), computing.resume, heads) as journal, computing.open() as executor:
         table, checks = _compute_cases(study, task, parameters, (cases, axes), quiet, journal, executor)
     verdict, status = _grid_verdict(table, len(task.references))
     if checks is not None:
@@ -99,8 +101,7 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
         report += report_checks(checks)
     writers: Writers = {}
     if outputs.output is not None:
-        text = _grid_csv(table, {n: parameters[n].unit for n in written}, task.loop)
-        writers[outputs.output] = partial(write_text, text=text)
+        writers[outputs.output] = table_writer(outputs.output, table, {str(c): column_units(str(c)) for c in table})
     tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
     tables |= {} if checks is None else {"checks": records(checks)}
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
@@ -108,7 +109,7 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     page = partial(case_page, study, report, drawn, written, metrics)
     finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
     if journal is not None and stopped is None:
-        journal.path.unlink(missing_ok=True)
+        journal.delete()
     return status
 
 
@@ -266,8 +267,14 @@ def _metric_name(column: Hashable) -> str:
     return str(column).partition("[")[0]
 
 
-def _grid_csv(table: "pd.DataFrame", axes: Mapping[str, str], loop: ClosedLoop) -> str:
-    """As CSV, each column with its unit."""
+def _column_unit(axes: Mapping[str, str], loop: ClosedLoop, column: str) -> str:
+    """The unit of a column of the table; empty for a name or a reason."""
     own = (loop.command.unit, loop.feedback.unit)
     known = {**axes, **{n: metric.shown_unit(*own) for n, metric in METRICS.items()}, "seconds": "s"}
-    return format_csv(table, {str(c): known.get(_metric_name(c), "") for c in table})
+    return known.get(_metric_name(column), "")
+
+
+def _cell_heading(unit: Callable[[str], str], column: str) -> str:
+    """A column of the rows that are written as they come; a gain that was found has its own name in the table."""
+    name = column.removeprefix(f"{FOUND} ")
+    return heading(name, unit(name))

@@ -14,7 +14,7 @@ from pneuopt.cli.shared import (
     read_fit_and_tuning,
     warn_of_status,
 )
-from pneuopt.cli.show_studies import format_csv, lead_report, report_front
+from pneuopt.cli.show_studies import lead_report, report_front, table_writer
 from pneuopt.cli.study_pages import front_page
 from pneuopt.cli.terminal import progress
 from pneuopt.evaluation.metric import Requirement, Sense
@@ -33,7 +33,7 @@ from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import plot_front
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.output import records, write_text
+from pneuopt.quantities.output import records
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
 from pneuopt.studies.outcome import INTERRUPTED_CASE
@@ -75,7 +75,7 @@ def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
     if outputs.output is not None:
         claimed = {f"claimed {n}": unit for n, unit in pair.items()}
         units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
-        writers[outputs.output] = partial(write_text, text=format_csv(front, units))
+        writers[outputs.output] = table_writer(outputs.output, front, units)
     hashes = file_hashes(study.path, study.drive, study.tuning)
     tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}, "provenance": hashes}
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None

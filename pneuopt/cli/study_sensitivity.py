@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from pneuopt.cli.computing import Computing, keep_cases
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import Outputs, Writers, file_hashes, finish, read_fit_and_tuning, warn_of_status
-from pneuopt.cli.show_studies import format_csv, lead_report
+from pneuopt.cli.show_studies import lead_report, table_writer
 from pneuopt.cli.study_pages import sensitivity_page
 from pneuopt.cli.terminal import progress
 from pneuopt.evaluation.evaluate import evaluate
@@ -18,7 +18,7 @@ from pneuopt.files.study_cases import read_sensitivity
 from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import plot_sensitivity
 from pneuopt.quantities.errors import check_names
-from pneuopt.quantities.output import records, write_text
+from pneuopt.quantities.output import records
 from pneuopt.quantities.status import Code, Status
 from pneuopt.studies.local_sensitivity import LocalSensitivity, local_sensitivity
 from pneuopt.studies.outcome import INTERRUPTED_CASE
@@ -57,7 +57,7 @@ def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Comp
         )
     status = _write(study, outputs, found, slopes)
     if journal is not None and status != EXIT_INTERRUPTED:
-        journal.path.unlink(missing_ok=True)
+        journal.delete()
     return status
 
 
@@ -67,7 +67,7 @@ def _write(study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSens
     report = lead_report(verdict, status) + found.summary()
     writers: Writers = {}
     if outputs.output is not None:
-        writers[outputs.output] = partial(write_text, text=format_csv(_join(found, slopes), {}))
+        writers[outputs.output] = table_writer(outputs.output, _join(found, slopes), {})
     tables: dict[str, Any] = {"verdict": verdict, "shares": records(found.table), "figures": records(found.figures)}
     if slopes is not None:
         report += slopes.summary()

@@ -106,6 +106,19 @@ def format_table(frame: "pd.DataFrame") -> str:
     return str(shown.to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 
+def format_cell(value: Any) -> str:
+    """A value as a cell of such a CSV.
+
+    Examples
+    --------
+    >>> [format_cell(v) for v in (1 / 3, float("nan"), True, "=1+1", None)]
+    ['0.333333333', '', 'True', "'=1+1", '']
+    """
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.9g}"
+    return "" if value is None else str(_quote_formula(value))
+
+
 def _quote_formula(cell: Any) -> Any:
     return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA_STARTS) else cell
 

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from math import ceil, inf, nan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -207,6 +207,9 @@ class _Memory:
         self._journal, self._marks, self._columns = journal, CaseMarks(parameters), columns
         self._cases, self.kept = list(cases.items()), 0
         self.missing = np.array([k for k in range(len(cases)) if not self._recall(k)], dtype=np.intp)
+        if journal is not None:
+            known = np.setdiff1d(np.arange(len(cases)), self.missing)
+            journal.show(self._row(k, "") for k in known.tolist())
 
     @property
     def done(self) -> int:
@@ -221,6 +224,13 @@ class _Memory:
             results = {n: float(column[k]) for n, column in self._columns.items()}
             assert self._journal is not None
             self._journal.add(name, self._marks.of(values), Outcome(results, error=errors[k]))
+        if self._journal is not None:
+            self._journal.show(self._row(k, errors[k]) for k in rows.tolist())
+
+    def _row(self, k: int, error: str) -> dict[str, Any]:
+        """A plant's row for those who watch."""
+        name, values = self._cases[k]
+        return {"case": name, **values, **{n: float(column[k]) for n, column in self._columns.items()}, "error": error}
 
     def _recall(self, k: int) -> bool:
         """Fill a row of the columns, if the journal has all of it."""

@@ -4,14 +4,15 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.studies.outcome import CaseValues, Outcome
+from pneuopt.studies.row_file import RowFile
 
 _SYNC_SECONDS = 1.0
 """Time between two waits for the disk [s]: only what came since is lost where the machine itself loses power; a wait a
@@ -30,6 +31,9 @@ class Journal:
         and values of a case are checked case by case.
     resume : bool
         Whether the file must be there, and of this study.
+    rows : RowFile, optional
+        Gets the rows of the table as they come, for people and other programs to read while the study runs; failed
+        cases are in it.
 
     Attributes
     ----------
@@ -37,6 +41,7 @@ class Journal:
         What an earlier run of the same study computed, by case.
     problem : str
         Why cases could not be kept, a full disk; empty where all are.
+    rows : RowFile or None
 
     Raises
     ------
@@ -45,8 +50,10 @@ class Journal:
         changed.
     """
 
-    def __init__(self, path: str | Path, identity: str | Mapping[str, str], *, resume: bool = False) -> None:
-        self.path, self.problem = Path(path), ""
+    def __init__(
+        self, path: str | Path, identity: str | Mapping[str, str], *, resume: bool = False, rows: RowFile | None = None
+    ) -> None:
+        self.path, self.problem, self.rows = Path(path), "", rows
         study = {**({"study": identity} if isinstance(identity, str) else identity), **_versions()}
         try:
             lines = self.path.read_bytes().splitlines() if self.path.exists() else []
@@ -78,8 +85,20 @@ class Journal:
         except OSError as error:  # a full disk does not end the study
             self._is_cut, self.problem = True, _describe_failure(self.path, error)
 
+    def show(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Put rows of the study's table into the file that shows them, if there is one."""
+        if self.rows is not None:
+            self.rows.extend(rows)
+
+    def delete(self) -> None:
+        """Delete the files of a study whose table is written."""
+        for path in (self.path, *([self.rows.path] if self.rows is not None else [])):
+            path.unlink(missing_ok=True)
+
     def close(self, *, finished: bool) -> None:
-        """Close the file; it is deleted where all is done, or nothing is in it."""
+        """Close the files; they are deleted where all is done, the journal also where nothing is in it."""
+        if self.rows is not None:
+            self.rows.close(finished=finished)
         try:
             self._file.close()
         except OSError as error:  # what a full disk has left in the buffer

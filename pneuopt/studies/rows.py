@@ -51,6 +51,13 @@ class CaseRows:
         """Whether a case has no outcome yet."""
         return self._errors[self._places[name]] == INTERRUPTED_CASE
 
+    def row(self, name: str) -> dict[str, Any]:
+        """The row of a case that has an outcome, without the results that it lacks."""
+        place, case = self._places[name], self._cases[name]
+        row: dict[str, Any] = {"case": name} | {n: _value_of(n, case, self._parameters) for n in self._swept}
+        row |= {n: column[place] for n, column in self._results.items() if not self._errors[place]}
+        return row | {"seconds": self._seconds[place], "error": self._errors[place]}
+
     def columns(self) -> dict[str, list[Any]]:
         """The table's columns."""
         columns: dict[str, list[Any]] = {"case": list(self._places)}

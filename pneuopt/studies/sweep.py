@@ -93,6 +93,7 @@ def sweep(
         for name, values in cases.items():
             if (outcome := journal.find(name, marks.of(values))) is not None:
                 rows.add(name, outcome)
+        journal.show(rows.row(name) for name in cases if not rows.is_missing(name))
     missing = ((name, values) for name, values in cases.items() if rows.is_missing(name))
     given = fn, parameters, missing, len(cases) - rows.done
     if executor is None or isinstance(executor, Processes):
@@ -107,6 +108,7 @@ def sweep(
             rows.add(name, outcome)
             if journal is not None:
                 journal.add(name, marks.of(cases[name]), outcome)
+                journal.show([rows.row(name)])
             report(meter.text(), rows.done, len(cases))
     return WideFrame(rows.columns())
 

@@ -236,11 +236,15 @@ def test_an_interrupted_study_keeps_what_is_done(folder: Path, monkeypatch: pyte
     assert pd.read_csv("cases.csv")["error"].fillna("").tolist() == ["", *["interrupted"] * 3]
     assert not Path("map.png").exists(), "an interrupted command ends soon, without a figure"
     assert len(Path("cases.csv.journal").read_text("utf-8").splitlines()) == 2
+    so_far = pd.read_csv("cases_so_far.csv")
+    assert list(so_far) == list(pd.read_csv("cases.csv"))
+    assert len(so_far) == 1
     monkeypatch.setattr(study_module, "sweep", in_threads(sweep, ThreadPoolExecutor(1)))
     again = run(LINE)
     assert again.stderr.startswith("warning: cases.csv.journal: 1 of 4 cases are known from an earlier run")
     assert pd.read_csv("cases.csv")["error"].isna().all()
     assert not Path("cases.csv.journal").exists()
+    assert not Path("cases_so_far.csv").exists()
 
 
 def test_one_that_was_not_certified_is_warned_of(folder: Path) -> None:

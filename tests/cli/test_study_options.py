@@ -56,6 +56,18 @@ def test_a_changed_file_is_not_resumed(folder: Path) -> None:
     assert Path("cases.csv.journal").exists()
 
 
+def test_a_study_is_written_as_parquet_where_its_file_is_called_so(folder: Path) -> None:
+    assert run("study study.toml -q -o cases.csv").exit_code == 0
+    assert run("study study.toml -q -o cases.parquet").exit_code == 0
+    wide, text = pd.read_parquet("cases.parquet"), pd.read_csv("cases.csv")
+    assert list(wide) == list(text)
+    numbers = [c for c in text.select_dtypes("number") if c not in ("seconds [s]", "error")]
+    assert len(numbers) > 20
+    pd.testing.assert_frame_equal(wide[numbers], text[numbers], check_dtype=False, rtol=1e-8)
+    assert wide["case"].tolist() == text["case"].tolist()
+    assert not Path("cases_so_far.parquet").exists()
+
+
 def test_samples_are_certified_and_shown(folder: Path) -> None:
     text = Path("study.toml").read_text("utf-8").partition("[axes]")[0]
     text += "[samples]\ncount = 3\n'load.mass' = { distribution = 'normal', spread = '5 %' }\n"
