@@ -73,7 +73,7 @@ from .evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from .evaluation.rest_check import RestCase, RestCheck, RestKind, check_rest
+from .evaluation.rest_check import NoHunting, RestCase, RestCheck, RestKind, check_rest
 from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.sampling import Sampling
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
@@ -263,6 +263,7 @@ __all__ = [
     "Move",
     "MoveProfile",
     "MoveSequence",
+    "NoHunting",
     "NoiseGain",
     "Normal",
     "Overshoot",

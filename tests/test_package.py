@@ -138,6 +138,7 @@ PUBLIC_NAMES = [
     "mean_start",
     "ModelSelection",
     "MotionDrive",
+    "NoHunting",
     "NoiseGain",
     "Normal",
     "open_loop",

@@ -296,12 +296,27 @@ def sensitivity_terms(
 
 
 def batch_frequency_response(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
-    """``C (jw I - A)^-1 B`` of m systems, shape (m, n), at frequencies of shape (n,), the same for all, or (m, n)."""
+    """``C (jw I - A)^-1 B`` of m systems, shape (m, n), at frequencies of shape (n,), the same for all, or (m, n).
+
+    At a frequency at which a system has no response, an undamped pole, it is NaN.
+    """
     resolvent = np.broadcast_to(-A[:, None], (len(A), w.shape[-1], *A.shape[1:])).astype(complex)
     each = np.arange(A.shape[-1])
     resolvent[..., each, each] += 1j * w[..., None]
-    x = np.linalg.solve(resolvent, np.broadcast_to(B[:, None, :, None], (*resolvent.shape[:3], 1)).astype(complex))
+    x = _solve_regular(resolvent, np.broadcast_to(B[:, None, :, None], (*resolvent.shape[:3], 1)).astype(complex))
     return np.asarray((C[:, None, None] @ x)[..., 0, 0])
+
+
+def _solve_regular(matrices: ComplexArray, right: ComplexArray) -> ComplexArray:
+    """Solutions of linear equations, shape (m, n, k, 1); NaN of a singular matrix, for which NumPy refuses all."""
+    try:
+        return np.asarray(np.linalg.solve(matrices, right))
+    except np.linalg.LinAlgError:
+        if len(matrices) == 1 and matrices.shape[1] == 1:
+            return np.full_like(right, nan)
+    axis = 0 if len(matrices) > 1 else 1
+    halves = zip(*(np.array_split(a, 2, axis=axis) for a in (matrices, right)), strict=True)
+    return np.concatenate([_solve_regular(*half) for half in halves], axis=axis)
 
 
 def controller_parts(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:

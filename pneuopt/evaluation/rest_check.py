@@ -56,6 +56,25 @@ USUAL_DURATION = 60.0
 """How long a loop is watched [s], unless it is said: hunting of a servo axis has periods of seconds."""
 
 
+@dataclass(frozen=True)
+class NoHunting:
+    """A limit of a tuning that only an event-accurate model shows: the loop comes to rest and stays, by `check_rest`.
+
+    ``tune(..., subject_to=[NoHunting()], rig=rig)`` certifies no design that does not, and says why.
+
+    Parameters
+    ----------
+    duration : float
+        For how long each reference is watched [s].
+    """
+
+    duration: float = USUAL_DURATION
+
+    def __post_init__(self) -> None:
+        proper = 0 < self.duration < inf
+        require(proper, f"NoHunting: duration must be positive and finite, got {self.duration:g} s; 60 s is usual")
+
+
 class RestKind(Enum):
     """How a loop ends; the value is the word in tables."""
 
@@ -253,16 +272,17 @@ def _read_rest(
     kind = _kind(error, run, stands, [e for e in breaks if e.t >= middle], late, still)
     hunts, slips = kind is RestKind.HUNTS, len([e for e in breaks if e.t >= middle])
     push = _push(run, late) if sticks else nan
+    period = 2 * float(np.mean(np.diff([e.t for e in breaks if e.t >= stands[0]]))) if hunts else nan
     return RestCase(
         case.label,
         kind,
         float(np.abs(error[late]).max()) if hunts else float(error[-1]),
         float(np.ptp(error[late]) / 2) if hunts else 0.0,
-        2 * float(np.mean(np.diff([e.t for e in breaks if e.t >= stands[0]]))) if hunts else nan,
+        period,
         slips,
         float(stands[-1] - reference.at) if sticks and len(stands) else 0.0 if sticks else inf,
         push,
-        f"at {case.label} the loop {_describe(loop, p, kind, error[late], push)}",
+        f"at {case.label} the loop {_describe(loop, p, kind, error[late], push, period)}",
     )
 
 
@@ -290,12 +310,13 @@ def _push(run: Trajectory, late: Mask) -> float:
     return float((u[-1] - u[0]) / (t[-1] - t[0])) if len(t) > 1 else 0.0
 
 
-def _describe(loop: ClosedLoop, p: ParameterSet, kind: RestKind, error: Array, push: float) -> str:
+def _describe(loop: ClosedLoop, p: ParameterSet, kind: RestKind, error: Array, push: float, period: float) -> str:
     """A case in words, without its subject; error over the second half."""
     unit = loop.feedback.unit
     off = write_value(float(abs(error[-1])), unit, 3)
     if kind is RestKind.HUNTS:
-        return f"hunts by +-{write_value(float(np.ptp(error) / 2), unit, 3)}{_hunting_cause(loop, p)}"
+        size, cycle = write_value(float(np.ptp(error) / 2), unit, 3), write_value(period, "s", 3)
+        return f"hunts by +-{size}, a cycle in {cycle}{_hunting_cause(loop, p)}"
     if kind is RestKind.PUSHED:
         return (
             f"sticks {off} from the reference, and its command still changes by {push:.2g} {loop.command.unit}/s: "

@@ -22,6 +22,7 @@ from pneuopt.evaluation.requirements import (
     upper_limit,
     with_upper_limit,
 )
+from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.quantities.errors import require
 
 # Largest sensitivity of a loop that a search takes for stable where none was asked for. With a smaller one good designs
@@ -45,11 +46,14 @@ class Specification:
     band : float or Tolerance
         Half width of the settling band, a fraction of the step or in the measured unit; 2 % unless a requirement
         names another.
+    rest : float
+        For how long a loop is watched on its rig, where it shall not hunt (`NoHunting`) [s]; 0 where that is not asked.
     """
 
     weights: Mapping[Requirement, float]
     limits: tuple[Requirement, ...]
     band: Band
+    rest: float = 0.0
 
     @property
     def envelope(self) -> EnvelopeBounds:
@@ -125,7 +129,7 @@ class Specification:
 Objective = Requirement | Mapping[Requirement, float] | Specification
 
 
-def specify(minimise: Objective, subject_to: Sequence[Requirement] = ()) -> Specification:
+def specify(minimise: Objective, subject_to: Sequence[Requirement | NoHunting] = ()) -> Specification:
     """Check an objective and its limits.
 
     Parameters
@@ -157,12 +161,19 @@ def specify(minimise: Objective, subject_to: Sequence[Requirement] = ()) -> Spec
 
 
 def specify_limits(
-    subject_to: Sequence[Requirement], weights: Mapping[Requirement, float] = NO_WEIGHTS
+    subject_to: Sequence[Requirement | NoHunting], weights: Mapping[Requirement, float] = NO_WEIGHTS
 ) -> Specification:
     """Check limits that may stand without an objective, as a file that only describes a loop has them.
 
     Errors are as for `specify`.
     """
+    rest = max((q.duration for q in subject_to if isinstance(q, NoHunting)), default=0.0)
+    found = _specify_requirements([q for q in subject_to if not isinstance(q, NoHunting)], weights)
+    return replace(found, rest=rest)
+
+
+def _specify_requirements(subject_to: Sequence[Requirement], weights: Mapping[Requirement, float]) -> Specification:
+    """What a search reads of it: all that has a metric."""
     for q in (*weights, *subject_to):
         known = ", ".join(k.__name__ for k in REQUIREMENT_KINDS)
         require(isinstance(q, Requirement), f"{q!r} is no requirement; write {known}, as in Overshoot(max=0.05)")

@@ -19,6 +19,7 @@ from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
+from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.budget import MAX_CASES
@@ -43,6 +44,7 @@ from pneuopt.files.toml import (
 from pneuopt.files.tuning_keys import (
     ACCEPT_KEY,
     BUDGET_KEYS,
+    NO_HUNTING_KEY,
     SCENARIO_KEYS,
     TUNING_KEYS,
     limit_key,
@@ -259,13 +261,19 @@ def _read_objective(table: TuningSections, loop: ClosedLoop, path: str | Path) -
     return weights
 
 
-def _read_requirements(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Requirement, ...]:
+def _read_requirements(
+    table: TuningSections, loop: ClosedLoop, path: str | Path
+) -> tuple[Requirement | NoHunting, ...]:
     """Read [limits]: requirements with their bounds."""
     where = f"{path}: [limits]"
-    check_names("requirement", table.get("limits", {}), REQUIREMENTS_BY_KEY, where)
-    units, found = bound_units(loop), []
+    check_names("requirement", table.get("limits", {}), (*REQUIREMENTS_BY_KEY, NO_HUNTING_KEY), where)
+    units, found = bound_units(loop), list[Requirement | NoHunting]()
     for key, given in table.get("limits", {}).items():
         spot = f"{where} {key}"
+        if key == NO_HUNTING_KEY:
+            duration = read_value(given, "s", where=spot)
+            found.append(construct_at(partial(NoHunting, duration), where))
+            continue
         bound = REQUIREMENTS_BY_KEY[key].metric.sense.value
         entry = given if isinstance(given, dict) else {bound: given}
         check_names("key", entry, limit_key(key).keys, spot)

@@ -102,6 +102,13 @@ BUDGET_KEYS: Mapping[str, Key] = {
 }
 
 
+NO_HUNTING_KEY = "no_hunting"
+"""Key under [limits] of `NoHunting`, which has no metric."""
+_NO_HUNTING = Key(
+    "the loop comes to rest, watched for so long on the rig's model", unit="s", condition="with --rig", example='"60 s"'
+)
+
+
 def objective_key(name: str) -> Key:
     """The key of a requirement under [minimise]."""
     return table(first_sentence(REQUIREMENTS_BY_KEY[name]), {**OBJECTIVE_KEYS, **EXTRA_KEYS.get(name, {})})
@@ -135,7 +142,9 @@ TUNING_KEYS: Mapping[str, Key] = {
     **{n: table(LOOP_MEANINGS[n], keys, required=n == "pid") for n, keys in LOOP_KEYS.items()},
     "reference": table("a step or a move to follow; one or more", REFERENCE_KEYS, takes=Takes.TABLES, required=True),
     "minimise": table("what shall be small, weighted", {n: objective_key(n) for n in REQUIREMENTS_BY_KEY}),
-    "limits": table("what shall be kept", {n: limit_key(n) for n in REQUIREMENTS_BY_KEY}),
+    "limits": table(
+        "what shall be kept", {n: limit_key(n) for n in REQUIREMENTS_BY_KEY} | {NO_HUNTING_KEY: _NO_HUNTING}
+    ),
     "scenarios": table("other plants and gains for which it shall hold, too", SCENARIO_KEYS),
     "method": METHOD_SECTION,
     "budget": table("what a search may take", BUDGET_KEYS),

@@ -10,6 +10,7 @@ import numpy as np
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import metric_name, requirement_values, upper_limit, user_value
+from pneuopt.evaluation.rest_check import RestKind, check_rest
 from pneuopt.evaluation.rig import Rig
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -21,13 +22,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def check_rig(rig: Rig, task: TuningTask) -> None:
-    """Refuse a rig that is not one of this loop.
+def check_rig(rig: Rig | None, task: TuningTask) -> None:
+    """Refuse a rig that is not one of this loop, and a limit that only a rig shows without one.
 
     Raises
     ------
     InputError
     """
+    if rig is None:
+        told = "NoHunting is read on the event-accurate model of the rig, which sticks; give rig=, or --rig rig.toml"
+        require(not task.spec.rest, told)
+        return
     require(rig.loop is not None, "the rig has no controller; make it of the loop, Rig(ClosedLoop(...), sensors)")
     signals = [(own.feedback.name, own.command.name, own.pid) for own in (rig.loop, task.loop) if own is not None]
     message = f"the rig's loop controls {signals[0][:2]}, the loop to be tuned {signals[-1][:2]}, or with another PID"
@@ -58,7 +63,20 @@ def certify_on_rig(task: TuningTask, result: TuningResult, rig: Rig) -> TuningRe
         return _reject(task, result, None, (f"the simulation of the rig stops: {error}",))
     contacts = [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
     breaks = tuple(dict.fromkeys((*contacts, *_breaks(task, found))))
-    return _reject(task, result, found, breaks) if breaks else replace(result, on_rig=found)
+    if breaks:
+        return _reject(task, result, found, breaks)
+    result = replace(result, on_rig=found)
+    return _watch_rest(task, result, rig, own) if task.spec.rest else result
+
+
+def _watch_rest(task: TuningTask, result: TuningResult, rig: Rig, parameters: ParameterSet) -> TuningResult:
+    """The result with how the loop ends on the rig; where it does not come to rest, it is no longer certified."""
+    rest = check_rest(rig, task.references, parameters, duration=task.spec.rest)
+    if rest.rests:
+        told = f"on the rig it comes to rest, watched for {task.spec.rest:g} s"
+        return replace(result, rest=rest, status=result.status.with_details(told))
+    restless = tuple(f"on the rig {case.sentence}" for case in rest.cases if case.kind is not RestKind.RESTS)
+    return replace(_reject(task, result, result.on_rig, restless), rest=rest)
 
 
 def _breaks(task: TuningTask, found: "pd.DataFrame") -> Iterator[str]:

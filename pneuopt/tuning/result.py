@@ -16,6 +16,7 @@ from pneuopt.evaluation.requirements import (
     user_limit,
     user_value,
 )
+from pneuopt.evaluation.rest_check import RestCheck
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
@@ -82,6 +83,8 @@ class TuningResult(Result):
         The metrics that a table shows, in that order, with their units; the reference's has the key "".
     limits : mapping of str to float
         What was asked for, by metric, in the metric's unit.
+    rest : RestCheck, optional
+        How the loop ends on the rig's model, where `NoHunting` was asked for.
     """
 
     parameters: ParameterSet
@@ -99,6 +102,7 @@ class TuningResult(Result):
     given: Mapping[str, float] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
+    rest: RestCheck | None = None
 
     def summary(self) -> Report:
         """How the tuning ended, gains, certified metrics beside their limits, margins, and how other plants behave."""

@@ -23,6 +23,7 @@ from pneuopt.evaluation.dither_effect import describe_swing
 from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
 from pneuopt.evaluation.report import metric_limits, relevant_units
 from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTime
+from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
@@ -57,7 +58,7 @@ def tune(
     parameters: ParameterSet,
     *,
     minimise: Objective,
-    subject_to: Sequence[Requirement] = (),
+    subject_to: Sequence[Requirement | NoHunting] = (),
     scenarios: Scenarios = NO_SCENARIOS,
     accept: Defect | Sequence[Defect] = (),
     plants: ExpectedPlants | Scenarios | None = None,
@@ -81,7 +82,7 @@ def tune(
     minimise : Requirement, mapping of Requirement to weight, or Specification
         A Specification, such as a tuning's file holds, brings its limits along: `subject_to` is then left out.
     subject_to : sequence of Requirement
-        Each with its bound, `max` or `min`.
+        Each with its bound, `max` or `min`; with a `rig` also `NoHunting`.
     scenarios : mapping of str to mapping, optional
         Plants beside the nominal one, or tolerances of the gains: of `corners`, `samples`, `draws`, `tolerances`, or
         several of them joined with ``|``. The worst over references and scenarios counts.
@@ -139,8 +140,7 @@ def tune(
     begun = time.perf_counter()
     specification = specify(minimise, subject_to)
     task = prepare_task(loop, references, parameters, specification, scenarios, accept, max_steps)
-    if rig is not None:
-        check_rig(rig, task)
+    check_rig(rig, task)
     _warn_of_swing(task)
     search, result, is_stopped = _search(task, method, ProgressReporter(progress, "tune"))
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result

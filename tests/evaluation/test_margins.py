@@ -15,6 +15,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import Linearisation, System
 from pneuopt.evaluation.batch_margins import _partial_fraction_response, batch_margin_function
 from pneuopt.evaluation.margins import (
+    batch_frequency_response,
     frequency_grid,
     frequency_response,
     margins,
@@ -297,3 +298,13 @@ def test_the_sensitivity_is_1_where_the_loop_rolls_off_beyond_the_grid(only: tup
     p = loop.parameter_vector(loop.parameters.with_values({"pid.Kp": 4.0, "pid.Ki": 0.0}))
     found = batch_margin_function(loop, [0.01, 0.1, 1.0])(p[None], np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), only)
     assert found["MaxSensitivity"].tolist() == [1.0]
+
+
+def test_a_system_at_its_undamped_pole_takes_no_other_response_with_it() -> None:
+    """A search met one among its candidates, and stopped."""
+    swings, lags = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.diag([-1.0, -2.0])
+    B, C, w = np.ones((2, 2)), np.ones((2, 2)), np.array([0.5, 1.0, 2.0])
+    found = batch_frequency_response(np.stack([swings, lags]), B, C, w)
+    assert np.isnan(found).tolist() == [[False, True, False], [False] * 3]
+    assert_allclose(found[1], 1 / (1j * w + 1) + 1 / (1j * w + 2), rtol=1e-12)
+    assert_allclose(found[0, [0, 2]], 2j * w[[0, 2]] / (1 - w[[0, 2]] ** 2), rtol=1e-12)

@@ -77,9 +77,9 @@ def test_hunting_is_found_and_explained() -> None:
     (case,) = watch().cases
     assert case.kind is RestKind.HUNTS
     assert case.sentence == (
-        f"at 0 to 0.1 the loop hunts by +-{1e3 * case.amplitude:.3g} mm: the integral pushes the stuck body until it "
-        "breaks away, and its static friction, 1.5 times Coulomb's, lets it jump beyond; give the integral a dead band "
-        "wider than the error at rest"
+        f"at 0 to 0.1 the loop hunts by +-{1e3 * case.amplitude:.3g} mm, a cycle in {case.period:.3g} s: the integral "
+        "pushes the stuck body until it breaks away, and its static friction, 1.5 times Coulomb's, lets it jump "
+        "beyond; give the integral a dead band wider than the error at rest"
     )
 
 

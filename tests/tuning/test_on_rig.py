@@ -1,5 +1,8 @@
 """A design on the rig's own model: what breaks there is not certified, and is said in words."""
 
+import re
+from dataclasses import replace
+
 import pandas as pd
 import pytest
 
@@ -7,7 +10,8 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.evaluation.requirements import IAE, Overshoot, SettlingTime
+from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
@@ -15,7 +19,7 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.on_rig import certify_on_rig
+from pneuopt.tuning.on_rig import _watch_rest, certify_on_rig
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.tune import TuningResult, prepare_search, prepare_task, tune
 
@@ -80,3 +84,38 @@ def test_another_loop_s_rig_is_refused_before_the_search() -> None:
     other = ClosedLoop(ForceDrive(Karnopp(Stribeck())).system(), PID(sample_time=1e-3))
     with pytest.raises(InputError, match="another PID; make the rig of the same loop"):
         tune(LOOP, STEP, given(), minimise=SettlingTime(), rig=Rig(other, SENSORS))
+
+
+PUSHED = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time=2e-3, dead_band=True), measured="position")
+STUCK = ClosedLoop(ForceDrive(Karnopp(Stribeck())).system(), PUSHED.pid, measured="position")
+HUNTING = {"pid.Kp": 5000.0, "pid.Ki": 100000.0, "pid.Kd": 200.0, "friction.stribeck_velocity": 1e-3}
+
+
+@pytest.mark.parametrize("width", [0.0, 0.01])
+def test_a_loop_that_hunts_on_the_rig_is_not_certified_where_that_is_asked(width: float) -> None:
+    step, rig = Step(0.1, horizon=0.6), Rig(STUCK, {"position": Sensor()})
+    values = PUSHED.parameters.with_values(HUNTING | {"pid.dead_band": width})
+    free = values.with_bounds({"pid.Kp": (4900.0, 5100.0)}).freed("pid.Kp")
+    task = prepare_task(PUSHED, step, free, specify(IAE(), [NoHunting(8.0)]))
+    design = prepare_search(task).certify_point(task.space.start)
+    own = values.select(n for n in values if n in STUCK.parameters)
+    on_rig = evaluate(rig, step, own)
+    found = _watch_rest(task, replace(design, on_rig=on_rig), rig, own)
+    assert found.rest is not None
+    assert found.rest.duration == 8.0
+    if width:
+        assert found.rest.rests
+        assert "on the rig it comes to rest, watched for 8 s" in str(found.status)
+        return
+    assert not found.status.converged
+    assert re.match(
+        r"on the rig at 0 to 0\.1 the loop hunts by \+-\S+ \S+, a cycle in .*: the integral pushes",
+        found.status.verdict,
+    )
+
+
+def test_no_hunting_asks_for_a_rig_and_a_duration() -> None:
+    with pytest.raises(InputError, match=r"NoHunting is read on the event-accurate model .*; give rig="):
+        tune(LOOP, STEP, given(), minimise=SettlingTime(), subject_to=[NoHunting()], plants={})
+    with pytest.raises(InputError, match="NoHunting: duration must be positive"):
+        NoHunting(0.0)
