@@ -23,6 +23,7 @@ from pneuopt.identification.checks import (
     log_remarks,
     outputs_in_log,
 )
+from pneuopt.identification.closed_gaps import fit_with_closed_gaps
 from pneuopt.identification.command_centre import find_centre
 from pneuopt.identification.examination import check_content
 from pneuopt.identification.identifiability import foresee_unidentifiable, leans_on_prior, rests_on_prior
@@ -176,7 +177,9 @@ def _fit_and_review(
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
     chosen = ChosenWindow(window, window, window, fit.stats["gap_share"]) if math.isfinite(window) else None
     restarts = False
-    if not doubts.found and (windowed := fit_in_windows(held, fit)):
+    if not doubts.found and (closed := fit_with_closed_gaps(held, fit)):
+        fit = closed
+    elif not doubts.found and (windowed := fit_in_windows(held, fit)):
         restarts = 2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
