@@ -21,7 +21,7 @@ from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import solve_least_squares
+from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
 from pneuopt.shooting.solution import Fit
 
@@ -90,7 +90,9 @@ def fit_from_starts(
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
             known = () if loss is not None or estimate_noise else _joinable_costs(fits)
-            held, fit = fit_holding_unidentifiable(problem, start, limit, known)
+            tried = replace(problem, method=_method_after(problem, fits)) if known else problem
+            held, fit = fit_holding_unidentifiable(tried, start, limit, known)
+            held = replace(held, method=problem.method)
             if fit.status is JOINED_SEARCH:
                 break
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
@@ -365,6 +367,12 @@ def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
 def _joinable_costs(fits: Sequence[Candidate]) -> tuple[tuple[float, float], ...]:
     """The costs at the end of the best search's stages, at which another one that joins it only confirms it."""
     return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].held else ()
+
+
+def _method_after(problem: EstimationProblem, fits: Sequence[Candidate]) -> LeastSquares:
+    """The method of a start that is to confirm the best one: without noise of the states where that did not settle."""
+    settles = problem.method.allows_state_noise and fits[0][1].status.converged
+    return replace(problem.method, allows_state_noise=settles)
 
 
 def _are_enough(fits: Sequence[Candidate]) -> bool:

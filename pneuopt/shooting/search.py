@@ -63,6 +63,11 @@ MAX_CREEPING_STEPS = 3
 # actual over promised decrease [1] below which such a search creeps: higher leaves a fit that converges, lower follows
 # a kink of the model for hundreds of steps (a log with encoder steps: 50 of .13 each, of 35 promised)
 CREEPING_SHARE = 0.3
+# a gap in its deviations [1] that no optimum leaves open: in the last stage it is a stick or a slip that the model puts
+# elsewhere, and steps that lower the cost by less than a share [1] creep along it for as long as they are let. Lower
+# ones end searches that near a wrong model's optimum, higher ones creep for ten seconds
+TRAPPED_GAP, TRAPPED_COST_DECREASE = 300.0, 0.02
+MAX_TRAPPED_STEPS = 5  # such steps in a row that end a stage: fewer leave what comes free, more take long
 # difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
 # one
 JOINED_COST_TOLERANCE = 1e-3
@@ -87,6 +92,7 @@ class Search:
         self.iterations, self.stage_began, self.stage = 0, 0, method.stages[0]
         self.correction: IntegrationCorrection | None
         self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[StageEnd]()
+        self.unsettled_gaps = set[float]()
         self.substeps = self.output_substeps = self.steps.start
         self.correction, self.integration_change, self.is_coarse = None, math.nan, False
         self.current = self._evaluate(nodes, self.scaling.start)
@@ -107,7 +113,7 @@ class Search:
             return Status(Code.NOT_CONVERGED, (verdict, remedy))
         last, allowed = self.method.stages[-1], None
         for stage in self.method.stages:
-            if stage is last and self._gaps_absorb_misfit():
+            if stage is last and self._gaps_absorb_misfit() and self.method.allows_state_noise:
                 allowed = self._allow_state_noise()
                 if allowed.converged:
                     return self._refine_steps(allowed)
@@ -188,6 +194,8 @@ class Search:
         ended = zip(self.method.stages[:-1], self.stage_ends, strict=False)
         explaining = [(stage, end) for stage, end in ended if self.is_noise(end.cost)]
         for stage, end in reversed(explaining[-MAX_LOOSENED:]):
+            if stage.gap in self.unsettled_gaps:  # the same squares, from another start: it creeps again
+                continue
             found = self._loosen(stage, end.nodes, end.z)
             if found.converged:
                 return found
@@ -201,6 +209,7 @@ class Search:
         self._finish_stage(last.iterations)
         found = self._convergence_status(self.current)
         if not found.converged:
+            self.unsettled_gaps.add(stage.gap)
             self._restore(before)
             self.noisy_gaps = False
         return found
@@ -300,7 +309,7 @@ class Search:
         """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         descent = Descent(self._objective(), damping, self._is_negligible_step, damps_nodes=self.noisy_gaps)
-        hopeless, self.stage_began = 0, self.iterations
+        hopeless, trapped, self.stage_began = 0, 0, self.iterations
         for _ in range(iterations):
             if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
                 self._correct_residuals(fine_steps(self.segments, self.substeps, self.stage.refine))
@@ -311,6 +320,9 @@ class Search:
             self.iterations += 1
             before, self.current = self.current.cost, trial
             self._report()
+            trapped = trapped + 1 if self._is_trapped(before) else 0
+            if trapped == MAX_TRAPPED_STEPS:
+                return True
             hopeless = hopeless + 1 if self._creeps(before, descent.promised) else 0
             if hopeless == MAX_CREEPING_STEPS:
                 if not self._leap(descent):
@@ -325,6 +337,12 @@ class Search:
         before, (self.current, taken) = self.current.cost, descent.leap(self.current, self.method.budget)
         self.iterations += taken
         return self.current.cost < before
+
+    def _is_trapped(self, before: float) -> bool:
+        """Whether a step from a cost has hardly lowered it in the last stage, while a gap stands wide open."""
+        is_tight = not self.noisy_gaps and self.stage.gap <= self.method.stages[-1].gap
+        is_slow = before - self.current.cost < TRAPPED_COST_DECREASE * before
+        return is_tight and is_slow and self.current.equations.largest_gap > TRAPPED_GAP * self.stage.gap
 
     def _creeps(self, before: float, promised: float) -> bool:
         """Whether a step from a cost has fallen far short of its promise, and changed little."""

@@ -336,6 +336,27 @@ def test_a_start_that_joins_the_best_confirms_it(monkeypatch: pytest.MonkeyPatch
     assert known == [(), fit.stage_costs]
 
 
+@pytest.mark.parametrize("settled", [True, False])
+def test_a_confirming_start_looks_for_no_noise_of_the_states_where_the_best_found_none(
+    settled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sensor with a lag: the second start took 18 seconds to end where the first one was, 13 of them so."""
+    problem, allowed = posed(Stribeck()), list[bool]()
+    missed = Status(Code.NOT_CONVERGED, ("gaps carry the cost",))
+
+    def fitted(problem: EstimationProblem, start: Start, *given: object) -> tuple[EstimationProblem, Fit]:
+        allowed.append(problem.method.allows_state_noise)
+        held, fit = fit_holding_unidentifiable(problem, start)
+        return held, fit if settled else replace(fit, status=missed, stats={**fit.stats, "gap_share": 0.12})
+
+    monkeypatch.setattr(starting, "_explains_to_noise", lambda *_: False)
+    monkeypatch.setattr(starting, "_is_at_noise", lambda *_: False)
+    monkeypatch.setattr(starting, "fit_holding_unidentifiable", fitted)
+    held, *_ = starting.fit_from_starts(problem)
+    assert allowed == [True, settled]
+    assert held.method == problem.method
+
+
 @pytest.mark.parametrize(
     ("jumps", "cost", "enough"),
     [(True, 2.0, True), (False, 2.0, False), (False, 1.0005, True), (True, math.inf, False)],

@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.equations import correct_residuals, normal_equations
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
@@ -203,3 +204,37 @@ def test_states_are_searched_to_the_end_where_no_parameter_is_free(monkeypatch: 
     fixed = problem.parameters.with_values(TRUTH).fixed("*")
     assert solve_least_squares(replace(problem, parameters=fixed)).status.converged
     assert left[LeastSquares().stages[-1].gap] < 1e-6
+
+
+def test_noise_of_the_states_that_has_not_settled_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve seconds of a search went by in the steps that had failed before."""
+    tried, loosen = list[float](), Search._loosen
+
+    def never(search: Search, stage: Stage, nodes: Array, z: Array) -> Status:
+        tried.append(stage.gap)
+        with monkeypatch.context() as patch:
+            patch.setattr(Search, "_finish_stage", lambda *_: False)
+            patch.setattr(Search, "_convergence_status", lambda *_: Status(Code.NOT_CONVERGED, ("no",)))
+            return loosen(search, stage, nodes, z)
+
+    monkeypatch.setattr(Search, "_loosen", never)
+    fit = solve_least_squares(shaken(2e-3), LeastSquares())
+    assert fit.jumps is None
+    assert len(tried) == len(set(tried)) > 0
+
+
+def test_a_gap_that_stays_wide_open_ends_the_last_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slip that a wrong model put elsewhere was followed for sixty iterations, at a thousand times the cost."""
+    ends = dict[float, int]()
+    monkeypatch.setattr("pneuopt.shooting.search.MAX_TRAPPED_STEPS", 2)
+    for widest in (0.0, math.inf):
+        monkeypatch.setattr("pneuopt.shooting.search.TRAPPED_GAP", widest)
+        monkeypatch.setattr("pneuopt.shooting.search.TRAPPED_COST_DECREASE", math.inf)
+        search = Search(segment(shaken(2e-3)), LeastSquares())
+        search._enter_stage(search.method.stages[-1], search.current.nodes, search.current.z)
+        search._run_stage(30)
+        ends[widest] = search.iterations
+    assert ends[0.0] == 2 < ends[math.inf]
+    search._enter_stage(search.method.stages[0], search.current.nodes, search.current.z)
+    monkeypatch.setattr("pneuopt.shooting.search.TRAPPED_GAP", 0.0)
+    assert not search._is_trapped(search.current.cost)  # loose gaps may stand open
