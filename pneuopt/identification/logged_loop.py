@@ -13,19 +13,21 @@ import casadi as ca
 import numpy as np
 from scipy.signal import savgol_filter
 
+from pneuopt.control.command import pid_reference
 from pneuopt.control.compensation import Instant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reset_integral import RESET_STATES
 from pneuopt.control.rest import unobservable_states
-from pneuopt.control.sensor import Encoder
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import DiscreteSystem, Motion, Symbols, System, define, names
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, ModelError, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
 from pneuopt.quantities.trajectories import Trajectory
 
+MOTION = ("speed", "position")  # signals of which one follows from the other where a log lacks it
 REFERENCE_CHANNELS = {"speed": "speed_reference", "position": "position_reference"}
 CONTROLLER_ACTS = "controller_acts"  # 1 at the log's samples at which the controller computes, 0 in between
 # difference of a log's time from the controller's, in sample times [1]: smaller refuses rounded times, larger takes
@@ -40,8 +42,12 @@ class LoggedLoop:
     """A loop with a sampled controller, its reference named as logs name it.
 
     A log has a sample wherever the controller acts, from its first one on, and any number in between. The model's
-    controller sees the plant's output without the sensor's noise: the noise that a high gain puts into the command is
+    controller sees the plant's outputs without the sensors' noise: the noise that a high gain puts into the command is
     left to the residuals; where it is not small, the intervals are too narrow.
+
+    The rates of the reference that a cascade or a feedforward uses are those of the log's "speed_reference" beside its
+    "position_reference", where it holds both, and else differences of the reference from one sample of the controller
+    to the next; a reference that is logged in coarse steps needs its speed beside it.
 
     Parameters
     ----------
@@ -60,9 +66,6 @@ class LoggedLoop:
         require(self.loop.pid.sample_time is not None, message, ModelError)
         message = "an identification has no derivatives through an Encoder; give SensorLag(filter + half a sample)"
         require(not isinstance(self.loop.sensor, Encoder), message, ModelError)
-        more = [*self.loop.readings, *names(self.loop.motion_inputs)]
-        message = f"a log's loop is one of a PID and its own signal, and this controller also gets {', '.join(more)}"
-        require(not more, f"{message}; identify the plant alone (loop.plant) with the logged command", ModelError)
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -72,9 +75,8 @@ class LoggedLoop:
     @property
     def inputs(self) -> tuple[Quantity, ...]:
         """The inputs that a log has to hold: the reference of what is fed back, and inputs not controlled."""
-        reference, *others = self.loop.inputs
-        fed_back = self.loop.feedback.name
-        return (replace(reference, name=REFERENCE_CHANNELS.get(fed_back, f"{fed_back}_reference")), *others)
+        rates = names(self.loop.motion_inputs)
+        return tuple(q for q in self._all_inputs if q.name not in rates)
 
     @property
     def outputs(self) -> tuple[Quantity, ...]:
@@ -94,7 +96,7 @@ class LoggedLoop:
     def motion(self) -> Motion:
         """The motion of the loop, its reference named as in a log."""
         motion = self.loop.motion()
-        return replace(motion, system=replace(motion.system, inputs=self.inputs))
+        return replace(motion, system=replace(motion.system, inputs=self._all_inputs))
 
     def rest_state(self, parameters: ParameterSet, outputs: Mapping[str, float] | None = None) -> Array:
         """The state of the loop at rest, as `ClosedLoop.rest_state`."""
@@ -110,16 +112,20 @@ class LoggedLoop:
         remedy = "identify the plant alone with it as input (loop.plant), which needs no controller; or leave it out"
         require(command not in measured, f"{name}: the log holds the command {command!r}; {remedy}", LogError)
         require(reference in measured, f"{name}: the loop needs the channel {reference!r} as input", LogError)
+        for channel in (n for n in self.loop.readings if n not in MOTION):
+            told = f"{name}: the controller reads {channel!r}, which the log does not hold; log it"
+            require(channel in measured, told, LogError)
         _acting_samples(measured.t, self._sample_time, name)
 
     def discrete(self, substeps: int = 1) -> DiscreteSystem:
         """The loop's sampled step; its last input is 1 at samples at which the controller acts."""
-        return _add_acting_input(self.loop.discrete(substeps), self.inputs)
+        return _add_acting_input(self.loop.discrete(substeps), self._all_inputs)
 
     def input_matrix(self, measured: Trajectory, name: str) -> Array:
         """The inputs of `discrete` along a log, shape (n, n_inputs)."""
-        own = measured.matrix(names(self.inputs))
-        return np.column_stack([own, _acting_samples(measured.t, self._sample_time, name)])
+        acts = _acting_samples(measured.t, self._sample_time, name)
+        columns = {n: measured[n] for n in names(self.inputs)} | self._reference_rates(measured, acts)
+        return np.column_stack([*(columns[n] for n in names(self._all_inputs)), acts])
 
     def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array:
         """The start states on which no measured output depends, from a candidate; NaN for those that are estimated.
@@ -137,7 +143,8 @@ class LoggedLoop:
         for gain, state in acting.items():
             idle = gain in parameters and not (parameters[gain].free or parameters[gain].value)
             held |= {state} if idle else set()
-        seen = {self.loop.feedback.name, *(n for n in names(self.loop.plant.outputs) if n in measured)}
+        read = (self.loop.feedback.name, self.loop.pid_signal.name, *self.loop.readings)
+        seen = {*read, *(n for n in names(self.loop.plant.outputs) if n in measured)}
         held |= set.intersection(*(set(unobservable_states(self.loop.plant, n)) for n in seen))
         return np.array([states[n][0] if n in held else np.nan for n in names(self.states)])
 
@@ -161,46 +168,86 @@ class LoggedLoop:
         return ()
 
     @property
+    def _all_inputs(self) -> tuple[Quantity, ...]:
+        """The loop's inputs, its reference named as in a log."""
+        reference, *others = self.loop.inputs
+        fed_back = self.loop.feedback.name
+        return (replace(reference, name=REFERENCE_CHANNELS.get(fed_back, f"{fed_back}_reference")), *others)
+
+    def _reference_rates(self, measured: Trajectory, acts: Array) -> dict[str, Array]:
+        """The rates of the reference that the controller uses, each held from one of its samples to the next."""
+        wanted, at = names(self.loop.motion_inputs), np.flatnonzero(acts)
+        if not wanted or at.size < 2:
+            return {n: np.zeros(len(measured)) for n in wanted}
+        t, held = measured.t[at], np.cumsum(acts).astype(np.intp) - 1
+        is_speed = REFERENCE_SPEED not in wanted
+        beside = REFERENCE_CHANNELS["speed"]
+        own = measured[self.inputs[0].name][at]
+        speed = own if is_speed else measured[beside][at] if beside in measured else np.gradient(own, t)
+        rates = {REFERENCE_SPEED: speed, REFERENCE_ACCELERATION: np.gradient(speed, t)}
+        return {n: rates[n][held] for n in wanted}
+
+    @property
     def _sample_time(self) -> float:
         return self.loop.pid.sample_time or 0.0
 
     @cached_property
     def _controller(self) -> tuple[DiscreteSystem, Rollout, ClosedLoop]:
-        """The controller alone, with the logged feedback as an input."""
-        seen, plant = self.loop.feedback, self.loop.plant
-        logged = replace(seen, name="logged")
+        """The controller alone, with the logged signals that it sees as inputs."""
+        plant = self.loop.plant
+        seen = [q for q in plant.outputs if q.name in self._seen]
 
         def rhs(_t: ca.SX, _x: Symbols, u: Symbols, _p: Symbols) -> tuple[Symbols, Symbols]:
-            return {}, {seen.name: u["logged"]}
+            return {}, {q.name: u[f"logged.{q.name}"] for q in seen}
 
-        echo = define([], [self.loop.command, logged], [seen], plant.parameters, rhs)
-        alone = replace(self.loop, plant=echo, actuated=self.loop.command.name, measured=seen.name)
+        logged = [replace(q, name=f"logged.{q.name}") for q in seen]
+        echo = define([], [self.loop.command, *logged], seen, plant.parameters, rhs)
+        echo = replace(echo, axis=plant.axis)
+        alone = replace(self.loop, plant=echo, actuated=self.loop.command.name, measured=self.loop.feedback.name)
         discrete = _add_acting_input(alone.discrete(), alone.inputs)
         return discrete, Rollout(discrete.pieces), alone
 
+    @property
+    def _seen(self) -> set[str]:
+        """The plant's outputs that the controller sees."""
+        return {self.loop.feedback.name, self.loop.pid_signal.name, *self.loop.readings}
+
     def _replay_controller(self, log: Log, name: str, *, was_at_rest: bool) -> Trajectory:
-        """The controller's states before each sample, and "control", along the logged feedback."""
+        """The controller's states before each sample, and "control", along the logged signals that it sees."""
         discrete, rollout, alone = self._controller
-        t, seen = log.measured.t, _feedback_along_log(log.measured, self.loop.feedback.name, self.inputs[0].name, name)
-        reference = log.measured[self.inputs[0].name]
+        t, wanted = log.measured.t, self.inputs[0].name
         acts = _acting_samples(t, self._sample_time, name)
-        p, pid = alone.parameter_vector(log.parameters), alone.pid
-        known = {**dict(zip(alone.parameters, p, strict=True)), "pid.Kp": alone.parallel_form(log.parameters).Kp}
-        own = pid.start(reference[0], seen[0], 0.0, {n: known[f"pid.{n}"] for n in ("Kp", "b", "c")})
-        x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.feedback, alone.command), own, strict=True)}
-        x0 |= {"sensor.reading": seen[0], "feedforward.filter": reference[0]}
-        for part in alone.compensators:
-            begun = part.start(alone.sensed_signal, Instant(0.0, reference[0], seen[0], 0.0, pid.sample_time))
-            remembered = zip(part.states(alone.sensed_signal, alone.command), begun, strict=True)
-            x0 |= {f"{part.section}.{q.name}": v for q, v in remembered}
-        x0 |= {} if was_at_rest else {"pid.integral": 0.0}
-        start = np.array([[x0[n] for n in names(discrete.states)]])
-        u, h = np.column_stack([reference, seen, acts]), np.append(np.diff(t), 0.0)
+        columns = {
+            f"logged.{n}": _signal_along_log(log.measured, n, self.loop.feedback.name, wanted, name) for n in self._seen
+        }
+        columns |= {"reference": log.measured[wanted]} | self._reference_rates(log.measured, acts)
+        begun = self._controller_start(log, {n: column[0] for n, column in columns.items()}, was_at_rest=was_at_rest)
+        start = np.array([[begun[n] for n in names(discrete.states)]])
+        u = np.column_stack([*(columns[n] for n in names(alone.inputs)), acts])
+        p, h = alone.parameter_vector(log.parameters), np.append(np.diff(t), 0.0)
         lag = log.parameters.value("sensor.lag") if alone.sensor else math.inf
         run = rollout.run(start, u[None], p, t[None], h[None], substeps=math.ceil(h.max() / lag) or 1, states=True)
         assert run.x is not None
-        columns = dict(zip(names(discrete.states), run.x[0].T, strict=True))
-        return Trajectory(t, columns | {"control": run.y[0, :, names(discrete.outputs).index("control")]})
+        states = dict(zip(names(discrete.states), run.x[0].T, strict=True))
+        return Trajectory(t, states | {"control": run.y[0, :, names(discrete.outputs).index("control")]})
+
+    def _controller_start(self, log: Log, first: Mapping[str, float], *, was_at_rest: bool) -> dict[str, float]:
+        """The controller's states before a log whose first signals are known: of a rest, or with an empty integral."""
+        alone = self._controller[2]
+        pid, known = alone.pid, dict(zip(alone.parameters, alone.parameter_vector(log.parameters), strict=True))
+        shown = {n: first[f"logged.{n}"] for n in self._seen}
+        measured, position = shown[alone.pid_signal.name], shown[alone.feedback.name]
+        wanted = float(pid_reference(alone, {"reference": first["reference"]}, position, known)["reference"])
+        own = {**without_prefix(known, "pid"), "Kp": alone.parallel_form(log.parameters).Kp}
+        begun = pid.start(wanted, measured, 0.0, own)
+        x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.pid_signal, alone.command), begun, strict=True)}
+        x0 |= {"sensor.reading": measured, "feedforward.filter": wanted}
+        for part in alone.compensators:
+            seen = Instant(0.0, wanted, measured, 0.0, pid.sample_time, {}, shown)
+            states = part.states(alone.sensed_signal, alone.command)
+            remembered = zip(states, part.start(alone.sensed_signal, seen), strict=True)
+            x0 |= {f"{part.section}.{q.name}": v for q, v in remembered}
+        return x0 | ({} if was_at_rest else {"pid.integral": 0.0})
 
     def _plant_log(self, log: Log, replayed: Trajectory) -> Log:
         plant = self.loop.plant
@@ -245,8 +292,8 @@ def _acting_samples(t: Array, sample_time: float, name: str) -> Array:
     return np.asarray(acts, dtype=float)
 
 
-def _feedback_along_log(measured: Trajectory, wanted: str, reference: str, name: str) -> Array:
-    """The fed-back signal along a log, without holes; a speed or position follows from the other."""
+def _signal_along_log(measured: Trajectory, wanted: str, feedback: str, reference: str, name: str) -> Array:
+    """A signal that the controller sees along a log, without holes; a speed or position follows from the other."""
     if wanted in measured:
         return measured.fill_gaps(wanted)
     t, step = measured.t, float(np.median(np.diff(measured.t)))
@@ -257,4 +304,4 @@ def _feedback_along_log(measured: Trajectory, wanted: str, reference: str, name:
     require(wanted == "position" and "speed" in measured, message, LogError)
     speed = measured.fill_gaps("speed")
     travel = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))
-    return np.asarray(measured[reference][0] + travel)
+    return np.asarray(measured[reference][0] * (wanted == feedback) + travel)

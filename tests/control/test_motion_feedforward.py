@@ -14,7 +14,6 @@ from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.response import loop_inputs
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
-from pneuopt.quantities.errors import LogError, ModelError
 from pneuopt.quantities.trajectories import Trajectory
 
 H = 2e-3
@@ -107,10 +106,3 @@ def test_it_starts_in_a_rest_that_is_the_plain_loops() -> None:
         plain.parameters.with_values({n: v for n, v in values.items() if n.startswith("pid.")}), reference=0.2
     )
     np.testing.assert_array_equal(found, bare)
-
-
-def test_a_logged_loop_says_what_it_cannot_replay() -> None:
-    from pneuopt.identification.logged_loop import LoggedLoop
-
-    with pytest.raises((ModelError, LogError), match="also gets reference_speed, reference_acceleration; identify"):
-        LoggedLoop(position_loop(*PARTS))

@@ -43,8 +43,9 @@ TRUTH = {
 
 
 def guessed() -> tuple[PneumaticDrive, ParameterSet]:
-    drive, known = s25()
-    return drive, (drive.parameters | known).with_values(GUESS)
+    drive, known = PneumaticDrive(friction=Stribeck()), s25()[1]
+    own = known.select(n for n in drive.parameters if n in known)
+    return drive, (drive.parameters | own).with_values(GUESS)
 
 
 @cache
