@@ -87,7 +87,7 @@ class ExactLinearisation:
 
     def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """What is learned after the sample, and the voltage."""
-        known = {n: self.drive.value(n) for n in self.drive}
+        known: dict[str, Any] = {n: self.drive.value(n) for n in self.drive}
         y, a, b = (seen.readings[n] for n in ("position", "pressure_a", "pressure_b"))
         v, wanted = seen.measured, seen.rates[REFERENCE_SPEED]
         area_a, area_b = areas(known["cylinder.bore"], known["cylinder.rod"])

@@ -105,7 +105,8 @@ class Outing:
     def trajectory(self) -> po.Trajectory:
         """The reference, its speed and its acceleration at the samples."""
         (_, first, _, out), (_, last, _, back) = self.moves
-        t = SAMPLE_TIME * np.arange(last + 1)
+        t: Array = np.asarray(SAMPLE_TIME * np.arange(last + 1), dtype=np.float64)
+        columns: tuple[Array, ...]
         if self.profile is None:
             ways = np.where(t < t[first], out, 0.0)
             columns = (self.trip.begin + ways, np.zeros_like(t), np.zeros_like(t))

@@ -76,7 +76,7 @@ class Task:
         self.count += len(points)
         if found.min() < self.best:
             self.best, self.point = float(found.min()), np.clip(points[int(np.argmin(found))], 0.0, 1.0)
-        return found
+        return np.asarray(found)
 
     def read(self, values: Mapping[str, float], *, seed: int = 0, dwell: float = DWELL) -> Reading:
         """What each trip on each plant gives with some gains, a lane a pair, trips first."""

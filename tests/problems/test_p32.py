@@ -1,17 +1,19 @@
 """The positioning benchmark P32: its statement, its references, its fast simulation, and its rivals."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 import pneuopt as po
 from pneuopt.control.compensation import Instant
-from pneuopt.models.pneumatic.cylinder import areas
 from problems.shared.exact_linearisation import ExactLinearisation
 from problems.shared.p32 import SAMPLE_TIME, drive, fresh_plants, plants, trips
 from problems.shared.p32_moves import Outing, Profile
-from problems.shared.p32_search import searched_plants
+from problems.shared.p32_search import Task, searched_plants
 from problems.shared.p32_simulator import FastSimulator, Lane, read
 from problems.shared.p32_structures import STRUCTURES, gains
+from problems.tune import p32
 
 PROFILE = Profile(0.4, 4.0, 0.05, 1e-3, 0.3)
 GAINS = {"position_loop.Kp": 20.0, "pid.Kp": 2.0, "pressure_feedback.gain": 1e-5, "dead_zone_inverse.width": 0.14}
@@ -100,7 +102,7 @@ def test_the_linearisation_gives_the_force_the_rate_that_it_asks_for() -> None:
     law = ExactLinearisation(given)
     for wanted, speed in ((0.5, 0.3), (-0.4, 0.1), (0.2, -0.3)):
         state = {"position": 0.1, "speed": speed, "pressure_a": 4.6e5, "pressure_b": 4.9e5}
-        p = {"speed_gain": 30.0, "force_gain": 80.0, "friction": 20.0, "smoothing": 1e-3, "rise": 0.5}
+        p: Any = {"speed_gain": 30.0, "force_gain": 80.0, "friction": 20.0, "smoothing": 1e-3, "rise": 0.5}
         rates = {"reference_speed": 0.2, "reference_acceleration": 1.0}
         voltage = float(law.act(Instant(0.0, wanted, speed, 0.0, SAMPLE_TIME, rates, state), {}, p)[1])
         opening = voltage / given.value("valve.span")
@@ -108,7 +110,22 @@ def test_the_linearisation_gives_the_force_the_rate_that_it_asks_for() -> None:
         x = [{**state, "valve.spool": spool}.get(q.name, 0.0) for q in drive_.states]
         ode = drive_.system().ode
         moved = ode(0.0, x, [0.0], [given.value(n) for n in drive_.parameters])[0].full().ravel()
-        area_a, area_b = areas(given.value("cylinder.bore"), given.value("cylinder.rod"))
+        area_a, area_b = np.pi / 4 * 0.032**2, np.pi / 4 * (0.032**2 - 0.012**2)
         force = area_a * (4.6e5 - 1e5) - area_b * (4.9e5 - 1e5)
         asked = 5.0 * (1.0 + 30.0 * (wanted - speed)) + 80.0 * 0.2 + 20.0
         assert area_a * moved[2] - area_b * moved[3] == pytest.approx(80.0 * (asked - force), rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_design_is_read_certified_and_drawn() -> None:
+    structure = STRUCTURES[p32.WINNER]
+    values = p32.designs()[p32.WINNER]
+    found = p32.evaluate(structure, values, {"nominal": {}}, 1.0)
+    rows = {claim.name: claim.value for claim in p32.rows("x", found)}
+    assert rows["x.standing"] == 100.0
+    assert rows["x.max_sensitivity"] <= 2.0
+    assert rows["x.median_error"] < 0.2
+    job = p32.Job({p32.WINNER: found}, {}, {})
+    assert len(p32.main(job)) == len(rows)
+    assert p32.figure(job).axes
+    assert Task(structure, {"nominal": {}}).read(values).error.shape == (9, 2)
