@@ -88,15 +88,18 @@ class Descent:
         Of the first step.
     is_negligible : callable
         Whether a step that is hardly damped is not worth a try.
+
+    Attributes
+    ----------
     damps_nodes : bool
         Whether nodes that overshoot are damped alone. Near an optimum this saves the rest of the log many short steps;
         far from it, nodes are left behind that tighter gaps then cannot free.
+    node_damping : ndarray, shape (m,)
+        Of each node alone, over its diagonal.
     """
 
-    def __init__(
-        self, objective: Objective, damping: float, is_negligible: IsNegligible, *, damps_nodes: bool = False
-    ) -> None:
-        self._damps_nodes, self.promised = damps_nodes, math.inf
+    def __init__(self, objective: Objective, damping: float, is_negligible: IsNegligible) -> None:
+        self.damps_nodes, self.promised = False, math.inf
         self.objective, self.damping, self._is_negligible = objective, damping, is_negligible
         self.node_damping = np.zeros(objective.segments.count)
 
@@ -120,7 +123,7 @@ class Descent:
                     break
                 trial = self._trial(current, reduced, step)
                 is_lower = trial.cost < current.cost
-                if self._damps_nodes and (not is_lower or self.node_damping.any()):
+                if self.damps_nodes and (not is_lower or self.node_damping.any()):
                     self.node_damping = self._missed_curvature(current, trial)
                 if is_lower:
                     self.damping = self.damping * 0.1 if self.damping > MIN_DAMPING else 0.0

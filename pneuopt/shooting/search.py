@@ -25,6 +25,7 @@ from pneuopt.shooting.convergence import (
 )
 from pneuopt.shooting.equations import correct_residuals, weigh_gaps
 from pneuopt.shooting.integration_steps import IntegrationSteps, fine_steps
+from pneuopt.shooting.last_stage import is_near_end, repeat_last_stage
 from pneuopt.shooting.levenberg_marquardt import INITIAL_DAMPING, Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search_end import (
@@ -95,7 +96,8 @@ class Search:
         self.unsettled_gaps = set[float]()
         self.substeps = self.output_substeps = self.steps.start
         self.correction, self.integration_change, self.is_coarse = None, math.nan, False
-        self.current = self._evaluate(nodes, self.scaling.start)
+        self.node_damping = np.zeros(segments.count)  # where the stage has ended, of each node alone
+        self.current = self.evaluate(nodes, self.scaling.start)
 
     def solve(self) -> Fit:
         """Run all stages; an interruption (Ctrl-C) ends them with the best iterate so far, marked."""
@@ -126,6 +128,7 @@ class Search:
             self.stage_ends.append(StageEnd(self.current.nodes, self.current.z, self.current.cost))
             if found := self._early_end(stage):
                 return self._refine_steps(found)
+        repeat_last_stage(self)
         status = self._convergence_status(self.current)
         # gaps that absorb the misfit of the model: the answer depends on their weight
         gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
@@ -171,15 +174,15 @@ class Search:
 
     def _jump_to_last_stage(self) -> Status | None:
         """The status of an optimum that the last stage soon reaches; or None."""
-        before = self._snapshot()
+        before = self.snapshot()
         self._enter_stage(self.method.stages[-1], self.current.nodes, self.current.z)
         if math.isfinite(self.current.cost):
-            self._run_stage(JUMP_ITERATIONS)
+            self.run_stage(JUMP_ITERATIONS)
             if self.is_noise(self.current.cost):  # finer steps are lost on what has not come near the noise by then
                 self._finish_stage(JUMP_ITERATIONS)
                 if (found := self._convergence_status(self.current)).converged and self.is_noise(self.current.cost):
                     return found
-        self._restore(before)
+        self.restore(before)
         return None
 
     def _gaps_absorb_misfit(self) -> bool:
@@ -203,21 +206,23 @@ class Search:
 
     def _loosen(self, stage: "Stage", nodes: Array, z: Array) -> Status:
         """The status of the optimum with a stage's gaps as noise of the states; where there is none, nothing moves."""
-        before, last = self._snapshot(), self.method.stages[-1]
+        before, last = self.snapshot(), self.method.stages[-1]
         self.noisy_gaps = True
         self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), nodes, z)
         self._finish_stage(last.iterations)
         found = self._convergence_status(self.current)
         if not found.converged:
             self.unsettled_gaps.add(stage.gap)
-            self._restore(before)
+            self.restore(before)
             self.noisy_gaps = False
         return found
 
-    def _snapshot(self) -> Snapshot:
+    def snapshot(self) -> Snapshot:
+        """Where the search is, to which `restore` returns."""
         return Snapshot(self.stage, self.current, self.correction, self.substeps, self.output_substeps)
 
-    def _restore(self, to: Snapshot) -> None:
+    def restore(self, to: Snapshot) -> None:
+        """Return to where the search was."""
         self.stage, self.current, self.correction, self.substeps, self.output_substeps = to
         self.segments = self.current.equations.segments
 
@@ -227,12 +232,12 @@ class Search:
         is_same = self.segments is self.current.equations.segments and nodes is self.current.nodes
         is_known = is_same and steps == self.substeps and self.correction is None
         self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
-        self.is_coarse = stage.refine > 1
+        self.is_coarse, self.node_damping = stage.refine > 1, np.zeros(len(nodes))
         if is_known:
             slopes = self.current.equations.linearisation
             self.current = Iterate(nodes, z, weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales))
         else:
-            self.current = self._evaluate(nodes, z)
+            self.current = self.evaluate(nodes, z)
 
     def _apply_finer_steps(self, steps: int) -> float:
         """Integrate the current iterate by finer steps; return the largest change of y [standard deviations]."""
@@ -242,7 +247,7 @@ class Search:
             self._correct_residuals(steps)
         else:
             self.substeps, self.output_substeps, self.correction = steps, steps, None
-            self.current = self._evaluate(nodes, z)
+            self.current = self.evaluate(nodes, z)
         return self.largest_change(self._outputs() - before)
 
     @property
@@ -261,7 +266,7 @@ class Search:
             equations = correct_residuals(current.equations, current.nodes, self.correction, sigma)
             self.current = Iterate(current.nodes, current.z, equations)
         else:
-            self.current = self._evaluate(current.nodes, current.z)
+            self.current = self.evaluate(current.nodes, current.z)
 
     def _outputs(self) -> Array:
         """The model's outputs with the correction of finer steps, shape (m, n, n_outputs)."""
@@ -273,48 +278,51 @@ class Search:
         for _ in range(MAX_STEP_HALVINGS):
             if not status.converged:
                 break
-            before = self._snapshot()
+            before = self.snapshot()
             change = self._apply_finer_steps(self.output_substeps if self.method.substeps else 2 * self.output_substeps)
             if not math.isfinite(self.current.cost):
-                self._restore(before)
+                self.restore(before)
                 break
             if self._convergence_status(self.current).converged:
                 self.integration_change = math.nan if self.method.substeps else change
                 if self.noisy_gaps:
-                    self._run_stage(self.stage.iterations)  # the finer steps have moved its optimum a little
+                    self.run_stage(self.stage.iterations)  # the finer steps have moved its optimum a little
                 break
-            self._run_stage(self.stage.iterations)
+            self.run_stage(self.stage.iterations)
             status = self._convergence_status(self.current)
         return status
 
     def _finish_stage(self, iterations: int) -> bool:
-        """Run a stage, then again with the finer steps that it asks for; return as `_run_stage` does.
+        """Run a stage, then again with the finer steps that it asks for; return as `run_stage` does.
 
         Where an iterate explains the log to its noise, the finer steps correct its residuals within the stage.
         """
-        has_ended = self._run_stage(iterations)
+        has_ended = self.run_stage(iterations)
         if self.stage.refine > 1 and self.correction is None:
-            before = self._snapshot()
+            before = self.snapshot()
             self._apply_finer_steps(fine_steps(self.segments, self.substeps, self.stage.refine))
             if math.isfinite(self.current.cost):
-                return self._run_stage(iterations)
-            self._restore(before)
+                return self.run_stage(iterations)
+            self.restore(before)
         return has_ended
 
     def is_noise(self, cost: float) -> bool:
         """Whether this cost is that of the noise alone."""
         return 2 * cost <= MAX_CHI_SQUARE_RATIO * self.current.equations.count
 
-    def _run_stage(self, iterations: int) -> bool:
+    def run_stage(self, iterations: int) -> bool:
         """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
-        descent = Descent(self._objective(), damping, self._is_negligible_step, damps_nodes=self.noisy_gaps)
+        descent = Descent(self._objective(), damping, self._is_negligible_step)
+        descent.node_damping = self.node_damping
         hopeless, trapped, self.stage_began = 0, 0, self.iterations
         for _ in range(iterations):
             if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
                 self._correct_residuals(fine_steps(self.segments, self.substeps, self.stage.refine))
                 descent.objective = self._objective()
+            descent.damps_nodes = self.noisy_gaps or is_near_end(self)
             trial = descent.step(self.current, self.method.budget)
+            self.node_damping = descent.node_damping
             if trial is None:
                 return True
             self.iterations += 1
@@ -357,7 +365,8 @@ class Search:
         sigma = self.stage.gap * self.gap_scales
         return Objective(self.segments, self.scaling, sigma, self.substeps, self.correction)
 
-    def _evaluate(self, nodes: Array, z: Array) -> Iterate:
+    def evaluate(self, nodes: Array, z: Array) -> Iterate:
+        """The iterate at these nodes and searched parameters."""
         return self._objective().evaluate(nodes, z)
 
     def _convergence_status(self, current: Iterate) -> Status:

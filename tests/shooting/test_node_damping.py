@@ -1,7 +1,7 @@
 """Nodes at which Gauss-Newton's model overshoots are damped alone, so that the rest of a log converges as fast."""
 
 import math
-from typing import Any
+from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
@@ -12,9 +12,11 @@ from scipy.optimize import OptimizeResult, least_squares
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.shooting import last_stage
 from pneuopt.shooting.budget import BudgetSpentError, CpuBudget
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.equations import missed_curvature, normal_equations
-from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.levenberg_marquardt import Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search import Search
@@ -67,9 +69,8 @@ def descend(problem: Transcription, *, damps_nodes: bool) -> tuple[Iterate, int]
     segments = segment(problem)
     objective = Objective(segments, ParameterScaling(segments.transcription), np.array([GAP]), 1)
     current, count = objective.evaluate(start_nodes(segments), objective.scaling.start), 0
-    descent = Descent(
-        objective, 1e-3, lambda at, _, step: at.equations.arrow.descent_rate(step) < 1e-6, damps_nodes=damps_nodes
-    )
+    descent = Descent(objective, 1e-3, lambda at, _, step: at.equations.arrow.descent_rate(step) < 1e-6)
+    descent.damps_nodes = damps_nodes
     while (found := descent.step(current)) is not None and count < 60:
         current, count = found, count + 1
     return current, count
@@ -101,19 +102,67 @@ def test_the_missed_curvature_is_that_of_the_nodes_that_overshoot() -> None:
         assert found[at // 2] * before.arrow.diagonal[at // 2, 0, 0] == pytest.approx(missed, rel=0.02)
 
 
-@pytest.mark.parametrize("is_near", [False, True])
-def test_nodes_are_damped_alone_near_an_optimum_only(is_near: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where gaps stand for noise of the states; before, nodes would be left behind that tighter gaps cannot free."""
+@pytest.mark.parametrize(
+    ("noisy", "stage", "cost", "damps"),
+    [(True, 0, 1e3, True), (False, 0, 1.0, False), (False, -1, 1e3, False), (False, -1, 1.0, True)],
+)
+def test_nodes_are_damped_alone_near_an_optimum_only(
+    noisy: bool, stage: int, cost: float, damps: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where gaps stand for noise of the states, or are the tightest of a search that explains the log to its noise.
+
+    Before, nodes would be left behind that tighter gaps cannot free.
+    """
     damped, search = list[bool](), Search(segment(wrong_squares()), LeastSquares())
-    search.noisy_gaps = is_near
+    search.noisy_gaps, search.stage = noisy, replace(search.method.stages[stage], refine=1)
+    search.method = replace(search.method, stages=(*search.method.stages[:-1], search.stage) if stage else ())
+    search.method = search.method if stage else LeastSquares()
+    search.current = replace(search.current, equations=replace(search.current.equations, cost=cost))
 
-    def descend(*given: Any, damps_nodes: bool) -> Descent:
-        damped.append(damps_nodes)
-        return Descent(*given, damps_nodes=damps_nodes)
+    def take_no_step(descent: Descent, *_: object) -> None:
+        damped.append(descent.damps_nodes)
 
-    monkeypatch.setattr("pneuopt.shooting.search.Descent", descend)
-    search._run_stage(8)
-    assert damped == [is_near]
+    monkeypatch.setattr(Descent, "step", take_no_step)
+    search.run_stage(8)
+    assert damped == [damps]
+
+
+def right_squares() -> Transcription:
+    """A log that the model explains, with squares, so that it takes some iterations from a wrong start."""
+    problem = wrong_squares()
+    measured = problem.residuals[0].measured.copy()
+    measured[:, 0] += 1.0
+    measured[::7, 1] = measured[::7, 0] ** 2
+    return replace(problem, residuals=(replace(problem.residuals[0], measured=measured, noise=np.array([NOISE, 0.5])),))
+
+
+@pytest.mark.parametrize("repeats", [0, last_stage.MAX_REPEATS])
+def test_a_search_that_explains_the_log_is_not_left_short_of_its_optimum(
+    repeats: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A log of bristles at rest was, and other starts took 30 CPU s in place of 3 for no answer."""
+    monkeypatch.setattr(last_stage, "MAX_REPEATS", repeats)
+    fit = solve_least_squares(right_squares(), LeastSquares(stages=(Stage(1e-3, 1),), substeps=1, tolerance=1e-2))
+    assert 2 * fit.stats["cost"] <= MAX_CHI_SQUARE_RATIO * fit.count
+    assert fit.status.converged == (repeats > 0)
+
+
+@pytest.mark.parametrize("helps", [True, False])
+def test_a_trapped_node_is_put_to_the_end_of_the_segment_before_it(helps: bool) -> None:
+    """One node over a kink, which no longer moved, kept a log of 1400 from its optimum, 11 lower in cost."""
+    search = Search(segment(right_squares()), LeastSquares(stages=(Stage(1e-3, 0),), substeps=1))
+    search.solve()
+    nodes = np.ones((N // 2, 1)) + 0.01
+    nodes[9 if helps else slice(0, 9)] += 0.5  # where all nodes before are wrong, this one would be, too
+    search.node_damping[9] = 2 * last_stage.TRAPPING_DAMPING
+    search.current = before = search.evaluate(nodes, 0.0 * search.current.z)
+    last_stage.free_nodes(search, np.array([9]))
+    if helps:
+        assert_allclose(search.current.nodes, np.ones((N // 2, 1)) + 0.01)
+        assert not search.node_damping.any()
+    else:
+        assert search.current is before
+        assert search.node_damping[9] > last_stage.TRAPPING_DAMPING
 
 
 def iterate(cost: float) -> Iterate:
@@ -155,11 +204,11 @@ def test_a_search_with_noise_of_the_states_that_creeps_leaps(
     monkeypatch.setattr(Descent, "leap", leap)
     monkeypatch.setattr(Search, "_report", lambda _: None)
     monkeypatch.setattr(Search, "is_noise", lambda *_: False)
-    search._run_stage(30)
+    search.run_stage(30)
     assert len(taken) == steps
     search.noisy_gaps = False
     leaps.clear()
-    search._run_stage(5)
+    search.run_stage(5)
     assert not leaps
 
 

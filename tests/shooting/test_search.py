@@ -75,9 +75,9 @@ def test_derivatives_are_computed_anew_only_where_finer_steps_change_much(
     limit: float, runs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search = Search(segment(two_logs()), LeastSquares())
-    evaluate = Mock(wraps=search._evaluate)
+    evaluate = Mock(wraps=search.evaluate)
     monkeypatch.setattr("pneuopt.shooting.search.MAX_GRADIENT_ERROR", limit)
-    monkeypatch.setattr(search, "_evaluate", evaluate)
+    monkeypatch.setattr(search, "evaluate", evaluate)
     search._correct_residuals(4)
     assert evaluate.call_count == runs
     assert search.output_substeps == 4
@@ -232,7 +232,7 @@ def test_a_gap_that_stays_wide_open_ends_the_last_stage(monkeypatch: pytest.Monk
         monkeypatch.setattr("pneuopt.shooting.search.TRAPPED_COST_DECREASE", math.inf)
         search = Search(segment(shaken(2e-3)), LeastSquares())
         search._enter_stage(search.method.stages[-1], search.current.nodes, search.current.z)
-        search._run_stage(30)
+        search.run_stage(30)
         ends[widest] = search.iterations
     assert ends[0.0] == 2 < ends[math.inf]
     search._enter_stage(search.method.stages[0], search.current.nodes, search.current.z)

@@ -1,0 +1,68 @@
+"""`repeat_last_stage`: the last stage again, of a search that explains the log but is held up by kinks of the model.
+
+Friction at rest has a kink in the speed, over which Gauss-Newton steps overshoot. Nodes that do so are damped alone;
+one that ends where its equations no longer move it is trapped, and keeps the rest of the log from its optimum.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pneuopt.quantities.arrays import Indices
+
+if TYPE_CHECKING:
+    from pneuopt.shooting.search import Search
+
+# times that the last stage is repeated near the noise [1]: fewer leave a search over kinks (bristles at rest) before
+# its end, for other starts that take longer; more follow one that does not end
+MAX_REPEATS = 3
+# damping of a node alone, over its diagonal [1], beyond which a kink traps it, for it moves less than half as far as
+# its equations ask: lower moves nodes that are only slow, higher leaves some behind
+TRAPPING_DAMPING = 1.0
+
+
+def is_near_end(search: "Search") -> bool:
+    """Whether a search explains the log to its noise with the tightest gaps, so that nodes may be damped alone."""
+    return search.stage is search.method.stages[-1] and search.is_noise(search.current.cost)
+
+
+def repeat_last_stage(search: "Search") -> None:
+    """Run the last stage again while it explains the log to its noise and lowers the cost, but has not converged.
+
+    Parameters
+    ----------
+    search : Search
+        Moves to where it has come by then. Parameters that the data do not determine end this, for a caller holds them.
+    """
+    least_decrease = 0.5 * search.method.tolerance**2  # that of a step of so many deviations
+    for _ in range(MAX_REPEATS):
+        found, before = search.assess(search.current), search.current.cost
+        if found.status.converged or found.unidentifiable.size or not is_near_end(search):
+            return
+        trapped = np.flatnonzero(search.node_damping > TRAPPING_DAMPING)
+        if trapped.size:
+            free_nodes(search, trapped)
+        else:
+            search.run_stage(search.stage.iterations)
+        if before - search.current.cost < least_decrease:
+            return
+
+
+def free_nodes(search: "Search", trapped: Indices) -> None:
+    """Run the last stage from where trapped nodes are put to the ends of the segments before them, if that helps.
+
+    Parameters
+    ----------
+    search : Search
+        Stays where it is unless its cost falls.
+    trapped : ndarray of int
+        Positions of nodes.
+    """
+    before, damping, nodes = search.snapshot(), search.node_damping, search.current.nodes.copy()
+    behind = trapped[trapped > 0]
+    nodes[behind] += search.current.equations.gaps[behind - 1] * search.segments.nominal
+    search.current, search.node_damping = search.evaluate(nodes, search.current.z), np.zeros(len(nodes))
+    search.run_stage(search.stage.iterations)
+    if not search.current.cost < before.current.cost:
+        search.restore(before)
+        search.node_damping = damping
