@@ -123,9 +123,10 @@ def test_a_design_is_read_certified_and_drawn() -> None:
     found = p32.evaluate(structure, values, {"nominal": {}}, 1.0)
     rows = {claim.name: claim.value for claim in p32.rows("x", found)}
     assert rows["x.standing"] == 100.0
-    assert rows["x.max_sensitivity"] <= 2.0
-    assert rows["x.median_error"] < 0.2
+    assert rows["x.within"] < 1.2
     job = p32.Job({p32.WINNER: found}, {}, {})
     assert len(p32.main(job)) == len(rows)
     assert p32.figure(job).axes
-    assert Task(structure, {"nominal": {}}).read(values).error.shape == (9, 2)
+    task = Task(structure, {"nominal": {}})
+    assert max(task.margins.peaks(gains(values))) <= 2.0  # the Ms that the search reads; at 50 mm/s it is larger
+    assert task.read(values).error.shape == (9, 2)
