@@ -32,8 +32,9 @@ def agreement(measured: ArrayLike, predicted: ArrayLike) -> Mapping[str, float]:
     known = np.isfinite(y)
     y, e = y[known], e[known]
     spread = float(np.linalg.norm(y - y.mean())) if y.size else 0.0
-    nrmse = float(np.linalg.norm(e)) / spread if spread > 0 else math.nan
-    rmse = float(np.sqrt(np.mean(e**2))) if y.size else math.nan
+    with np.errstate(over="ignore"):  # of a free run that diverged: infinitely far from the log
+        nrmse = float(np.linalg.norm(e)) / spread if spread > 0 else math.nan
+        rmse = float(np.sqrt(np.mean(e**2))) if y.size else math.nan
     return {"rmse": rmse, "nrmse": nrmse, "fit_percent": 100 * (1 - nrmse), "samples": float(y.size)}
 
 

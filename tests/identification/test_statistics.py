@@ -65,3 +65,8 @@ def test_few_degrees_of_freedom_take_students_quantile(dof: float, quantile: flo
 def test_correlation_matrix() -> None:
     assert_allclose(correlation(np.array([[4.0, 1.0], [1.0, 1.0]])), [[1, 0.5], [0.5, 1]])
     assert np.isnan(correlation(np.array([[0.0, 0.0], [0.0, 1.0]]))[0]).all()
+
+
+def test_a_prediction_that_diverged_is_infinitely_far_without_a_warning() -> None:
+    found = agreement([0.0, 1.0, 2.0], [0.0, 1e200, 2.0])
+    assert (found["rmse"], found["fit_percent"]) == (np.inf, -np.inf)
