@@ -174,7 +174,7 @@ class Job:
 
 def run(count: int = FRESH, certify: bool = False) -> Job:
     given, known = drive()[1], designs()
-    corners, drawn = plants(given), fresh_plants(given, count)
+    corners, drawn = plants(given), fresh_plants(given, count) if count else {}
     found = {n: evaluate(STRUCTURES[n], values, corners) for n, values in known.items()}
     fresh = {n: evaluate(STRUCTURES[n], known[n], drawn, 1.0) for n in known} if count else {}
     best, own = STRUCTURES[WINNER], known[WINNER]
