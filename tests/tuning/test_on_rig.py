@@ -91,6 +91,7 @@ STUCK = ClosedLoop(ForceDrive(Karnopp(Stribeck())).system(), PUSHED.pid, measure
 HUNTING = {"pid.Kp": 5000.0, "pid.Ki": 100000.0, "pid.Kd": 200.0, "friction.stribeck_velocity": 1e-3}
 
 
+@pytest.mark.slow  # 4 to 5 s
 @pytest.mark.parametrize("width", [0.0, 0.01])
 def test_a_loop_that_hunts_on_the_rig_is_not_certified_where_that_is_asked(width: float) -> None:
     step, rig = Step(0.1, horizon=0.6), Rig(STUCK, {"position": Sensor()})
