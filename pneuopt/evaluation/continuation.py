@@ -90,14 +90,17 @@ class Course:
         """Whether the error has left every sensible size."""
         return bool(np.abs(self.error[-1]) > RUNAWAY_ERROR)
 
+    @property
+    def judged(self) -> slice:
+        """The instants of `t` that are judged: those shortly before a contact are left out."""
+        left_out = CONTACT_SHARE * self.t[-1] if self.contact else 0.0
+        return slice(int(np.searchsorted(self.t, self.t[-1] - left_out, side="right")))
+
     @cached_property
     def at(self) -> Array:
-        """Instants that are judged [s]: means are known until half a dither period before the end.
-
-        Those shortly before a contact are left out.
-        """
-        left_out = CONTACT_SHARE * self.t[-1] if self.contact else 0.0
-        return np.asarray(self.t[self.t <= self.t[-1] - max(left_out, (self.period or 0.0) / 2)])
+        """Instants of `judged` at which the mean over a dither's period is known [s]."""
+        t = self.t[self.judged]
+        return np.asarray(t[t <= self.t[-1] - (self.period or 0.0) / 2])
 
     @cached_property
     def error(self) -> Array:

@@ -80,14 +80,14 @@ def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
     course, size = continue_response(found, share), abs(found.case.reference.nominal_size)
     ending = Ending(course, share, found.case.label)
     begin, mean = begin_of_end(ending), np.abs(course.error)
-    raw = np.abs(course.signal - course.reference.final) / size
+    t, raw = course.t[course.judged], np.abs(course.signal[course.judged] - course.reference.final) / size
     errors = {
-        "RemainingError": 100 * float(raw[course.t >= begin].max()),
+        "RemainingError": 100 * float(raw[t >= begin].max()),
         "SteadyStateError": 100 * float(mean[course.at >= begin].max()),
     }
     settled = {
         "SettlingTime": _settling_time(ending, found.metrics["SettlingTime"], course.at, mean),
-        "SettlingTimeRaw": _settling_time(ending, found.metrics["SettlingTimeRaw"], course.t, raw),
+        "SettlingTimeRaw": _settling_time(ending, found.metrics["SettlingTimeRaw"], t, raw),
     }
     return DitheredEnding(
         {**found.metrics, **errors, **settled},
