@@ -91,15 +91,15 @@ class Course:
         return bool(np.abs(self.error[-1]) > RUNAWAY_ERROR)
 
     @property
-    def judged(self) -> slice:
+    def before_contact(self) -> slice:
         """The instants of `t` that are judged: those shortly before a contact are left out."""
         left_out = CONTACT_SHARE * self.t[-1] if self.contact else 0.0
         return slice(int(np.searchsorted(self.t, self.t[-1] - left_out, side="right")))
 
     @cached_property
     def at(self) -> Array:
-        """Instants of `judged` at which the mean over a dither's period is known [s]."""
-        t = self.t[self.judged]
+        """Instants of `before_contact` at which the mean over a dither's period is known [s]."""
+        t = self.t[self.before_contact]
         return np.asarray(t[t <= self.t[-1] - (self.period or 0.0) / 2])
 
     @cached_property
