@@ -80,7 +80,10 @@ def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
     course, size = continue_response(found, share), abs(found.case.reference.nominal_size)
     ending = Ending(course, share, found.case.label)
     begin, mean = begin_of_end(ending), np.abs(course.error)
-    t, raw = course.t[course.before_contact], np.abs(course.signal[course.before_contact] - course.reference.final) / size
+    t, raw = (
+        course.t[course.before_contact],
+        np.abs(course.signal[course.before_contact] - course.reference.final) / size,
+    )
     errors = {
         "RemainingError": 100 * float(raw[t >= begin].max()),
         "SteadyStateError": 100 * float(mean[course.at >= begin].max()),

@@ -56,7 +56,8 @@ class LoggedLoop:
     Raises
     ------
     ModelError
-        If the controller is continuous, or reads an encoder, whose steps leave a fit without derivatives.
+        If the controller is continuous, reads an encoder, whose steps leave a fit without derivatives, or resets its
+        integral, whose jumps do so too.
     """
 
     loop: ClosedLoop
@@ -66,6 +67,11 @@ class LoggedLoop:
         require(self.loop.pid.sample_time is not None, message, ModelError)
         message = "an identification has no derivatives through an Encoder; give SensorLag(filter + half a sample)"
         require(not isinstance(self.loop.sensor, Encoder), message, ModelError)
+        message = (
+            "an identification has no derivatives through the jumps of a resetting integral: switch the reset off for "
+            "the run (PID(reset=False)), or log the command and identify the plant alone (loop.plant)"
+        )
+        require(not self.loop.pid.reset, message, ModelError)
 
     @property
     def states(self) -> tuple[Quantity, ...]:

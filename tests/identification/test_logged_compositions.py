@@ -1,4 +1,4 @@
-"""Identification inside composed controllers: cascade, feedforward, state feedback and reset, from logs of moves."""
+"""Identification inside composed controllers: cascade, feedforward and state feedback, from logs of moves."""
 
 import re
 from dataclasses import replace
@@ -27,7 +27,7 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import LogError
+from pneuopt.quantities.errors import LogError, ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -187,3 +187,9 @@ def test_state_feedback_without_its_pressures_in_the_log_is_refused() -> None:
     said = "the controller reads 'pressure_a', which the log does not hold; log it"
     with pytest.raises(LogError, match=re.escape(said)):
         identify(loop, [replace(log, noise={"position": 1e-5})], given.freed("load.mass"))
+
+
+def test_a_resetting_integral_is_refused_with_what_to_do() -> None:
+    loop = ClosedLoop(ForceDrive(Coulomb()).system(), PID(H, limits=False, reset=True), measured="position")
+    with pytest.raises(ModelError, match=re.escape("PID(reset=False)), or log the command")):
+        LoggedLoop(loop)
