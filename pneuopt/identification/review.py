@@ -95,7 +95,7 @@ def review_fit(
         local = _verdict_at(problem, start, result)
         verdict = add_unidentifiable(verdict, unidentifiable, local, _names_at_given_value(problem))
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
-    covariance = _blank_covariance(result.covariance, estimates.index[estimates["stderr"].isna()])
+    covariance = _widen_covariance(result.covariance, estimates["stderr"])
     status = _name_part(problem, _name_interruption(result.status, waiting), verdict)
     return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
 
@@ -106,6 +106,13 @@ def _blank_covariance(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.D
     out.loc[own] = math.nan
     out[own] = math.nan
     return out
+
+
+def _widen_covariance(covariance: "pd.DataFrame", stderr: "pd.Series[float]") -> "pd.DataFrame":
+    """The covariance with the correlations as they are and these standard deviations; NaN where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = stderr.to_numpy(dtype=float) / np.sqrt(np.diag(covariance))
+    return covariance * np.outer(ratio, ratio)
 
 
 def _blank_intervals(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
@@ -175,12 +182,16 @@ def _parameters_outside_interval(profile: Profile, estimates: "pd.DataFrame") ->
 
 
 def _replace_intervals(estimates: "pd.DataFrame", profiles: Mapping[str, Profile], verdict: Verdict) -> "pd.DataFrame":
-    """The estimates with the profiles' intervals; no standard deviation where an interval is open."""
+    """The estimates with the profiles' intervals, and standard deviations that reach their farther ends.
+
+    There is none where an interval is open. The linear one is that of the likelihood's curvature at its peak, which
+    says little of the side on which a profile is flat.
+    """
     out = _blank_intervals(estimates, verdict.unidentifiable)
     for name, found in profiles.items():
         out.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
-        if found.is_open:
-            out.loc[name, "stderr"] = math.nan
+        farther = max(found.high - found.estimate, found.estimate - found.low) / math.sqrt(found.threshold)
+        out.loc[name, "stderr"] = math.nan if found.is_open else max(farther, float(estimates["stderr"][name]))
     return out
 
 

@@ -8,6 +8,7 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System
 from pneuopt.identification import profiles, review
 from pneuopt.identification.checks import check_logs
+from pneuopt.identification.clusters import t_quantile
 from pneuopt.identification.identify import identify
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.profiles import Profile, profile
@@ -81,6 +82,17 @@ def test_a_weakly_identifiable_stribeck_velocity_has_unequal_sides() -> None:
     assert f"m/s, 95 % interval: {found.sentence}" in " ".join(repr(found).split())
     wider = profile(system, [log], result, "friction.stribeck_velocity", level=0.99)
     assert wider.low < found.low < found.high < wider.high
+
+
+def test_a_standard_deviation_reaches_the_farther_end_of_a_profile() -> None:
+    """The curvature at the peak gave one of a third on the side on which the likelihood is flat."""
+    _, result = fitted(Stribeck(), moved(42.0, 16.0), *CURVE)
+    row = result.estimates.loc["friction.stribeck_velocity"]
+    farther = max(row["ci_high"] - row["value"], row["value"] - row["ci_low"])
+    assert farther > 1.3 * min(row["ci_high"] - row["value"], row["value"] - row["ci_low"])
+    assert row["stderr"] * t_quantile(float(row["dof"]), 0.95) == pytest.approx(farther)
+    deviations = np.sqrt(np.diag(result.covariance))
+    assert deviations == pytest.approx(result.estimates["stderr"].to_numpy())
 
 
 def test_a_curve_that_is_not_there_has_open_ends_and_no_interval() -> None:
