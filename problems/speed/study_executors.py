@@ -7,6 +7,9 @@ each certified by `evaluate` over a step of 1 s. Each executor serves a study in
 for linear algebra. Row case.cpu: CPU seconds of a certified case within the study in one thread, once the first ten are
 done. Rows *.differ: cells of the table, without "seconds", whose bits differ from those of one thread. Rows
 *.efficiency_cpu: CPU seconds in one thread over those of all processes together, their start and imports included.
+Rows *.start: CPU seconds of the same study of twenty cases, most of which is the start; rows *.efficiency_cpu.going and
+*.efficiency.going: the efficiencies of the other cases, by the differences from that study, as of one that goes on for
+hours.
 The wall efficiency, wall time in one thread over twice that on two workers, tells nothing unless two cores are idle: it
 is shown beside the number of cores that the study had on average.
 """
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
 
 SERIAL, WORKERS = "serial", 2
 PLACES = (SERIAL, "processes", "dask")
-CASES, WARMING = 600, 10
+CASES, WARMING, STARTING = 600, 10, 20
 EFFICIENCY, CASE_CPU = 0.85, 0.2  # what a study should reach [1], and what a case may take [s]
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -52,14 +55,13 @@ class Cost(NamedTuple):
 def main(cases: int = CASES, places: tuple[str, ...] = PLACES) -> "pd.DataFrame":
     import pandas as pd
 
-    tables, costs = dict[str, pd.DataFrame](), dict[str, Cost]()
+    tables, costs, starts = dict[str, pd.DataFrame](), dict[str, Cost](), dict[str, Cost]()
     with tempfile.TemporaryDirectory() as folder:
         for place in places:
             path = Path(folder) / f"{place}.pickle"
-            command = [sys.executable, __file__, "--cases", str(cases), "--place", place, "--table", str(path)]
-            done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, **ONE_THREAD})
-            costs[place], tables[place] = Cost(*map(float, done.stdout.split())), pd.read_pickle(path)
-    alone, table = costs[SERIAL], tables[SERIAL]
+            starts[place] = _run(place, min(STARTING, cases), path)
+            costs[place], tables[place] = _run(place, cases, path), pd.read_pickle(path)
+    alone, table, begun = costs[SERIAL], tables[SERIAL], starts[SERIAL]
     claims = [
         Claim("cases", len(table)),
         Claim("failed", int((table["error"] != "").sum()), "1", None, "<= 0"),
@@ -68,7 +70,7 @@ def main(cases: int = CASES, places: tuple[str, ...] = PLACES) -> "pd.DataFrame"
         Claim(f"{SERIAL}.cpu", alone.cpu, "s"),
     ]
     for place in places[1:]:
-        cost = costs[place]
+        cost, start = costs[place], starts[place]
         claims += [
             Claim(f"{place}.differ", count_differences(table, tables[place]), "1", None, "<= 0"),
             Claim(f"{place}.wall", cost.wall, "s"),
@@ -76,8 +78,22 @@ def main(cases: int = CASES, places: tuple[str, ...] = PLACES) -> "pd.DataFrame"
             Claim(f"{place}.cores", cost.cpu / cost.wall),
             Claim(f"{place}.efficiency", alone.wall / (WORKERS * cost.wall), "1"),
             Claim(f"{place}.efficiency_cpu", alone.cpu / cost.cpu, "1", None, f">= {EFFICIENCY}"),
+            Claim(f"{place}.start", start.cpu, "s"),
         ]
+        if cases > STARTING:
+            wall, cpu = WORKERS * (cost.wall - start.wall), cost.cpu - start.cpu
+            claims += [
+                Claim(f"{place}.efficiency.going", (alone.wall - begun.wall) / wall),
+                Claim(f"{place}.efficiency_cpu.going", (alone.cpu - begun.cpu) / cpu),
+            ]
     return frame(claims)
+
+
+def _run(place: str, cases: int, path: Path) -> Cost:
+    """What a study costs that serves alone in a process, and leaves its table."""
+    command = [sys.executable, __file__, "--cases", str(cases), "--place", place, "--table", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, **ONE_THREAD})
+    return Cost(*map(float, done.stdout.split()))
 
 
 def count_differences(one: "pd.DataFrame", other: "pd.DataFrame") -> int:
