@@ -90,7 +90,7 @@ def test_a_standard_deviation_reaches_the_farther_end_of_a_profile() -> None:
     row = result.estimates.loc["friction.stribeck_velocity"]
     farther = max(row["ci_high"] - row["value"], row["value"] - row["ci_low"])
     assert farther > 1.3 * min(row["ci_high"] - row["value"], row["value"] - row["ci_low"])
-    assert row["stderr"] * t_quantile(float(row["dof"]), 0.95) == pytest.approx(farther)
+    assert row["stderr"] * t_quantile(row["dof"].item(), 0.95) == pytest.approx(farther)
     deviations = np.sqrt(np.diag(result.covariance))
     assert deviations == pytest.approx(result.estimates["stderr"].to_numpy())
 
