@@ -114,8 +114,9 @@ class ClosedLoop:
             check_algebraic_loop(self.plant, self.command.name, name)
         twice = [q.name for q in self.motion_inputs if q.name in names(self.plant.inputs)]
         require(not twice, f"the plant has inputs {', '.join(twice)} of its own; rename them", ModelError)
+        own = self.parameters  # raises where a part cannot be built: a dither beyond the Nyquist frequency, say
         if self.schedule:
-            self.schedule.check(self.parameters)
+            self.schedule.check(own)
 
     def __repr__(self) -> str:
         model = self.system() if self.pid.sample_time is None else self.discrete()
