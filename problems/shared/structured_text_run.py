@@ -27,6 +27,7 @@ FUNCTIONS: Mapping[str, Callable[..., Any]] = {
     "MAX": max,
     "ABS": abs,
     "EXP": math.exp,
+    "LN": math.log,
     "SIN": math.sin,
     "COS": math.cos,
     "SQRT": math.sqrt,
