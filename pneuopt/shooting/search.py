@@ -64,11 +64,6 @@ MAX_CREEPING_STEPS = 3
 # actual over promised decrease [1] below which such a search creeps: higher leaves a fit that converges, lower follows
 # a kink of the model for hundreds of steps (a log with encoder steps: 50 of .13 each, of 35 promised)
 CREEPING_SHARE = 0.3
-# a gap in its deviations [1] that no optimum leaves open: in the last stage it is a stick or a slip that the model puts
-# elsewhere, and steps that lower the cost by less than a share [1] creep along it for as long as they are let. Lower
-# ones end searches that near a wrong model's optimum, higher ones creep for ten seconds
-TRAPPED_GAP, TRAPPED_COST_DECREASE = 300.0, 0.02
-MAX_TRAPPED_STEPS = 5  # such steps in a row that end a stage: fewer leave what comes free, more take long
 # difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
 # one
 JOINED_COST_TOLERANCE = 1e-3
@@ -315,7 +310,7 @@ class Search:
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         descent = Descent(self._objective(), damping, self._is_negligible_step)
         descent.node_damping = self.node_damping
-        hopeless, trapped, self.stage_began = 0, 0, self.iterations
+        hopeless, self.stage_began = 0, self.iterations
         for _ in range(iterations):
             if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
                 self._correct_residuals(fine_steps(self.segments, self.substeps, self.stage.refine))
@@ -328,9 +323,6 @@ class Search:
             self.iterations += 1
             before, self.current = self.current.cost, trial
             self._report()
-            trapped = trapped + 1 if self._is_trapped(before) else 0
-            if trapped == MAX_TRAPPED_STEPS:
-                return True
             hopeless = hopeless + 1 if self._creeps(before, descent.promised) else 0
             if hopeless == MAX_CREEPING_STEPS:
                 if not self._leap(descent):
@@ -345,12 +337,6 @@ class Search:
         before, (self.current, taken) = self.current.cost, descent.leap(self.current, self.method.budget)
         self.iterations += taken
         return self.current.cost < before
-
-    def _is_trapped(self, before: float) -> bool:
-        """Whether a step from a cost has hardly lowered it in the last stage, while a gap stands wide open."""
-        is_tight = not self.noisy_gaps and self.stage.gap <= self.method.stages[-1].gap
-        is_slow = before - self.current.cost < TRAPPED_COST_DECREASE * before
-        return is_tight and is_slow and self.current.equations.largest_gap > TRAPPED_GAP * self.stage.gap
 
     def _creeps(self, before: float, promised: float) -> bool:
         """Whether a step from a cost has fallen far short of its promise, and changed little."""
