@@ -22,8 +22,12 @@ TRAPPING_DAMPING = 1.0
 
 
 def is_near_end(search: "Search") -> bool:
-    """Whether a search explains the log to its noise with the tightest gaps, so that nodes may be damped alone."""
-    return search.stage is search.method.stages[-1] and search.is_noise(search.current.cost)
+    """Whether a search explains the log to its noise in a last stage that is to converge: one that refines its steps.
+
+    One that only settles a start ends with wide gaps, where nodes that are damped alone are left behind.
+    """
+    is_last = search.stage is search.method.stages[-1] and search.stage.refine > 1
+    return is_last and search.is_noise(search.current.cost)
 
 
 def repeat_last_stage(search: "Search") -> None:

@@ -309,7 +309,7 @@ class Search:
         """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         descent = Descent(self._objective(), damping, self._is_negligible_step)
-        descent.node_damping = self.node_damping
+        descent.node_damping = np.zeros(len(self.node_damping)) if self.noisy_gaps else self.node_damping
         hopeless, self.stage_began = 0, self.iterations
         for _ in range(iterations):
             if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:

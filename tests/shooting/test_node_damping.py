@@ -103,26 +103,32 @@ def test_the_missed_curvature_is_that_of_the_nodes_that_overshoot() -> None:
 
 
 @pytest.mark.parametrize(
-    ("noisy", "stage", "cost", "damps"),
-    [(True, 0, 1e3, True), (False, 0, 1.0, False), (False, -1, 1e3, False), (False, -1, 1.0, True)],
+    ("noisy", "stages", "cost", "damps"),
+    [
+        (True, slice(None), 1e3, True),
+        (False, slice(None), 1.0, False),
+        (False, slice(-1, None), 1e3, False),
+        (False, slice(-1, None), 1.0, True),
+        (False, slice(0, 1), 1.0, False),
+    ],
 )
 def test_nodes_are_damped_alone_near_an_optimum_only(
-    noisy: bool, stage: int, cost: float, damps: bool, monkeypatch: pytest.MonkeyPatch
+    noisy: bool, stages: slice, cost: float, damps: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where gaps stand for noise of the states, or are the tightest of a search that explains the log to its noise.
 
-    Before, nodes would be left behind that tighter gaps cannot free.
+    Before, nodes would be left behind that tighter gaps cannot free; so they would in a stage that settles a start: a
+    log of bristles took 45 CPU s for an answer with noise of the states, in place of 7.
     """
-    damped, search = list[bool](), Search(segment(wrong_squares()), LeastSquares())
-    search.noisy_gaps, search.stage = noisy, replace(search.method.stages[stage], refine=1)
-    search.method = replace(search.method, stages=(*search.method.stages[:-1], search.stage) if stage else ())
-    search.method = search.method if stage else LeastSquares()
+    damped, search = list[bool](), Search(segment(wrong_squares()), LeastSquares(stages=LeastSquares().stages[stages]))
+    search.noisy_gaps = noisy
     search.current = replace(search.current, equations=replace(search.current.equations, cost=cost))
 
     def take_no_step(descent: Descent, *_: object) -> None:
         damped.append(descent.damps_nodes)
 
     monkeypatch.setattr(Descent, "step", take_no_step)
+    monkeypatch.setattr(Search, "_corrects_residuals", False)
     search.run_stage(8)
     assert damped == [damps]
 
@@ -142,7 +148,9 @@ def test_a_search_that_explains_the_log_is_not_left_short_of_its_optimum(
 ) -> None:
     """A log of bristles at rest was, and other starts took 30 CPU s in place of 3 for no answer."""
     monkeypatch.setattr(last_stage, "MAX_REPEATS", repeats)
-    fit = solve_least_squares(right_squares(), LeastSquares(stages=(Stage(1e-3, 1),), substeps=1, tolerance=1e-2))
+    fit = solve_least_squares(
+        right_squares(), LeastSquares(stages=(Stage(1e-3, 1, refine=2),), substeps=1, tolerance=1e-4)
+    )
     assert 2 * fit.stats["cost"] <= MAX_CHI_SQUARE_RATIO * fit.count
     assert fit.status.converged == (repeats > 0)
 
@@ -150,7 +158,7 @@ def test_a_search_that_explains_the_log_is_not_left_short_of_its_optimum(
 @pytest.mark.parametrize("helps", [True, False])
 def test_a_trapped_node_is_put_to_the_end_of_the_segment_before_it(helps: bool) -> None:
     """One node over a kink, which no longer moved, kept a log of 1400 from its optimum, 11 lower in cost."""
-    search = Search(segment(right_squares()), LeastSquares(stages=(Stage(1e-3, 0),), substeps=1))
+    search = Search(segment(right_squares()), LeastSquares(stages=(Stage(1e-3, 0, refine=2),), substeps=1))
     search.solve()
     nodes = np.ones((N // 2, 1)) + 0.01
     nodes[9 if helps else slice(0, 9)] += 0.5  # where all nodes before are wrong, this one would be, too
