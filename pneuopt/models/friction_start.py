@@ -1,4 +1,4 @@
-"""Declarations of a friction law from which an identification starts without a guess (see `starts.friction`)."""
+"""Declarations of a friction law from which an identification starts without a guess (see `models.starts.friction`)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -20,11 +20,11 @@ from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, S
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.pneumatic.gas import GAS_CONSTANT
 from pneuopt.models.pneumatic.limits import check_hardware, check_start, cylinder_limits, position_warning
+from pneuopt.models.pneumatic.line_pressure import LinePressureCheck
+from pneuopt.models.pneumatic.pressure_zero import PressureZeroCheck
 from pneuopt.models.pneumatic.rest import BALANCE_RATES, MotionBalance, solve_steady_motion
+from pneuopt.models.pneumatic.starts import PneumaticStarts
 from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve
-from pneuopt.models.starts.line_pressure import LinePressureCheck
-from pneuopt.models.starts.pneumatic import PneumaticStarts
-from pneuopt.models.starts.pressure_zero import PressureZeroCheck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix

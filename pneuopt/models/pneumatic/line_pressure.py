@@ -14,15 +14,15 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Log
 from pneuopt.models.pneumatic.cylinder import volumes
-from pneuopt.models.starts.following import PRESSURE_NAMES
-from pneuopt.models.starts.pneumatic import PneumaticLog
-from pneuopt.models.starts.pressure_zero import (
+from pneuopt.models.pneumatic.following import PRESSURE_NAMES
+from pneuopt.models.pneumatic.pressure_zero import (
     MAX_UNQUESTIONED_SHARE,
     MIN_RESIDUAL_RATIO,
     is_informative,
     most_active_part,
     trial_shapes,
 )
+from pneuopt.models.pneumatic.starts import PneumaticLog
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import without_prefix
 

@@ -18,8 +18,8 @@ import numpy as np
 from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.dynamics.system import System
 from pneuopt.models.friction import FrictionModel
+from pneuopt.models.pneumatic.following import PRESSURE_NAMES, AirSimulator
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
-from pneuopt.models.starts.following import PRESSURE_NAMES, AirSimulator
 from pneuopt.models.starts.friction import (
     RegressionRows,
     filter_channel,

@@ -15,18 +15,18 @@ from typing import NamedTuple
 import numpy as np
 
 from pneuopt.dynamics.hooks import Log
-from pneuopt.models.starts.following import PRESSURE_NAMES
+from pneuopt.models.pneumatic.following import PRESSURE_NAMES
+from pneuopt.models.pneumatic.starts import PneumaticLog, valve_shapes
 from pneuopt.models.starts.friction import filter_channel
-from pneuopt.models.starts.pneumatic import PneumaticLog, valve_shapes
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.units import ATMOSPHERE
 
 PrepareLogs = Callable[[Mapping[str, Log]], Mapping[str, PneumaticLog]]
 # Ratio of residuals by which another zero point must be better to be advised: a smaller one warns of right pressures, a
-# larger one misses wrong ones (tests/models/starts/test_pressure_zero.py).
+# larger one misses wrong ones (tests/models/pneumatic/test_pressure_zero.py).
 MIN_RESIDUAL_RATIO = 1.5
 # Share of a pressure's squared rates that a zero point may leave without a check of others: a wrong one leaves 0.03 or
-# more (tests/models/starts/test_pressure_zero.py), a smaller share checks right ones at the cost of time.
+# more (tests/models/pneumatic/test_pressure_zero.py), a smaller share checks right ones at the cost of time.
 MAX_UNQUESTIONED_SHARE = 0.02
 MAX_RESIDUAL_SHARE = 0.2  # largest such share that an advised zero point may leave: with more, the model does not fit
 MIN_LOG_DURATION = 1.0  # duration from which a log is checked alone as well [s]; shorter ones hold too little motion

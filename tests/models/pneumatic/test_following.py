@@ -8,7 +8,7 @@ import pytest
 import pneuopt as po
 from pneuopt.models.catalog import b32
 from pneuopt.models.pneumatic.chamber import Thermal
-from pneuopt.models.starts.following import AirSimulator
+from pneuopt.models.pneumatic.following import AirSimulator
 
 Truth = tuple[po.System, po.ParameterSet, po.Trajectory]
 
