@@ -86,8 +86,14 @@ class PneumaticStarts:
 
     def prepare_logs(self, logs: Mapping[str, Log]) -> dict[str, "PneumaticLog"]:
         """Logs with the motion and the air of this drive."""
-        simulator_for = functools.cache(functools.partial(AirSimulator, self.system()))
+        simulator_for = functools.partial(_air_simulator, self.system())
         return {name: PneumaticLog(log, simulator_for, self.air_force) for name, log in logs.items()}
+
+
+@functools.lru_cache(maxsize=32)
+def _air_simulator(system: System, given_states: tuple[str, ...]) -> AirSimulator:
+    """The air of a drive, which the checks of a log and its starts ask for in turn."""
+    return AirSimulator(system, given_states)
 
 
 def _with_valve(starts: Sequence[Start], index: int, valve: ValveValues) -> Start:
