@@ -2,8 +2,8 @@
 
     python .docs/make_pages.py FOLDER
 
-Two pages are written by hand and copied: theory.md and validated.md. A source's link to what is no page of the site
-ends this, so that nothing is moved without its readers.
+Pages written by hand stand beside this file; keys.md and outputs.md get their tables from the declarations. A source's
+link to what is no page of the site ends this, so that nothing is moved without its readers.
 """
 
 import ast
@@ -13,11 +13,14 @@ import shutil
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 
 import pneuopt
+from pneuopt.cli.keys import format_markdown
+from pneuopt.files.json_outputs import describe_outputs
+from pneuopt.files.key_list import list_keys
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
@@ -31,7 +34,6 @@ SECTIONS = {  # pages of README's sections
     "tutorial.md": ("Your own rig", "# Tutorial: your own rig"),
     "jobs.md": ("The three jobs", "# How to: the three jobs"),
     "concepts.md": ("Concept map", "# Concepts"),
-    "keys.md": ("Appendix: the keys of the files", "# Keys of the files"),
     "changelog.md": ("Changelog", "# Changelog"),
 }
 ROOMS = {  # whose public names have a page, in the order in which data go through them
@@ -52,9 +54,15 @@ ROOMS = {  # whose public names have a page, in the order in which data go throu
 }
 CONTENTS = {  # the site's pages by what a reader comes for
     "Learn": ["tutorial", "jobs", "concepts", "theory", "validated"],
-    "Look up": ["commands", "keys", "api/index"],
+    "Look up": ["commands", "keys", "outputs", "api/index"],
     "Results": ["gallery", "paper", "data"],
     "Project": ["contributing", "changelog"],
+}
+HAND_WRITTEN: Mapping[str, Callable[[], str]] = {  # the pages beside this file, and the tables at their ends
+    "theory.md": str,
+    "validated.md": str,
+    "keys.md": lambda: format_markdown(list_keys()),
+    "outputs.md": describe_outputs,
 }
 FOLDER = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "build" / "pages"
 
@@ -244,8 +252,8 @@ def write_all() -> None:
     for source, page in PAGES.items():
         if page != "index.md":
             write(page, localise((ROOT / source).read_text("utf-8"), str(Path(source).parent), page))
-    for page in ("theory.md", "validated.md"):
-        shutil.copy(Path(__file__).with_name(page), FOLDER)
+    for page, table in HAND_WRITTEN.items():
+        write(page, Path(__file__).with_name(page).read_text("utf-8") + table())
     write_api()
     write_commands()
     write_gallery()

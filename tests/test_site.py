@@ -38,12 +38,19 @@ def test_every_public_name_and_script_has_its_place(pages: ModuleType) -> None:
     assert all((ROOT / call.split()[0]).is_file() for _, call, _ in pages.scripts() if call)
 
 
+def test_pages_written_by_hand_have_their_tables_and_a_place(pages: ModuleType) -> None:
+    assert "| `load.mass` | kg |" in pages.HAND_WRITTEN["keys.md"]()
+    assert "**identify**: `pneuopt identify`" in pages.HAND_WRITTEN["outputs.md"]()
+    shown = {f"{page}.md" for part in pages.CONTENTS.values() for page in part}
+    assert {p.name for p in (ROOT / ".docs").glob("*.md")} == set(pages.HAND_WRITTEN) <= shown
+
+
 def test_sources_link_to_pages_of_the_site(pages: ModuleType) -> None:
     for title, _ in pages.SECTIONS.values():
         pages.localise(pages.section(title), "", "index.md")
     with pytest.raises(AssertionError, match=r"a link to LICENSE, of which the site has no page"):
         pages.localise("[licence](LICENSE)", "", "index.md")
-    assert pages.localise("[keys](#appendix-the-keys-of-the-files)", "", "index.md") == "[keys](keys.md)"
+    assert pages.localise("[words](#concept-map)", "", "index.md") == "[words](concepts.md)"
     assert pages.link_names("see `tune`\n```\n`tune`\n```") == "see {py:obj}`tune <pneuopt.tune>`\n```\n`tune`\n```"
 
 

@@ -367,13 +367,15 @@ def keys_command(
     word: Annotated[
         str | None, typer.Argument(metavar="WORD", help="A file, a section, a key, or a word of its meaning.")
     ] = None,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print tables in Markdown, as in README.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print tables in Markdown.")] = False,
+    outputs: Annotated[bool, typer.Option("--outputs", help="Show what each command writes with --json.")] = False,
 ) -> None:
     """Show what may stand in the files: each key, its unit, its default and what it means."""
     with report_errors():
-        from pneuopt.cli.keys import run_keys
+        from pneuopt.cli.keys import run_keys, run_outputs
 
-        raise typer.Exit(run_keys(word, markdown))
+        require(not (outputs and word), "--outputs shows all outputs: give no WORD beside it")
+        raise typer.Exit(run_outputs(markdown) if outputs else run_keys(word, markdown))
 
 
 @_command("info")

@@ -71,7 +71,9 @@ COMMAND_HELP = {
         "Tell whether parameters drift over dated logs.",
         ("pneuopt track drive.toml logs/*.csv --tuned tuned.toml --plot drift.png",),
     ),
-    "keys": CommandHelp("Show what may stand in the files.", ("pneuopt keys", "pneuopt keys dead_zone")),
+    "keys": CommandHelp(
+        "Show what may stand in the files.", ("pneuopt keys", "pneuopt keys dead_zone", "pneuopt keys --outputs")
+    ),
     "info": CommandHelp("Show versions, compiler, cache and speed.", ("pneuopt info",), "Quote it in a bug report"),
 }
 

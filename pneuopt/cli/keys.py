@@ -1,4 +1,4 @@
-"""The command `keys`: what stands in which file, as on the screen and as in README's appendix."""
+"""The command `keys`: what stands in which file, and in what --json writes."""
 
 import difflib
 import textwrap
@@ -9,6 +9,7 @@ import typer
 
 from pneuopt.cli.exit_status import EXIT_SUCCESS
 from pneuopt.cli.terminal import make_console
+from pneuopt.files.json_outputs import OUTPUTS, describe_member, describe_outputs
 from pneuopt.files.key_list import FILE_MEANINGS, KeyRow, list_keys
 from pneuopt.quantities.errors import InputError
 
@@ -19,6 +20,12 @@ def run_keys(word: str | None, markdown: bool) -> int:
     """Print the keys whose name or meaning has the word in it; all without one."""
     rows = find_keys(word)
     typer.echo(format_markdown(rows) if markdown else _format_screen(rows, make_console().width))
+    return EXIT_SUCCESS
+
+
+def run_outputs(markdown: bool) -> int:
+    """Print what each command writes with --json."""
+    typer.echo(describe_outputs() if markdown else _outputs_on_screen(make_console().width))
     return EXIT_SUCCESS
 
 
@@ -67,8 +74,23 @@ def _format_screen(rows: Sequence[KeyRow], width: int) -> str:
         lines += ["", *textwrap.wrap(f"{file}: {FILE_MEANINGS[file]}", width)]
         for row in own:
             unit, usual = f" [{row.unit}]" if row.unit else "", f" = {row.usual}" if row.usual else ""
-            lines += textwrap.wrap(
-                f"{row.full_name}{unit}{usual}", width, initial_indent="  ", subsequent_indent=_MARGIN
-            )
-            lines += textwrap.wrap(row.remarks, width, initial_indent=_MARGIN, subsequent_indent=_MARGIN)
+            lines += _entry(f"{row.full_name}{unit}{usual}", row.remarks, width)
     return "\n".join(lines[1:])
+
+
+def _outputs_on_screen(width: int) -> str:
+    """Lines no wider than the terminal."""
+    lines: list[str] = []
+    for name, output in OUTPUTS.items():
+        lines += ["", *textwrap.wrap(f"{name}: {output.meaning}", width)]
+        for member, held in output.members.items():
+            lines += _entry(f"{member}: {held.holds.value}", describe_member(held), width)
+    return "\n".join(lines[1:])
+
+
+def _entry(head: str, remarks: str, width: int) -> list[str]:
+    """The lines of a key or a member, and what it means below it."""
+    return [
+        *textwrap.wrap(head, width, initial_indent="  ", subsequent_indent=_MARGIN),
+        *textwrap.wrap(remarks, width, initial_indent=_MARGIN, subsequent_indent=_MARGIN),
+    ]

@@ -1,4 +1,4 @@
-"""What the commands write with --json: one declaration, from which the schema and README's appendix come.
+"""What the commands write with --json: one declaration, for the schema and `pneuopt keys --outputs`.
 
 Numbers are in SI units unless a name or a "unit" beside them says otherwise; what is not finite is null; a table is a
 list of records, one a row. Members may be added from version to version; none is renamed without the changelog.
@@ -72,12 +72,13 @@ def describe_outputs() -> str:
     """The outputs as tables in Markdown, one a command."""
     parts = []
     for name, output in OUTPUTS.items():
-        rows = [f"| `{n}` | {m.holds.value} | {_describe(m)} |" for n, m in output.members.items()]
+        rows = [f"| `{n}` | {m.holds.value} | {describe_member(m)} |" for n, m in output.members.items()]
         parts.append("\n".join([f"**{name}**: {output.meaning}", "", "| member | holds | |", "|---|---|---|", *rows]))
     return "\n\n".join(parts)
 
 
-def _describe(member: Member) -> str:
+def describe_member(member: Member) -> str:
+    """What a member means, and what it has in it."""
     own = ", ".join(f"`{n}`" for n in member.members)
     further = " and more" if member.is_open and own else ""
     optional = "; not always there" if member.is_optional else ""

@@ -1,26 +1,16 @@
-"""`pneuopt keys`: the list on the screen, and README's appendix, which it made."""
-
-from pathlib import Path
+"""`pneuopt keys`: what may stand in the files, and what --json writes, on the screen and as Markdown."""
 
 import pytest
 from typer.testing import CliRunner
 
 from pneuopt.cli.app import app
-from pneuopt.cli.keys import format_markdown
+from pneuopt.files.json_outputs import OUTPUTS
 from pneuopt.files.key_list import list_keys
-
-README = Path(__file__).parents[2] / "README.md"
 
 
 def run(*words: str, width: int = 80) -> tuple[int, str]:
     result = CliRunner(env={"COLUMNS": str(width)}).invoke(app, ["keys", *words])
     return result.exit_code, result.output
-
-
-def test_the_appendix_of_the_readme_is_the_list() -> None:
-    appendix = README.read_text("utf-8").partition("## Appendix: the keys of the files\n")[2]
-    remedy = "README's appendix is not the list of keys; put there what `pneuopt keys --markdown` prints"
-    assert format_markdown(list_keys()) in appendix, remedy
 
 
 @pytest.mark.parametrize("width", [60, 80])
@@ -29,6 +19,28 @@ def test_the_screen_shows_every_key_within_its_width(width: int) -> None:
     assert code == 0
     assert max(map(len, output.splitlines())) <= width
     assert [r.full_name for r in list_keys() if f"  {r.full_name}" not in output] == []
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_the_screen_shows_every_member_of_what_json_writes_within_its_width(width: int) -> None:
+    code, output = run("--outputs", width=width)
+    assert code == 0
+    assert max(map(len, output.splitlines())) <= width
+    for name, written in OUTPUTS.items():
+        own = output.partition(f"\n{name}: " if name != next(iter(OUTPUTS)) else f"{name}: ")[2].partition("\n\n")[0]
+        assert [m for m, held in written.members.items() if f"  {m}: {held.holds.value}" not in own] == []
+
+
+def test_markdown_has_a_row_for_each_key_and_member() -> None:
+    keys, outputs = run("--markdown")[1], run("--outputs", "--markdown")[1]
+    assert [
+        r.full_name for r in list_keys() if f"`{r.full_name}`" not in keys and f"**[{r.section}]**" not in keys
+    ] == []
+    assert all(f"| `{member}` |" in outputs for written in OUTPUTS.values() for member in written.members)
+
+
+def test_a_word_beside_outputs_is_refused_not_ignored() -> None:
+    assert run("mass", "--outputs") == (2, "error: --outputs shows all outputs: give no WORD beside it\n")
 
 
 def test_a_word_finds_sections_keys_and_meanings() -> None:

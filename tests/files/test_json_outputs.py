@@ -1,15 +1,11 @@
-"""The declaration of what --json writes: a right schema, and README's table. tests/cli holds each output to it."""
-
-from pathlib import Path
+"""The declaration of what --json writes: a right schema. tests/cli holds each output to it."""
 
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from pneuopt.files.first_files import first_files
-from pneuopt.files.json_outputs import OUTPUTS, describe_outputs, output_schema
+from pneuopt.files.json_outputs import OUTPUTS, output_schema
 from pneuopt.quantities.parameters import ParameterSet
-
-README = (Path(__file__).parents[2] / "README.md").read_text("utf-8")
 
 
 def test_the_schema_is_one() -> None:
@@ -35,11 +31,6 @@ def test_a_wrong_output_is_refused(document: object, right: bool) -> None:
     else:
         with pytest.raises(ValidationError):
             validator.validate(document)
-
-
-def test_the_readmes_table_is_the_declaration() -> None:
-    remedy = "README's appendix on --json is not the declaration; put there what `describe_outputs()` returns"
-    assert describe_outputs() in README, remedy
 
 
 def test_init_writes_it() -> None:
