@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 
+from PIL import Image
+
 import pneuopt
 from pneuopt.cli.keys import format_markdown
 from pneuopt.files.json_outputs import describe_outputs
@@ -218,6 +220,12 @@ def figures_of(script: Path) -> list[Path]:
     return [f for name, f in found.items() if not any(name.startswith(stem) for stem in longer)]
 
 
+def drawing_command(figure: Path, call: str) -> str:
+    """What has drawn a figure, with its counts, as `finish` of problems/shared/claims.py writes into it."""
+    with Image.open(figure) as image:
+        return str(image.info.get("Description", f"python {call} --out out"))
+
+
 def write_gallery() -> None:
     """Every claim script with its result, its figures (`figures_of`) and the command that draws them."""
     lead = section("Results").partition("|")[0].strip()
@@ -237,7 +245,7 @@ def write_gallery() -> None:
         for figure in figures_of(path):
             copy_figure(figure.relative_to(ROOT).as_posix())
             parts += [f"![The figure of {path.stem}](figures/{figure.name})", ""]
-            parts += [f"*Drawn by* `python {call} --out out`", ""]
+            parts += [f"*Drawn by* `{drawing_command(figure, call)}`", ""]
         parts += [escape_asterisks(text), ""]
     write("gallery.md", "\n".join(parts))
 

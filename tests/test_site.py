@@ -7,6 +7,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 
 import pneuopt
 
@@ -78,6 +80,22 @@ def test_the_gallery_of_a_clean_clone_shows_what_scripts_have_drawn(pages: Modul
     assert committed <= {ROOT / ".docs" / "figures" / figure.name for figure in shown}, "each is of a script in README"
     assert len(shown) >= MIN_FIGURES
     assert all(figure.stat().st_size < MAX_FIGURE_BYTES for figure in committed)
+
+
+def test_a_kept_figure_is_small_and_says_what_drew_it(
+    pages: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    keeper = load("keep_figures")
+    monkeypatch.setattr(keeper, "FIGURES", tmp_path)
+    drawn = tmp_path / "out" / "p32.png"
+    drawn.parent.mkdir()
+    command = "python problems/tune/p32.py --plants 8 --out out"
+    Figure(figsize=(12, 4)).savefig(drawn, dpi=150, metadata={"Description": command})
+    kept = keeper.keep(drawn)
+    with Image.open(kept) as image:
+        assert image.size == (1200, 400)
+    assert pages.drawing_command(kept, "problems/tune/p32.py") == command
+    assert pages.drawing_command(ROOT / ".docs/figures/crawl.png", "a.py PATH") == "python a.py PATH --out out"
 
 
 @pytest.mark.slow

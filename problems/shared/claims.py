@@ -11,7 +11,8 @@ import json
 import math
 import operator
 import re
-from collections.abc import Callable, Iterable, Mapping
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -187,9 +188,22 @@ def finish(
     if options.out is not None and figures is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         for name, figure in figures().items():
-            figure.savefig(options.out / f"{name}.png", dpi=150)
+            figure.savefig(options.out / f"{name}.png", dpi=150, metadata={"Description": drawn_by(sys.argv)})
             print(f"{options.out / name}.png")
     return 0 if bool(rows["holds"].all()) and not unbounded else 1
+
+
+def drawn_by(words: Sequence[str]) -> str:
+    """The command that draws a figure, as the gallery shows it: the script and its counts, without files and processes.
+
+    Examples
+    --------
+    >>> drawn_by(["/a/problems/tune/p32.py", "--plants", "8", "--json", "rows.json", "--jobs=2", "--out", "here"])
+    'python problems/tune/p32.py --plants 8 --out out'
+    """
+    script = "/".join(Path(words[0]).resolve().parts[-3:])
+    own = re.sub(r" --(json|out|jobs)[ =]\S+| --resume", "", " ".join(["", *words[1:]]))
+    return f"python {script}{own} --out out"
 
 
 def records(rows: "pd.DataFrame") -> list[dict[str, object]]:

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image
 
 from problems.shared.claims import Claim, arguments, finish, frame, table, unbounded_patterns
 
@@ -48,3 +49,6 @@ def test_figures_are_made_only_when_asked_for(tmp_path: Path, capsys: pytest.Cap
     assert finish(frame([GOOD]), arguments("").parse_args(["--out", str(tmp_path)]), figures) == 0
     assert (tmp_path / "empty.png").stat().st_size > 0
     assert "empty.png" in capsys.readouterr().out
+    with Image.open(tmp_path / "empty.png") as image:
+        assert image.info["Description"].startswith("python ")
+        assert image.info["Description"].endswith(" --out out")
