@@ -20,6 +20,7 @@ from .control.forms import (
 )
 from .control.friction_feedforward import Direction, FrictionFeedforward
 from .control.gain_schedule import GainSchedule
+from .control.impulsive_control import ImpulsiveControl
 from .control.knocker import Knocker
 from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
@@ -232,6 +233,7 @@ __all__ = [
     "GainSchedule",
     "Huber",
     "IdentificationResult",
+    "ImpulsiveControl",
     "InputError",
     "Integrator",
     "Intersample",

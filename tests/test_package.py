@@ -97,6 +97,7 @@ PUBLIC_NAMES = [
     "identifiability",
     "IdentificationResult",
     "identify",
+    "ImpulsiveControl",
     "InputError",
     "Integrator",
     "Intersample",

@@ -15,6 +15,9 @@ from pneuopt.control.wiring import Signals
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import with_prefix, without_prefix
 
+ERROR = "error"
+"""Beside the inputs of a cascade's inner controller: the error of the outer one."""
+
 
 class CommandParts(Protocol):
     """The parts of a `ClosedLoop` that make its command."""
@@ -46,7 +49,7 @@ class CommandParts(Protocol):
 
 
 def pid_reference(parts: CommandParts, u: Mapping[str, Any], position: Any, p: Mapping[str, Any]) -> dict[str, Any]:
-    """The inputs as the PID and its compensators see them: in a cascade their reference is a speed.
+    """The inputs as the PID and its compensators see them: a cascade's reference is a speed, and `ERROR` a position's.
 
     Parameters
     ----------
@@ -59,7 +62,8 @@ def pid_reference(parts: CommandParts, u: Mapping[str, Any], position: Any, p: M
     if parts.outer is None:
         return dict(u)
     own = without_prefix(p, parts.outer.section)
-    return {**u, "reference": parts.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, own)}
+    speed = parts.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, own)
+    return {**u, "reference": speed, ERROR: u["reference"] - position}
 
 
 def added_command(
@@ -98,7 +102,8 @@ def added_terms(
     if parts.compensators:
         v = parts.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
         rates = {n: u[n] for n in (REFERENCE_SPEED, REFERENCE_ACCELERATION) if n in u}
-        seen = Instant(t, u["reference"], measured, v + lead, parts.pid.sample_time, rates, y)
+        error = u.get(ERROR, u["reference"] - measured)
+        seen = Instant(t, u["reference"], measured, v + lead, parts.pid.sample_time, rates, y, error)
         own, bent = compensate(parts.compensators, seen, x, p)
         moved = moved | own
     return moved, {"feedforward": lead, "compensation": bent, "dither": _dither_command(parts, t, p)}

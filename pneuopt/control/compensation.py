@@ -31,7 +31,8 @@ class Instant:
     """What a compensator sees: the time [s], reference and measured signal, and the command so far.
 
     `sample_time` [s] is the controller's, None of a continuous one. `rates` are the motion inputs that the part asks
-    for ("reference_speed", "reference_acceleration"), `readings` the plant's outputs, by name.
+    for ("reference_speed", "reference_acceleration"), `readings` the plant's outputs, by name, and `error` that of the
+    signal that the loop is judged by, which in a cascade is the position; a rest, where parts start, has none.
     """
 
     t: Any
@@ -41,6 +42,7 @@ class Instant:
     sample_time: float | None
     rates: Mapping[str, Any] = field(default_factory=dict)
     readings: Mapping[str, Any] = field(default_factory=dict)
+    error: Any = 0.0
 
 
 @runtime_checkable
@@ -135,12 +137,22 @@ def check_compensators(given: object, on: SensedSignal, axis: Axis | None) -> No
         require(not absent, told, ModelError)
 
 
-def check_values(compensators: Sequence[Compensator], known: ParameterSet, value: Mapping[str, float]) -> None:
-    """Refuse a compensator's value outside the bounds that it declares, whatever a set's own bounds say."""
+def check_values(
+    compensators: Sequence[Compensator], known: ParameterSet, value: Mapping[str, float], count: float
+) -> None:
+    """Refuse a compensator's value outside the bounds that it declares, whatever a set's own bounds say.
+
+    And a tolerance that the sensor's count, in the same unit, cannot tell from zero.
+    """
     prefixes = tuple(f"{c.section}." for c in compensators)
     for name, q in known.items():
         runs = not name.startswith(prefixes) or q.lower <= value[name] <= q.upper
         require(runs, f"{name} must lie within [{q.lower:g}, {q.upper:g}] {q.unit}, got {value[name]:g}")
+    for part in compensators:
+        name = f"{part.section}.tolerance"
+        if name in value and value[f"{part.section}.{part.size}"] > 0:
+            told = f"{name} {value[name]:g} {known[name].unit} lies within a count of the sensor, {count:g}"
+            require(value[name] > count, f"{told}: no error could be told from it; take at least {2 * count:g}")
 
 
 def compensate(compensators: Sequence[Compensator], seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:

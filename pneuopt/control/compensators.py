@@ -6,6 +6,7 @@ from types import MappingProxyType
 from pneuopt.control.acceleration_feedback import AccelerationFeedback
 from pneuopt.control.dead_zone_inverse import DeadZoneInverse
 from pneuopt.control.friction_feedforward import FrictionFeedforward
+from pneuopt.control.impulsive_control import ImpulsiveControl
 from pneuopt.control.knocker import Knocker
 from pneuopt.control.motion_feedforward import MotionFeedforward
 from pneuopt.control.pressure_feedback import PressureFeedback
@@ -16,11 +17,12 @@ Kind = (
     | type[AccelerationFeedback]
     | type[FrictionFeedforward]
     | type[Knocker]
+    | type[ImpulsiveControl]
     | type[DeadZoneInverse]
 )
 _KINDS: tuple[Kind, ...] = (
     *(MotionFeedforward, PressureFeedback, AccelerationFeedback),
-    *(FrictionFeedforward, Knocker, DeadZoneInverse),
+    *(FrictionFeedforward, Knocker, ImpulsiveControl, DeadZoneInverse),
 )
 
 # A file's compensators act in this order: the one that inverts the valve comes last, where it sees all but the dither.

@@ -69,8 +69,8 @@ class ClosedLoop:
     feedforward : Feedforward, optional
         What a change of the reference adds to the PID's command.
     compensators : tuple of Compensator
-        What is added to the command against friction and dead zone, in the order in which they act: `Knocker`,
-        `FrictionFeedforward`, `DeadZoneInverse`, `MotionFeedforward`, `PressureFeedback`, `AccelerationFeedback`.
+        What is added to the command, in the order in which they act: `Knocker`, `FrictionFeedforward`,
+        `DeadZoneInverse`, `ImpulsiveControl`, `MotionFeedforward`, `PressureFeedback`, `AccelerationFeedback`.
     outer : PositionLoop, optional
         Makes the loop a cascade: it is judged by the position, whose error sets the speed that the PID controls.
     schedule : GainSchedule, optional
@@ -291,7 +291,7 @@ class ClosedLoop:
             require(time > 0, f"feedforward.time must be positive, got {time:g} s; without it set its gain to zero")
         if self.schedule:
             self.schedule.check_values(without_prefix(value, "schedule"))
-        check_values(self.compensators, self.parameters, value)
+        check_values(self.compensators, self.parameters, value, self.count_size(parameters))
         Tf = float(self.gains(list(value.values()))[3])
         self.pid.check({**without_prefix(value, "pid"), "Tf": Tf}, self.command.unit)
 

@@ -53,6 +53,12 @@ class SensedSignal:
         return (REFERENCE_SPEED,) if self.order == 0 or self.cascade else ()
 
     @property
+    def error_unit(self) -> str:
+        """Unit of the error of the signal that the loop is judged by: in a cascade the position's."""
+        unit = difference_unit(self.measured.unit)
+        return unit_ratio(f"{unit}*s", "1") if self.cascade else unit
+
+    @property
     def h(self) -> float:
         """The sample time [s], 0 of a continuous controller."""
         return self.sample_time or 0.0

@@ -40,6 +40,12 @@ STATE_MEANINGS: Mapping[str, str] = {
     "acceleration_feedback.speed": "filtered speed",
     "knocker.command": "command at the last pulse's onset",
     "knocker.direction": "direction of the last pulse",
+    "impulsive_control.error": "error that has stood still",
+    "impulsive_control.standing": "samples for which it has",
+    "impulsive_control.phase": "samples since the last pulse's onset",
+    "impulsive_control.length": "samples of the last pulse",
+    "impulsive_control.peak": "peak of the last pulse, with its sign",
+    "impulsive_control.before": "error at the last pulse's onset",
 }
 _UNNAMED_CONSTANTS = (0.5, 1.0, 2.0)  # sample times [s] that are found in many formulas, where their name would mislead
 

@@ -98,6 +98,14 @@ ROWS: Mapping[str, Row] = {
         ("amplitude", 0.0, 30.0),
         continuous=False,
     ),
+    "impulsive_control": Row(
+        {"amplitude": "V", "limit": "V", "width": "s", "pause": "s", "tolerance": "m/s", "growth": "1", "brake": "1"},
+        {"amplitude": 60.0, "limit": 500, "width": 2e-2, "pause": 6e-3, "tolerance": 0.05, "growth": 1.2, "brake": 0.5},
+        'amplitude = { value = "0.2 V", lower = "0 V", upper = "1 V", free = true }\nwidth = "20 ms"\npause = "6 ms"\n'
+        'tolerance = "2 mm/s"',
+        ("amplitude", 0.0, 90.0),
+        continuous=False,
+    ),
     "dead_zone_inverse": Row(
         {"width": "V", "smoothing": "V"},
         {"width": 8.0, "smoothing": 5.0},

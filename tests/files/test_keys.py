@@ -107,7 +107,8 @@ def test_a_tunings_keys_are_those_of_its_reader(tmp_path: Path) -> None:
     assert gains == listed("tuning.toml", "pid")
     needed = {
         "loop": "", "dither": "frequency = '20 Hz'", "sensor": "lag = '1 ms'", "feedforward": "gain = '1 N*s/m'",
-        "friction_feedforward": "level = '1 N'", "knocker": "amplitude = '1 N'", "dead_zone_inverse": "width = '1 N'",
+        "friction_feedforward": "level = '1 N'", "knocker": "amplitude = '1 N'",
+        "impulsive_control": "amplitude = '1 N'", "dead_zone_inverse": "width = '1 N'",
         "minimise": "", "limits": "", "scenarios": "", "budget": "",
     }  # fmt: skip
     for section, line in needed.items():
