@@ -160,17 +160,15 @@ def _fit_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
     if _rms(rows.acceleration) * (rows.t[1] - rows.t[0]) > MAX_PHASE_STEP * _rms(rows.speed):
         return None
     mass = 0.0 if math.isnan(axis.inertia) else axis.inertia
-    one = [(np.column_stack([a, s, v, np.ones(v.size)]), f) for _, a, s, v, f in lags]
-    left = [_residual(A, f) for A, f in one]
+    one = [_factor(np.column_stack([s, v, np.ones(v.size), a, f])) for _, a, s, v, f in lags]
+    left = [abs(R[4, 4]) for R in one]
     # a lag turns speed into acceleration: where the log hardly tells lags apart, the least one is assumed
     told = [k for k in range(len(one)) if left[k] <= MIN_RESIDUAL_FACTOR * min(left)]
     chosen = min(told, key=lambda k: (abs(lags[k][0]), left[k]))
-    A, f = one[chosen]
-    values = np.linalg.lstsq(A, f)[0]
-    stated = min(_residual(A[:, 1:], f - mass * A[:, 0]) for A, f in one)
-    centred = min(_residual(A[:, :3], f) for A, f in one)
-    found = [float(value) for value in values]
-    return Balance(found[0], found[3], found[1], left[chosen], stated, centred, float(f.std()))
+    friction, _, offset, own_mass = np.linalg.lstsq(one[chosen][:, :4], one[chosen][:, 4])[0].tolist()
+    stated = min(math.hypot(R[3, 4] - mass * R[3, 3], R[4, 4]) for R in one)
+    centred = min(_rms_left(R[:, [0, 1, 3]], R[:, 4]) for R in one)
+    return Balance(own_mass, offset, friction, left[chosen], stated, centred, float(lags[chosen][4].std()))
 
 
 class _Rows(NamedTuple):
@@ -233,8 +231,13 @@ def _columns(rows: _Rows, lag: int) -> tuple[Array, Array, Array, Array]:
     return a[used], s[used], v[used], f[used]
 
 
-def _residual(A: Array, f: Array) -> float:
-    return _rms(f - A @ np.linalg.lstsq(A, f)[0])
+def _factor(columns: Array) -> Array:
+    """The triangular factor of columns over the root of their length: root mean squares of regressions stand in it."""
+    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=float) / math.sqrt(len(columns))
+
+
+def _rms_left(A: Array, f: Array) -> float:
+    return float(np.linalg.norm(f - A @ np.linalg.lstsq(A, f)[0]))
 
 
 def _rms(e: Array) -> float:

@@ -37,22 +37,24 @@ def check_jumps(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding
     t, x = log.t[known], log[axis.position][known]
     if known.size < 4 * NEIGHBOURS:
         return
-    noise = max(experiment.noise.get(axis.position, 0.0), noise_level(x, t))
-    jumps = np.flatnonzero(_is_jump(t, x, noise))
+    jumps = np.flatnonzero(_is_abrupt(t, x))
+    if jumps.size:  # few logs have abrupt steps, and only theirs need a level of the noise
+        noise = max(experiment.noise.get(axis.position, 0.0), noise_level(x, t))
+        jumps = jumps[np.abs(np.diff(x))[jumps] > MIN_JUMP_NOISE * noise]
     if jumps.size:
         shown = _evidence(experiment, axis, known, jumps)
         yield LogFinding(axis.position, _sentence(t, x, jumps, axis.position), True, evidence=shown)
 
 
-def _is_jump(t: Array, x: Array, noise: float) -> Mask:
-    """Which steps are far larger than the noise, than the steps around them, and than those of most of the log."""
-    size, time = np.abs(np.diff(x)), np.diff(t)
-    speed = size / time
+def _is_abrupt(t: Array, x: Array) -> Mask:
+    """Which steps are far larger than those around them, and than those of most of the log."""
+    time = np.diff(t)
+    speed = np.abs(np.diff(x)) / time
     padded = np.pad(speed, NEIGHBOURS)
     shifts = [k for k in range(2 * NEIGHBOURS + 1) if k != NEIGHBOURS]
     around = np.max([padded[k : k + speed.size] for k in shifts], axis=0)
     is_fast = speed > MIN_JUMP_SPEED_RATIO * np.maximum(around, _usual_speed(t, x))
-    return np.asarray(is_fast & (size > MIN_JUMP_NOISE * noise) & (4 * speed / time > MIN_JUMP_ACCELERATION))
+    return np.asarray(is_fast & (4 * speed / time > MIN_JUMP_ACCELERATION))
 
 
 def _usual_speed(t: Array, x: Array) -> float:

@@ -103,7 +103,8 @@ def check_work_sign(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
         else:
             pushes = [log["pressure_a"] - ratio * log["pressure_b"] for ratio in ROD_AREA_RATIOS]
             pushes = [push - np.nanmean(push) for push in pushes]
-        share = max(_work_share(log.t, push, motion, lag) for push in pushes for lag in sensor_lags(log.t))
+        shares = np.stack([_work_shares(log.t, np.stack(pushes), motion, lag) for lag in sensor_lags(log.t)], axis=1)
+        share = max(shares.ravel().tolist())
         if share < MIN_WORK_SHARE:
             at = int(np.nanargmin(pushes[-1] * motion))
             unit = experiment.unit(axis.push) if name == axis.push else "Pa"
@@ -149,17 +150,21 @@ def check_command(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFindi
         yield LogFinding("valve_voltage", message + "'valve_voltage', or of the motion", True, evidence=shown)
 
 
-def _work_share(t: Array, push: Array, motion: Array, lag: int) -> float:
-    """Work over the integral of the power's absolute value; NaN where the log does not return to its beginning."""
-    t = np.where(np.isfinite(push), t, np.nan)
-    (t, _), (push, motion) = shift(t, motion, lag), shift(push, motion, lag)
-    if t.size < 10:
-        return math.nan
-    path = float(np.trapezoid(np.abs(motion), t))
-    if path == 0 or abs(float(np.trapezoid(motion, t))) > MAX_NET_TRAVEL_SHARE * path:
-        return math.nan
-    total = float(np.trapezoid(np.abs(push * motion), t))
-    return float(np.trapezoid(push * motion, t)) / total if total > 0 else math.nan
+def _work_shares(t: Array, pushes: Array, motion: Array, lag: int) -> Array:
+    """Work of each push, over the integral of its power's absolute value; NaN where the log does not return."""
+    unknown = np.full(len(pushes), math.nan)
+    rows, motion = shift(np.where(np.isfinite(pushes).all(axis=0), np.arange(t.size), math.nan), motion, lag)
+    if rows.size < 10:
+        return unknown
+    at = rows.astype(np.intp)
+    steps = np.diff(t[at], prepend=t[at[0]], append=t[at[-1]])
+    travel = 0.5 * (steps[:-1] + steps[1:]) * motion  # by trapezoids
+    path = float(np.abs(travel).sum())
+    if path == 0 or abs(float(travel.sum())) > MAX_NET_TRAVEL_SHARE * path:
+        return unknown
+    known = pushes[:, at]
+    work, total = known @ travel, np.abs(known) @ np.abs(travel)
+    return np.asarray(np.divide(work, total, out=unknown, where=total > 0))
 
 
 def _command_correlations(t: Array, command: Array, motion: Array) -> tuple[float, float]:
