@@ -41,6 +41,8 @@ class SegmentLinearisation:
         last the residuals themselves.
     squares : ndarray, shape (m, n_outputs)
         Squared data residuals.
+    sums : ndarray, shape (m, n_outputs, n + c)
+        Derivatives of each segment's summed data residuals, by its states (in nominal sizes) and sensitivity columns.
     end_sensitivities : ndarray, shape (m, n, n + c)
         Sensitivity of each segment's end, in nominal sizes.
     y : ndarray, shape (m, n_samples, n_outputs)
@@ -55,6 +57,7 @@ class SegmentLinearisation:
 
     grams: Array
     squares: Array
+    sums: Array
     end_sensitivities: Array
     y: Array
     x_end: Array
@@ -207,7 +210,15 @@ def normal_equations(
     start_errors = np.where(np.isfinite(segments.fixed_start), nodes - segments.fixed_start, 0.0) / segments.nominal
     gaps = segment_gaps(segments, nodes, run.x_end if correction is None else run.x_end + correction.x_end)
     slopes = SegmentLinearisation(
-        run.grams * np.outer(scale, scale), run.squares, ends, run.y, run.x_end, gaps, start_errors, chain
+        run.grams * np.outer(scale, scale),
+        run.squares,
+        run.sums * scale[:-1],
+        ends,
+        run.y,
+        run.x_end,
+        gaps,
+        start_errors,
+        chain,
     )
     return weigh_gaps(segments, slopes, sigma)
 

@@ -52,11 +52,12 @@ class FitScores:
         rng, grams = np.random.default_rng(0), self._equations.linearisation.grams[:, :-1, :-1]
         values, vectors = np.linalg.eigh(grams)
         roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-        out = np.zeros((count, int(groups.max()) + 1, self.directions.shape[2]))
-        for draws in np.array_split(np.arange(count), min(count, -(-count * grams[..., 0].size // MAX_BATCH_NUMBERS))):
+        order, batches = np.argsort(groups, kind="stable"), -(-count * grams[..., 0].size // MAX_BATCH_NUMBERS)
+        first, out = np.searchsorted(groups[order], np.arange(int(groups.max()) + 1)), list[Array]()
+        for draws in np.array_split(np.arange(count), min(count, batches)):
             found = self._respond(roots @ rng.standard_normal((*grams.shape[:2], len(draws))))
-            np.add.at(out, (draws[:, None], groups), found)
-        return out
+            out.append(np.add.reduceat(found[:, order], first, axis=1))
+        return np.concatenate(out)
 
     def residual_sums(self) -> tuple[Array, Array]:
         """Sum of each segment's residuals by output, shape (m, n_outputs), and its derivatives, (m, n_outputs, k).
@@ -66,9 +67,7 @@ class FitScores:
         segments, run = self._equations.segments, self.optimum.run
         weights = np.where(np.isfinite(segments.measured), segments.weights, 0.0)
         sums = np.sum(weights * (run.y - np.nan_to_num(segments.measured)), axis=1)
-        each = weights[0].size * self.directions.shape[1]
-        batches = np.array_split(np.arange(len(weights)), -(-len(weights) * each // MAX_BATCH_NUMBERS))
-        return sums, np.concatenate([self._summed_derivatives(rows, weights[rows]) for rows in batches])
+        return sums, self._equations.linearisation.sums @ self.directions
 
     @cached_property
     def whole_information(self) -> Array:
@@ -107,16 +106,6 @@ class FitScores:
         data = np.einsum("mck,mcr->rmk", self.directions, noise + linear.grams[:, :-1, :-1] @ step)
         gaps = ends / self.optimum.gap_deviations[:, None]
         return np.asarray(data + np.einsum("mnk,mnr->rmk", self._gap_directions, gaps))
-
-    def _summed_derivatives(self, rows: Indices, weights: Array) -> Array:
-        """Derivatives of the sums of some segments' weighted outputs, shape (len(rows), n_outputs, k)."""
-        o, s = self.optimum, self._equations.segments
-        p = o.values[s.parameter_positions[rows]]
-        run = s.sensitivities.run(o.nodes[rows], s.inputs[rows], p, s.t[rows], s.h[rows], substeps=o.substeps)
-        assert run.dy is not None
-        sums = np.einsum("mso,msoc->moc", weights, run.dy)
-        sums[:, :, : len(s.nominal)] *= s.nominal
-        return np.asarray(sums @ self.directions[rows])
 
 
 def fit_scores(optimum: Optimum) -> FitScores | None:

@@ -3,7 +3,7 @@
    NX, NU, NP, NY and NS are the sizes of the state, input, parameter and output vectors and the number of sensitivity
    columns S = dx/d(start, parameters). All arrays are C-contiguous with the segment first; a null pointer leaves that
    result out. With measured outputs (NaN: none) and their weights, the Gram matrix of [dy | y - measured], weighted, is
-   summed over a segment's samples, and dy itself is never stored. */
+   summed over a segment's samples, and so is the weighted dy, which itself is never stored. */
 
 #ifdef _WIN32
 #define EXPORT __declspec(dllexport)
@@ -17,6 +17,7 @@ typedef struct {
   Lanes t[1], h[1], x[LENGTH(NX)], u[LENGTH(NU)], p[LENGTH(NP)], S[LENGTH(NX * NS)];
   Lanes x_next[LENGTH(NX)], S_next[LENGTH(NX * NS)], y[LENGTH(NY)], dy[LENGTH(NY * NS)];
   Lanes measured[LENGTH(NY)], weight[LENGTH(NY)], gram[WIDTH * WIDTH], squares[LENGTH(NY)];
+  Lanes sums[LENGTH(NY * NS)];
   Lanes step_kept[LENGTH(STEP_KEPT)], output_kept[LENGTH(OUTPUT_KEPT)], update_kept[LENGTH(UPDATE_KEPT)];
 } Segment;
 
@@ -44,6 +45,7 @@ static void advance(Segment *s) {
 
 static void start(Segment *s) {
   memset(s->S, 0, sizeof(s->S)), memset(s->gram, 0, sizeof(s->gram)), memset(s->squares, 0, sizeof(s->squares));
+  memset(s->sums, 0, sizeof(s->sums));
   for (int c = 0; c < STARTS; c++) s->S[c * NX + c] = ALL(1.0);
 #if HAS_UPDATE
   update_segment(s);
@@ -62,7 +64,10 @@ static void add_residuals(Segment *s) {
   Lanes e[WIDTH];
   for (int i = 0; i < NY; i++) {
     const Lanes known = v_eq(s->measured[i], s->measured[i]), weight = s->weight[i];
-    for (int a = 0; a < NS; a++) e[a] = v_if_else_zero(known, s->dy[a * NY + i] * weight);
+    for (int a = 0; a < NS; a++) {
+      e[a] = v_if_else_zero(known, s->dy[a * NY + i] * weight);
+      s->sums[a * NY + i] += e[a];
+    }
     e[NS] = v_if_else_zero(known, (s->y[i] - s->measured[i]) * weight);
     s->squares[i] += e[NS] * e[NS];
     for (int a = 0; a < WIDTH; a++)
@@ -91,7 +96,7 @@ EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stri
                                   const double *x0, const double *u, const double *p, const double *t, const double *h,
                                   const double *measured, const double *weight, double *y, double *dy, double *x,
                                   double *x_end, double *dx_end, double *gram, double *squares,
-                                  const volatile int *stop) {
+                                  double *sums, const volatile int *stop) {
   Segment s;
   for (Count i = first; i < last; i += LANES) {
     const int lanes = last - i < LANES ? (int)(last - i) : LANES;
@@ -120,6 +125,7 @@ EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stri
     }
     mirror(&s);
     scatter(s.gram, gram, row, WIDTH * WIDTH, lanes), scatter(s.squares, squares, row, NY, lanes);
+    scatter(s.sums, sums, row, NY * NS, lanes);
     scatter(s.x, x_end, row, NX, lanes), scatter(s.S, dx_end, row, NX * NS, lanes);
   }
 }

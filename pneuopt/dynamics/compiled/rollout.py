@@ -86,6 +86,8 @@ class Gram:
         Sum over samples and outputs of e e', with e = [dy | y - measured], weighted.
     squares : ndarray, shape (m, n_outputs)
         Sum over samples of each output's squared residuals, weighted.
+    sums : ndarray, shape (m, n_outputs, s)
+        Sum over samples of each output's weighted derivatives, of the residuals that count.
     y : ndarray, shape (m, n, n_outputs)
     x_end : ndarray, shape (m, n_states)
     dx_end : ndarray, shape (m, n_states, s)
@@ -93,6 +95,7 @@ class Gram:
 
     grams: Array
     squares: Array
+    sums: Array
     y: Array
     x_end: Array
     dx_end: Array
@@ -232,7 +235,7 @@ class Rollout:
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         x = np.empty((m, -(-n // states), nx)) if states else None
-        self._call_library((x0, u, p, t, h), substeps, states, (None, None, y, dy, x, x_end, dx_end, None, None))
+        self._call_library((x0, u, p, t, h), substeps, states, (None, None, y, dy, x, x_end, dx_end, None, None, None))
         return RolloutResult(y, x_end, x, _swap_last_axes(dy), _swap_last_axes(dx_end))
 
     def _run_vm(self, given: tuple[Array, Array, Array, Array, Array], substeps: int, states: int) -> RolloutResult:
@@ -244,9 +247,10 @@ class Rollout:
     def _gram_native(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         m, nx, ns = len(given[0]), self.n_states, self.n_columns
         grams, squares = np.empty((m, ns + 1, ns + 1)), np.empty((m, self.n_outputs))
+        sums = np.empty((m, ns, self.n_outputs))
         y, x_end, dx_end = np.empty(measured.shape), np.empty((m, nx)), np.empty((m, ns, nx))
-        self._call_library(given, substeps, 0, (measured, weight, y, None, None, x_end, dx_end, grams, squares))
-        return Gram(grams, squares, y, x_end, np.swapaxes(dx_end, 1, 2))
+        self._call_library(given, substeps, 0, (measured, weight, y, None, None, x_end, dx_end, grams, squares, sums))
+        return Gram(grams, squares, np.swapaxes(sums, 1, 2), y, x_end, np.swapaxes(dx_end, 1, 2))
 
     def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         parts = []
@@ -257,7 +261,12 @@ class Rollout:
             e = np.concatenate([dy, (run.y - y)[..., None]], axis=-1) * w[..., None]
             e = np.where(np.isfinite(y)[..., None], e, 0.0)
             flat = e.reshape(len(y), -1, e.shape[-1])
-            parts.append((np.swapaxes(flat, 1, 2) @ flat, np.sum(e[..., -1] ** 2, axis=1), run.y, run.x_end, dx_end))
+            grams, squares, sums = (
+                np.swapaxes(flat, 1, 2) @ flat,
+                np.sum(e[..., -1] ** 2, axis=1),
+                e[..., :-1].sum(axis=1),
+            )
+            parts.append((grams, squares, sums, run.y, run.x_end, dx_end))
         return Gram(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _call_library(
@@ -267,7 +276,7 @@ class Rollout:
         assert self._library is not None
         p, (m, n) = given[2], given[3].shape
         function, stop = self._library.rollout, ctypes.c_int(0)
-        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int] + [ctypes.c_longlong] * 2 + [ctypes.c_void_p] * 15
+        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int] + [ctypes.c_longlong] * 2 + [ctypes.c_void_p] * 16
         function.restype = None
         arrays = (*given, *others)
         pointers = [a.ctypes.data if a is not None else None for a in arrays]

@@ -381,6 +381,8 @@ def test_the_gram_is_that_of_the_run_s_residuals(name: str, lanes: int | None) -
     e = np.where(np.isfinite(measured)[..., None], e, 0.0).reshape(len(e), -1, e.shape[-1])
     assert_allclose(found.grams, np.swapaxes(e, 1, 2) @ e, rtol=1e-9, atol=1e-9 * np.abs(e).max() ** 2)
     assert_allclose(found.squares.sum(axis=1), found.grams[:, -1, -1], rtol=1e-12)
+    derivatives = np.where(np.isfinite(measured), weight, 0.0)[..., None] * run.dy
+    assert_allclose(found.sums, derivatives.sum(axis=1), rtol=1e-9, atol=1e-9 * np.abs(derivatives).max())
     assert_allclose(found.y, run.y, rtol=1e-12)
     assert_allclose(found.x_end, run.x_end, rtol=1e-12)
     assert run.dx_end is not None
