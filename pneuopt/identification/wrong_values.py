@@ -18,6 +18,7 @@ from pneuopt.quantities.units import write_value
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import solve_least_squares
 from pneuopt.shooting.search import Search
+from pneuopt.shooting.search_end import ABANDONED_START
 from pneuopt.shooting.segments import segment
 from pneuopt.shooting.solution import Fit
 
@@ -26,8 +27,8 @@ from pneuopt.shooting.solution import Fit
 MIN_PROMISED_SHARE = 0.5
 # the same by a fit, to be named: lower blames a value for an error of the model, higher misses it beside another one
 MIN_EXPLAINED_SHARE = 0.8
-# iterations of a stage of a trial, and of the last one: a value that explains the logs takes 17 in all, more are lost
-# on what does not
+# iterations of a stage of a trial, and of its last one again where the equations by then promise enough: a value that
+# explains the logs takes 17 in all, more are lost on what does not
 TRIAL_ITERATIONS, LAST_TRIAL_ITERATIONS = 4, 10
 MAX_FREED_TRIALS = 2  # values that are tried: more take time, fewer miss one whose promise is not the largest
 MAX_TESTS = 2  # fits of one problem that are tested: more take time, fewer miss what the first one is too far off for
@@ -207,16 +208,9 @@ def _fixed_values(problem: EstimationProblem) -> list[str]:
 def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -> WrongValue | None:
     """What a fit with a value freed explains; None where that is too little, or it hardly changes."""
     freed = replace(problem, parameters=problem.parameters.freed(name))
-    *others, last = freed.method.stages
-    stages = (
-        *(replace(stage, iterations=TRIAL_ITERATIONS) for stage in others[1:]),
-        replace(last, iterations=LAST_TRIAL_ITERATIONS),
-    )
-    allowed = 1 + (1 - MIN_EXPLAINED_SHARE) * excess / fit.count
-    method = replace(freed.method, stages=stages, max_misfit=allowed, allows_state_noise=False)
-    found = solve_least_squares(freed.transcription(freed.start_from(fit)), method)
-    if found.status.code is Code.INTERRUPTED:
-        raise KeyboardInterrupt
+    found = _search_freed(freed, fit, 1 + (1 - MIN_EXPLAINED_SHARE) * excess / fit.count)
+    if found is None:
+        return None
     place, given = found.parameters.free_names.index(name), problem.parameters[name]
     squares = 2 * found.stats["cost"]
     share = 1 - (squares - fit.count) / excess
@@ -229,3 +223,18 @@ def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -
     if not (share >= MIN_EXPLAINED_SHARE and is_clear and found.jumps is None):
         return None
     return WrongValue(name, given.value, value, given.unit, min(1.0, share), squares)
+
+
+def _search_freed(freed: EstimationProblem, fit: Fit, allowed: float) -> Fit | None:
+    """A short search with a value freed; None where its squares a sample would stay above those that are allowed."""
+    *others, last = (replace(stage, iterations=TRIAL_ITERATIONS) for stage in freed.method.stages[1:])
+    method = replace(freed.method, max_misfit=allowed, allows_state_noise=False)
+    found = fit
+    for stages in ((*others, replace(last, refine=1)), (replace(last, iterations=LAST_TRIAL_ITERATIONS),)):
+        found = solve_least_squares(freed.transcription(freed.start_from(found)), replace(method, stages=stages))
+        if found.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        optimum, is_left = found.optimum, found.status is ABANDONED_START
+        if is_left or optimum is None or optimum.equations.promised_squares(optimum.keep) > allowed * fit.count:
+            return None
+    return found
