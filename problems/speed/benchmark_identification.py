@@ -5,7 +5,8 @@
 b32.py's log, six parameters, started from the log alone, on a warm cache and one core; CPU seconds. "x" is one
 compiled scalar simulation of the record (10 RK4 steps a sample), timed in the same process. The rivals start from our
 equation-error start: SciPy's least_squares around solve_ivp (LSODA), single shooting with a right-hand side in Python,
-until its time is up; and the full-space IPOPT on the log's first second, for the whole log is beyond it. Then the same
+until its time is up: if `scipy.converged` is 0 by then, `scipy.over_ours` is a lower bound of what an answer costs; and
+the full-space IPOPT on the log's first second, for the whole log is beyond it. Then the same
 without a compiler, and the cost against the record's length: the same loop, its ten seconds of reference repeated.
 "exact" is the same log without noise: what is left there is the method's own error, for noise alone moves the Stribeck
 velocity by 0.14 % (one standard deviation) on this log.
@@ -107,7 +108,7 @@ def _run_part(name: str) -> dict[str, float]:
 
 
 def ours() -> dict[str, float]:
-    """CPU seconds of the fastest of three (one in the VM), beside the unit; and how far the answer is off."""
+    """CPU seconds of the fastest of five (one in the VM), beside the unit; and how far the answer is off."""
     system, truth, blind = _blind()
     log = generate(*po.catalog.b32()).select(LOGGED)
     fit, seconds, unit = po.identify(system, [log], blind), math.inf, math.inf
