@@ -38,7 +38,7 @@ from pneuopt.shooting.search_end import (
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, start_nodes
 from pneuopt.shooting.solution import Fit
-from pneuopt.shooting.stage_end import STAGE_COST_TOLERANCE, is_negligible_step
+from pneuopt.shooting.stage_end import creeps, is_negligible_step
 
 if TYPE_CHECKING:
     from pneuopt.shooting.least_squares import LeastSquares, Stage
@@ -61,9 +61,6 @@ MAX_LOOSENED = 2
 # creeping steps in a row after which a search with noise of the states leaps: fewer leave a way that leads on, more
 # take long
 MAX_CREEPING_STEPS = 3
-# actual over promised decrease [1] below which such a search creeps: higher leaves a fit that converges, lower follows
-# a kink of the model for hundreds of steps (a log with encoder steps: 50 of .13 each, of 35 promised)
-CREEPING_SHARE = 0.3
 # difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
 # one
 JOINED_COST_TOLERANCE = 1e-3
@@ -200,17 +197,42 @@ class Search:
         return status
 
     def _loosen(self, stage: "Stage", nodes: Array, z: Array) -> Status:
-        """The status of the optimum with a stage's gaps as noise of the states; where there is none, nothing moves."""
+        """The status of the optimum with a stage's gaps as noise of the states, or with tight gaps where it leads.
+
+        Where there is none, nothing moves.
+        """
         before, last = self.snapshot(), self.method.stages[-1]
         self.noisy_gaps = True
         self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), nodes, z)
         self._finish_stage(last.iterations)
         found = self._convergence_status(self.current)
-        if not found.converged:
-            self.unsettled_gaps.add(stage.gap)
-            self.restore(before)
-            self.noisy_gaps = False
+        if found.converged:
+            return self._tighten() or found
+        self.unsettled_gaps.add(stage.gap)
+        self.restore(before)
+        self.noisy_gaps = False
         return found
+
+    def _tighten(self) -> Status | None:
+        """The status of an optimum with tight gaps, where one with noise of the states leads to it; or None.
+
+        The nodes of a first stage may lie across kinks, and its equations then foresee a misfit that a right model has
+        not; at an optimum that is nearer they are right.
+        """
+        before, last = self.snapshot(), self.method.stages[-1]
+        if self._promised_squares(last) > MAX_JUMP_MISFIT * self.current.equations.count:
+            return None
+        self.noisy_gaps = False
+        for stage in self.method.stages:
+            if stage.gap < before.stage.gap and self.is_noise(self.current.cost):
+                self._enter_stage(stage, self.current.nodes, self.current.z)
+                self._finish_stage(stage.iterations)
+        found = self._convergence_status(self.current)
+        if self.stage is last and found.converged and self.is_noise(self.current.cost):
+            return found
+        self.restore(before)
+        self.noisy_gaps = True
+        return None
 
     def snapshot(self) -> Snapshot:
         """Where the search is, to which `restore` returns."""
@@ -323,7 +345,7 @@ class Search:
             self.iterations += 1
             before, self.current = self.current.cost, trial
             self._report()
-            hopeless = hopeless + 1 if self._creeps(before, descent.promised) else 0
+            hopeless = hopeless + 1 if creeps(self, before, descent.promised) else 0
             if hopeless == MAX_CREEPING_STEPS:
                 if not self._leap(descent):
                     return True
@@ -337,12 +359,6 @@ class Search:
         before, (self.current, taken) = self.current.cost, descent.leap(self.current, self.method.budget)
         self.iterations += taken
         return self.current.cost < before
-
-    def _creeps(self, before: float, promised: float) -> bool:
-        """Whether a step from a cost has fallen far short of its promise, and changed little."""
-        return self.noisy_gaps and before - self.current.cost < min(
-            CREEPING_SHARE * promised, STAGE_COST_TOLERANCE * before
-        )
 
     def _is_negligible_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
         return is_negligible_step(self, current, reduced, step)

@@ -25,6 +25,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import LeastSquares
 
 STEP, NOISE = 2e-3, {"position": 2e-5}
 AXIS = ForceDrive(Stribeck())
@@ -37,7 +38,7 @@ LIMITS = {"position": (0.05, 0.15), "speed": (-0.4, 0.4), "force": (-60.0, 60.0)
 
 
 @functools.cache
-def design(cpu_seconds: float = 3.0) -> ExperimentDesign:
+def design() -> ExperimentDesign:
     return next_experiment(
         LOOP,
         KNOWN.freed(*FREE),
@@ -45,7 +46,7 @@ def design(cpu_seconds: float = 3.0) -> ExperimentDesign:
         limits=LIMITS,
         noise=NOISE,
         plants={},
-        cpu_seconds=cpu_seconds,
+        cpu_seconds=3,
         criterion=DOptimal(),
     )
 
@@ -106,20 +107,29 @@ def test_every_limit_is_kept_at_every_sample() -> None:
         assert design().room[name] <= 0
 
 
-@pytest.mark.slow  # 15 s
 def test_a_design_tells_more_than_steps_and_a_fit_achieves_what_it_predicts() -> None:
-    found = design(
-        12.0
-    )  # long enough for any machine; a fit of some worse designs takes an exact model for a wrong one
     steps = 0.1 + 0.04 * np.sign(np.sin(2 * np.pi * np.arange(1500) * STEP / 1.5))
     asked = KNOWN.select(AXIS.parameters).freed(*FREE)
-    planned = identify(AXIS, log_of(found.excitation["position_reference"]), asked)
+    planned = identify(AXIS, log_of(design().excitation["position_reference"]), asked)
     usual = identify(AXIS, log_of(steps), asked)
     narrower = usual.estimates["stderr"] / planned.estimates["stderr"]
     assert float(np.exp(np.log(narrower).mean())) > 1.25
-    compared = found.compare(planned, alone=True)
+    compared = design().compare(planned, alone=True)
     assert compared["ratio"].between(0.9, 1.1).all(), compared
     assert (compared["shift"].abs() < 4).all(), compared
+
+
+def test_an_exact_model_of_a_log_that_often_turns_is_not_taken_for_a_wrong_one() -> None:
+    """A third of the designs made such logs: the fit gave noise to the states, and had not tried tight gaps."""
+    t = STEP * np.arange(750)
+    turning = 0.1 + 0.021 * np.sin(2 * np.pi * 1.5 * t) + 0.009 * np.sin(2 * np.pi * 8 * t)
+    fit = identify(AXIS, log_of(turning), KNOWN.select(AXIS.parameters).freed(*FREE))
+    assert "does not explain" not in fit.status.message
+    assert fit.stats["gap_deviation"] == LeastSquares().stages[-1].gap
+    found = fit.estimates
+    truth = np.array([KNOWN.value(n) for n in found.index])
+    assert ((found["value"] - truth).abs() < 4 * found["stderr"]).all(), found
+    assert (found["stderr"] < 0.1 * truth).all()
 
 
 def test_what_a_fit_knows_counts_and_its_noise_is_taken() -> None:
