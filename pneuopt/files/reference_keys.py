@@ -1,4 +1,4 @@
-"""The keys of a [[reference]] in a tuning.toml: of a step, and of a move."""
+"""The keys of a [[reference]] in a tuning.toml: of a step, of a move, and of a path from a table."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,7 +9,7 @@ from pneuopt.quantities.keys import Key, Takes, choice, table
 
 _PUSH = Key("by how much it changes", unit="{own}", example='"50 N"')
 _KNOWN = Key("its value at time 0", unit="{own}", example='"250 mm"')
-_OF_A_MOVE = "of a move"
+_OF_A_MOVE, _HAS_AN_END = "of a move", "of a move or a path"
 _SHARED_KEYS: Mapping[str, Key] = {
     "initial": Key("value before", unit="{measured}", usual=Step.initial),
     "at": Key("when it begins", unit="s", usual=Step.at),
@@ -49,13 +49,22 @@ MOVE_KEYS: Mapping[str, Key] = {
     "profile": replace(
         choice("its shape", {kind.value: kind for kind in MoveProfile}, Move.profile.value), condition=_OF_A_MOVE
     ),
-    "dwell": Key("from its end to the end of the experiment", unit="s", usual=Move.dwell, condition=_OF_A_MOVE),
+    "dwell": Key("from its end to the end of the experiment", unit="s", usual=Move.dwell, condition=_HAS_AN_END),
     **_SHARED_KEYS,
+}
+PATH_KEYS: Mapping[str, Key] = {
+    "path": Key(
+        "a table of time and the measured signal, in any format that a log has, beside this file",
+        Takes.TEXT,
+        example='"path.csv"',
+        condition="in place of step or move",
+    ),
+    **{n: MOVE_KEYS[n] for n in ("dwell", "start", "disturbance")},
 }
 OWN_MOVE_KEYS: Mapping[str, Key] = {
     "distance": replace(MOVE_KEYS["move"], condition="of one of several moves"),
     **{n: MOVE_KEYS[n] for n in ("speed", "acceleration", "jerk", "profile", "dwell")},
 }
 """Those of one of several moves."""
-REFERENCE_KEYS: Mapping[str, Key] = {**STEP_KEYS, **MOVE_KEYS}
+REFERENCE_KEYS: Mapping[str, Key] = {**STEP_KEYS, **MOVE_KEYS, **PATH_KEYS}
 """All of them."""

@@ -1,6 +1,8 @@
-"""The [[reference]] sections of a tuning.toml: steps, moves and disturbances."""
+"""The [[reference]] sections of a tuning.toml: steps, moves, paths and disturbances."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os.path import relpath
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +10,8 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move
 from pneuopt.control.reference import Reference, Step
-from pneuopt.files.reference_keys import MOVE_KEYS, OWN_MOVE_KEYS, REFERENCE_KEYS, STEP_KEYS
+from pneuopt.files.path import read_path_of
+from pneuopt.files.reference_keys import MOVE_KEYS, OWN_MOVE_KEYS, PATH_KEYS, REFERENCE_KEYS, STEP_KEYS
 from pneuopt.files.toml import construct_at, read_fixed_value
 from pneuopt.files.tuning_keys import signal_units
 from pneuopt.quantities.errors import check_names, require
@@ -28,27 +31,69 @@ def read_references(entries: Any, loop: ClosedLoop, path: str | Path) -> tuple[R
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
     require(several, f"{path}: write each reference as a section of its own, [[reference]]")
     require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
-    found = tuple(_reference(e, loop, f"{path}: [[reference]] {k}") for k, e in enumerate(entries, 1))
+    found = tuple(_reference(e, loop, Path(path), k) for k, e in enumerate(entries, 1))
     told = "two references step between the same values; tables tell them by that"
     require(len({r.label for r in found}) == len(found), f"{path}: {told}")
     return found
 
 
-def _reference(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Reference:
+@dataclass(frozen=True)
+class _Kind:
+    """A kind of reference: its name, its keys, the key by which it ends, and those without which it is none."""
+
+    name: str
+    keys: Mapping[str, Key]
+    end: str
+    needed: tuple[str, ...] = ()
+
+
+_STEP, _PATH = _Kind("step", STEP_KEYS, "horizon", ("step", "horizon")), _Kind("path", PATH_KEYS, "dwell")
+_MOVE = _Kind("move", MOVE_KEYS, "dwell", ("speed", "acceleration"))
+_REFERENCE_KINDS: Mapping[str, _Kind] = {"step": _STEP, "move": _MOVE, "moves": _MOVE, "path": _PATH}
+
+
+def move_paths(entries: Any, old: Path, new: Path) -> None:
+    """Rewrite the tables that [[reference]] sections name, beside a file in one folder, for a file in another.
+
+    Parameters
+    ----------
+    entries : list of dict
+        Of a TOML document, changed in place.
+    old, new : Path
+        The folders.
+    """
+    if old.resolve() == new.resolve():
+        return
+    for entry in entries:
+        if isinstance(entry.get("path"), str):
+            table = (old / entry["path"]).resolve()
+            try:
+                entry["path"] = Path(relpath(table, new.resolve())).as_posix()
+            except ValueError:  # on another drive of Windows
+                entry["path"] = table.as_posix()
+
+
+def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: int) -> Reference:
     """Read one [[reference]]."""
+    where = f"{file}: [[reference]] {number}"
     check_names("key", entry, REFERENCE_KEYS, where)
-    moves = "move" in entry or "moves" in entry
-    keys, kind, end = (MOVE_KEYS, "move", "dwell") if moves else (STEP_KEYS, "step", "horizon")
-    one = sum(key in entry for key in ("step", "move", "moves")) <= 1
-    require(one, f"{where} has more than one of step, move and moves; write a section [[reference]] for each")
+    given = [key for key in _REFERENCE_KINDS if key in entry]
+    told = f"{where} has more than one of step, move, moves and path; write a section [[reference]] for each"
+    require(len(given) <= 1, told)
+    kind = _REFERENCE_KINDS[given[0]] if given else _STEP
     for key in entry:
-        message = f"{where} {key} does not belong to a {kind}, which ends by {end}; a {kind} has {', '.join(keys)}"
-        require(key in keys, message)
-    needed = ("speed", "acceleration") if moves else ("horizon",) if "disturbance" in entry else ("step", "horizon")
-    for key in needed:
+        message = f"{where} {key} does not belong to a {kind.name}, which ends by {kind.end}"
+        message += f"; a {kind.name} has {', '.join(kind.keys)}"
+        require(key in kind.keys, message)
+    for key in ("horizon",) if "disturbance" in entry and kind is _STEP else kind.needed:
         require(key in entry, f"{where} has no {key}")
-    known = _numbers(entry, keys, loop, where) | _circumstances(entry, loop, where)
-    if moves:
+    known = _numbers(entry, kind.keys, loop, where) | _circumstances(entry, loop, where)
+    if kind is _PATH:
+        require(isinstance(entry["path"], str), f'{where} path must name a file, path = "path.csv"')
+        table = file.parent / entry["path"]
+        known = {"dwell": Move.dwell, **known}
+        return construct_at(lambda: read_path_of(loop.feedback.name, table, **known), f"{where} path")
+    if kind is _MOVE:
         known |= _profile(entry, where)
         each = _each_move(entry, loop, where) if "moves" in entry else [{"distance": known.pop("move")}]
         return construct_at(lambda: _chain_moves(each, known), where)

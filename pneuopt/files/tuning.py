@@ -29,7 +29,7 @@ from pneuopt.files.loop import (
     read_loop_sections,
 )
 from pneuopt.files.method import read_method
-from pneuopt.files.references import read_references
+from pneuopt.files.references import move_paths, read_references
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
 from pneuopt.files.spreads import read_draw, read_sample_spreads, read_spreads
 from pneuopt.files.toml import (
@@ -170,6 +170,7 @@ def write_tuned(
     document = read_toml(source)
     for name in TUNED_SECTIONS:
         document.pop(name, None)
+    move_paths(document.get("reference", []), Path(source).parent, Path(path).parent)
     status: dict[str, Any] = {"code": result.status.code.value, "message": result.status.message}
     if result.status.converged:
         _write_gains(document, result.parameters, source)

@@ -1,14 +1,19 @@
-"""References in a tuning.toml: moves, and the band about their ends."""
+"""References in a tuning.toml: moves, paths from tables, and the band about their ends."""
 
 import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tomlkit
 
+from pneuopt.control.motion_path import MotionPath
 from pneuopt.control.move_sequence import MoveSequence
 from pneuopt.control.moves import Move, MoveProfile
 from pneuopt.evaluation.band import Tolerance
+from pneuopt.files.references import move_paths
+from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
@@ -77,7 +82,7 @@ def test_a_reference_may_be_a_move(tmp_path: Path) -> None:
     [
         ('dwell = "2 s"', 'horizon = "2 s"', "horizon does not belong to a move, which ends by dwell"),
         ('move = "-200 mm"', 'step = "-200 mm"', "speed does not belong to a step, which ends by horizon"),
-        ('move = "-200 mm"', 'step = "1 mm"\nmove = "1 mm"', "has more than one of step, move and moves"),
+        ('move = "-200 mm"', 'step = "1 mm"\nmove = "1 mm"', "has more than one of step, move, moves and path"),
         ('move = "-200 mm"', 'moves = "-200 mm"', "moves must be a list"),
         ('move = "-200 mm"', 'moves = ["-200 mm", "0 mm"]', "Move: distance must not be zero"),
         ('move = "-200 mm"', 'moves = ["1 mm", { speed = "1 m/s" }]', "moves 2 has no distance; write { distance"),
@@ -99,3 +104,70 @@ def test_refuses_a_move_and_says_where(tmp_path: Path, old: str, new: str, said:
         read_tuning(written(tmp_path, MOVE.replace(old, new, 1)), ForceDrive(Coulomb()).system())
     assert "[[reference]] 1" in str(error.value)
     assert said in str(error.value)
+
+
+CAM = '[loop]\nmeasured = "position"\n[pid]\nKp = "200 N/m"\n[[reference]]\npath = "cams/cam.csv"\ndwell = "0.4 s"\n'
+
+
+def table(folder: Path, head: str, points: np.ndarray) -> None:
+    (folder / "cams").mkdir(exist_ok=True)
+    rows = "\n".join(",".join(f"{x:.9g}" for x in row) for row in points)
+    (folder / "cams" / "cam.csv").write_text(f"{head}\n{rows}\n", encoding="utf-8")
+
+
+def cam(folder: Path, head: str = "t [ms],x [mm]") -> np.ndarray:
+    """A cam of 100 mm, written beside the tuning [s, m]."""
+    t = np.linspace(0.0, 0.8, 41)
+    points = np.column_stack([t, 0.05 * (1 - np.cos(np.pi * t / 0.8))])
+    table(folder, head, 1e3 * points)
+    return points
+
+
+def test_a_reference_may_be_a_path_from_a_table(tmp_path: Path) -> None:
+    """Beside the tuning's own file, wherever the command runs; the column of the measured signal's reference counts."""
+    points, drive = cam(tmp_path, "time [ms],position_reference [mm]"), ForceDrive(Coulomb()).system()
+    tuning = written(tmp_path, CAM + 'start = { speed = "0.1 m/s" }\ndisturbance = { "load.force" = "20 N" }\n')
+    (found,) = read_tuning(tuning, drive).references
+    assert isinstance(found, MotionPath)
+    np.testing.assert_allclose([found.t, found.points], points.T, atol=1e-9)
+    assert (found.name, found.dwell, found.start, found.disturbance) == ("cam", 0.4, {"speed": 0.1}, {"load.force": 20})
+    wider = np.column_stack([1e3 * points, 1e3 * points[:, 1] + 7.0])
+    table(tmp_path, "time [ms],position_reference [mm],position [mm]", wider)
+    assert read_tuning(tuning, drive).references[0].origin == pytest.approx(0.0)
+    table(tmp_path, "time [ms],position [mm]", 1e3 * points)
+    (found,) = read_tuning(written(tmp_path, CAM.replace('dwell = "0.4 s"\n', "")), drive).references
+    assert found.horizon == pytest.approx(points[-1, 0] + Move.dwell)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("cams/cam.csv", "cam.csv", "path: {folder}/cam.csv: cannot be read (No such file or directory)"),
+        ('"cams/cam.csv"', "3", 'path must name a file, path = "path.csv"'),
+        ('dwell = "0.4 s"', 'horizon = "1 s"', "horizon does not belong to a path, which ends by dwell"),
+        ('dwell = "0.4 s"', 'speed = "1 m/s"', "speed does not belong to a path, which ends by dwell"),
+        ('dwell = "0.4 s"', 'step = "1 mm"', "has more than one of step, move, moves and path"),
+        ('dwell = "0.4 s"', 'dwell = "-2 s"', "MotionPath: dwell -2 s ends the experiment before it begins"),
+        ('"position"', '"speed"', "no column of a path; name one speed [m/s]"),
+    ],
+)
+def test_refuses_a_path_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    cam(tmp_path, "time [ms],position [mm]")
+    text = CAM.replace("N/m", "N*s/m") if new == '"speed"' else CAM
+    assert old in text
+    with pytest.raises(InputError) as error:
+        read_tuning(written(tmp_path, text.replace(old, new, 1)), ForceDrive(Coulomb()).system())
+    assert "[[reference]] 1" in str(error.value)
+    assert said.format(folder=tmp_path) in str(error.value)
+
+
+def test_a_tuned_file_elsewhere_names_the_same_table(tmp_path: Path) -> None:
+    points, drive = cam(tmp_path, "time [ms],position [mm]"), ForceDrive(Coulomb()).system()
+    tuning, folder = written(tmp_path, CAM + "[minimise]\nfollowing_error = {}\n"), tmp_path / "results" / "today"
+    folder.mkdir(parents=True)
+    document = read_toml(tuning)
+    move_paths(document["reference"], tmp_path, folder)
+    (folder / "tuned.toml").write_text(tomlkit.dumps(document), encoding="utf-8")
+    assert document["reference"][0]["path"] == "../../cams/cam.csv"
+    (found,) = read_tuning(folder / "tuned.toml", drive).references
+    assert found.final == pytest.approx(points[-1, 1])
