@@ -213,8 +213,8 @@ class StickSlipIntegration:
         return float(forward), float(backward)
 
     def _state_at(self, t: float) -> Array:
-        """The state at an instant of the last step."""
-        if t >= self._solver.t:
+        """The state at an instant of the last step, at its begin where rounding puts the instant before the first."""
+        if t >= self._solver.t or self._solver.t_old is None:
             x = np.array(self._solver.y)
         else:
             self._dense = self._dense or self._solver.dense_output()

@@ -83,6 +83,12 @@ def test_hunting_is_found_and_explained() -> None:
     )
 
 
+def test_samples_that_rounding_puts_before_the_mode_that_they_begin_are_read() -> None:
+    """Of a loop sampled at 2 ms, 1.122 s is an ulp later by the controller's clock than by the instants read."""
+    (case,) = watch(1.2, PID(2e-3)).cases
+    assert case.last_motion < 1.2
+
+
 def test_a_hand_written_simulation_hunts_alike() -> None:
     (case,) = watch().cases
     late = np.array([(t, e) for t, e in standstills(60.0) if t >= 30.0])
