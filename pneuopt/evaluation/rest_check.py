@@ -142,6 +142,15 @@ class RestCheck(Result):
         """Whether every case comes to rest for good."""
         return all(case.kind is RestKind.RESTS for case in self.cases)
 
+    @property
+    def repeatability(self) -> float:
+        """Range of the errors at rest over the cases, such as start positions; inf where one does not rest.
+
+        In the measured unit; of one case 0.
+        """
+        errors = [case.error for case in self.cases]
+        return max(errors) - min(errors) if self.rests else inf
+
     def to_frame(self) -> "pd.DataFrame":
         """A row a case, by its label: "kind", "error", "amplitude", "period", "slips", "last_motion", "push"."""
         import pandas as pd
@@ -156,12 +165,14 @@ class RestCheck(Result):
         count, whole = len(restless), len(self.cases)
         word = f"does not come to rest in {count} of {whole} cases" if count else f"comes to rest in {whole} of {whole}"
         lead = Line(f"the loop {word}, watched for {self.duration:g} s", Tone.BAD if count else Tone.GOOD)
+        span = f"repeatability {write_value(self.repeatability, self.unit, 3)}: the range of its errors at rest"
+        repeats = (Line(span, indent=2),) if self.rests and whole > 1 else ()
         columns = (*text_columns("case", "ends"), *number_columns(f"error\n{self.unit}", "slips", "last motion\ns"))
         rows = tuple(
             (c.label, c.kind.value, format_number(c.error, 3), str(c.slips), format_number(c.last_motion, 3))
             for c in self.cases
         )
-        return Report((lead, *(Line(c.sentence, indent=2) for c in restless), Table(columns, rows)))
+        return Report((lead, *repeats, *(Line(c.sentence, indent=2) for c in restless), Table(columns, rows)))
 
 
 def check_rest(

@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
@@ -129,6 +130,23 @@ def test_a_proportional_controller_rests_with_an_error() -> None:
     found = watch(pid__Ki=0.0)
     assert found.rests
     assert 0 < found.cases[0].error <= STATIC / GAINS["pid.Kp"]
+
+
+def test_repeatability_is_the_range_of_the_errors_at_rest() -> None:
+    """A P controller leaves a body anywhere that its friction holds, so where it rests depends on where it began."""
+    loop = ClosedLoop(ForceDrive(Karnopp(Stribeck())).system(), PID(), measured="position")
+    values = loop.parameters.with_values(GAINS | FALL | {"pid.Ki": 0.0})
+    starts = [Move(0.1 - at, initial=at, speed=0.5, acceleration=5.0, dwell=1.0) for at in (0.0, 0.04, 0.17)]
+    found = check_rest(loop, starts, values, duration=3.0)
+    ends = [case.error for case in found.cases]
+    assert len({round(e, 7) for e in ends}) == 3
+    assert found.repeatability == max(ends) - min(ends)
+    assert found.repeatability <= 2 * STATIC / GAINS["pid.Kp"]
+    shown = f"repeatability {1e3 * found.repeatability:.3g} mm: the range of its errors at rest"
+    assert shown in str(found).splitlines()[1]
+    assert check_rest(loop, starts[:1], values, duration=3.0).repeatability == 0
+    assert "repeatability" not in str(watch())
+    assert watch().repeatability == np.inf
 
 
 def test_scenarios_are_watched_and_tabled() -> None:
