@@ -241,19 +241,20 @@ def _cost_after_guesses(problem: EstimationProblem, fits: Sequence[Candidate]) -
 def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
     """What a start reaches in some stages with its guesses held, the start from there, and whether that is the noise.
 
-    A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones.
+    A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones. With
+    noise of the states a wrong guess explains any log.
     """
     transcription = problem.transcription(candidate)
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
     bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
     held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
-    fit = solve_least_squares(held, replace(problem.method, stages=problem.method.stages[:stages]))
+    method = replace(problem.method, stages=problem.method.stages[:stages], allows_state_noise=False)
+    fit = solve_least_squares(held, method)
     if fit.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     start = problem.start_from(fit, f"{candidate.label}, settled")
     gap, cost = fit.stats["gap_deviation"], fit.stats["cost"]
-    is_tight = stages == GUESS_STAGES and fit.jumps is None
-    explains = is_tight and 2 * cost <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
+    explains = stages == GUESS_STAGES and 2 * cost <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
     return (gap, cost), replace(start, parameters={**start.parameters, **guesses}), explains
 
 

@@ -99,7 +99,7 @@ def test_a_start_that_explains_the_log_as_it_settles_comes_before_the_others_set
         (-1, starting.GUESS_STAGES, 1.5, True),  # 1.13 squares a sample
         (-1, starting.GUESS_STAGES, 1.05, False),
         (-1, 1, 1.5, False),  # with wide gaps all starts explain the log
-        (0, starting.GUESS_STAGES, 1.5, False),  # and so they do with noise of the states: .98
+        (1, starting.GUESS_STAGES, 1.05, True),  # 1.006; noise of the states would have left .92 by wide gaps
     ],
 )
 def test_a_start_explains_the_log_by_tight_gaps_only(
