@@ -10,7 +10,6 @@ from math import inf, isfinite, log1p
 from typing import Any, Protocol
 
 import numpy as np
-from scipy import stats
 
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -54,6 +53,8 @@ class Uniform:
 
     def freeze(self, value: float) -> Any:
         """SciPy's distribution."""
+        from scipy import stats
+
         low, high = self.spread if isinstance(self.spread, tuple) else _ends_about(value, self.spread)
         return stats.uniform(low, high - low)
 
@@ -78,6 +79,8 @@ class LogUniform:
 
     def freeze(self, value: float) -> Any:
         """SciPy's distribution."""
+        from scipy import stats
+
         if isinstance(self.spread, tuple):
             return stats.loguniform(*self.spread)
         require(value > 0, f"LogUniform: the value must be positive, got {value:g}")
@@ -102,6 +105,8 @@ class Normal:
 
     def freeze(self, value: float) -> Any:
         """SciPy's distribution."""
+        from scipy import stats
+
         if isinstance(self.spread, tuple):
             return stats.norm(*self.spread)
         low, high = _ends_about(value, self.spread)
@@ -127,6 +132,8 @@ class LogNormal:
 
     def freeze(self, value: float) -> Any:
         """SciPy's distribution."""
+        from scipy import stats
+
         median, fraction = self.spread if isinstance(self.spread, tuple) else (value, self.spread)
         require(median > 0, f"LogNormal: the median must be positive, got {median:g}")
         return stats.lognorm(log1p(fraction), scale=median)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import t
 
 from pneuopt.evaluation.monte_carlo import degrees_of_freedom, draw_in_ranges, select_estimates, select_ranges
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, AxisNames, Factor, Scenarios, draws, tolerances
@@ -199,6 +198,8 @@ def _range_axis(parameters: ParameterSet, name: str, low: float, high: float) ->
 
 def _estimate_axis(parameters: ParameterSet, name: str, deviation: float, dof: float) -> PlantAxis:
     """An estimate with the interval that its standard deviation leaves, within its bounds."""
+    from scipy.stats import t
+
     p, width = parameters[name], float(t.ppf((1 + FIT_SHARE) / 2, dof)) * deviation
     ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
     low, high = (float(min(max(end, p.lower), p.upper)) for end in ends)

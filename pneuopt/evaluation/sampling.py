@@ -5,7 +5,6 @@ from enum import Enum
 from math import ceil, log2
 
 import numpy as np
-from scipy.stats import qmc
 
 from pneuopt.quantities.arrays import Array
 
@@ -47,12 +46,20 @@ def unit_points(sampling: Sampling, count: int, axes: int, seed: Seed) -> Array:
 
 def _sobol_points(count: int, axes: int, rng: np.random.Generator) -> Array:
     """The first points of a scrambled sequence, which is balanced at powers of two."""
+    from scipy.stats import qmc  # now: it takes as long to import as all else of a certificate
+
     points = qmc.Sobol(axes, scramble=True, rng=rng).random_base2(ceil(log2(count)))
     return np.asarray(points[:count])
 
 
+def _latin_points(count: int, axes: int, rng: np.random.Generator) -> Array:
+    from scipy.stats import qmc
+
+    return np.asarray(qmc.LatinHypercube(axes, rng=rng).random(count))
+
+
 _POINTS: Mapping[Sampling, Callable[[int, int, np.random.Generator], Array]] = {
     Sampling.RANDOM: lambda count, axes, rng: rng.random((count, axes)),
-    Sampling.LATIN_HYPERCUBE: lambda count, axes, rng: np.asarray(qmc.LatinHypercube(axes, rng=rng).random(count)),
+    Sampling.LATIN_HYPERCUBE: _latin_points,
     Sampling.SOBOL: _sobol_points,
 }

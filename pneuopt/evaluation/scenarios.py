@@ -12,7 +12,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import norm, t
 
 from pneuopt.evaluation.distributions import Distribution, quantiles
 from pneuopt.evaluation.sampling import Sampling, Seed, unit_points
@@ -290,6 +289,8 @@ def draws(
 
 def _by_student_t(normal: Array, deviations: Array, dof: Array) -> Array:
     """Normal draws, moved to the same probability of Student's t where there are finite degrees of freedom."""
+    from scipy.stats import norm, t
+
     few = np.isfinite(dof) & (deviations > 0)
     out = normal.copy()
     out[few] = deviations[few] * t.ppf(norm.cdf(normal[few] / deviations[few]), dof[few])

@@ -1,6 +1,8 @@
 """Each distribution and each way to fill the cube goes through the same mill."""
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -115,3 +117,10 @@ def test_samples_by_distributions_vary_together_on_one_axis(sampling: Sampling) 
 def test_a_distribution_has_no_corners() -> None:
     with pytest.raises(InputError, match=r"load\.mass: Normal\(spread=0.1\) has no corners; draw samples"):
         corners(RIG, {"load.mass": Normal(0.1)})  # type: ignore[arg-type]
+
+
+def test_a_certificate_does_without_the_statistics_of_scipy() -> None:
+    """They take as long to import as all else that it needs, and each worker of a study imports it."""
+    code = "import sys, pneuopt; pneuopt.evaluate; print('scipy.stats' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"
