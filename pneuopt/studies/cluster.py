@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from pneuopt.quantities.errors import InputError
+from pneuopt.studies.executors import UNKNOWN_WORKERS
 from pneuopt.studies.processes import Processes
 
 LOCAL_CLUSTER = "dask"
@@ -63,7 +64,10 @@ def open_executor(where: str) -> Iterator[Executor | Processes]:
         raise InputError(f"executor {where!r}: give a number of processes, dask, or a scheduler, tcp://host:8786")
     distributed = _import_distributed()
     with _make_client(distributed, where) as client:
-        yield client.get_executor(pure=False)  # otherwise a chunk that is tried again is given its old error
+        executor = client.get_executor(pure=False)  # otherwise a chunk that is tried again is given its old error
+        workers = sum(client.nthreads().values())
+        executor._max_workers = workers if where == LOCAL_CLUSTER else max(workers, UNKNOWN_WORKERS)
+        yield executor
 
 
 @contextmanager

@@ -13,7 +13,9 @@ from pneuopt.studies.queue import CaseQueue, Chunk
 _CHUNKS_A_WORKER = 3
 """Chunks that wait for each worker [1]: fewer leave it idle while a result travels, more fill the memory."""
 _ChunkFunction = Callable[[list[CaseValues]], list[Outcome]]
-_UNKNOWN_WORKERS = 64  # workers [1] of an executor that does not say how many it has, a cluster's
+UNKNOWN_WORKERS = 64
+"""Workers [1] of an executor that does not say how many it has, or of a cluster that may grow: more make chunks so
+small that each costs more to send than to compute, fewer leave workers idle."""
 
 
 def run_in_executor(
@@ -24,7 +26,7 @@ def run_in_executor(
     count: int,
 ) -> Outcomes:
     """Evaluate cases in an executor and yield each outcome as it comes; parameters as of `run_in_processes`."""
-    workers = int(getattr(executor, "_max_workers", None) or _UNKNOWN_WORKERS)
+    workers = int(getattr(executor, "_max_workers", None) or UNKNOWN_WORKERS)
     queue, task = CaseQueue(cases, count, workers), _make_task(executor, fn, parameters)
     running: dict[Future[list[Outcome]], Chunk] = {}
     try:

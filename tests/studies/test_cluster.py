@@ -7,6 +7,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -78,6 +79,10 @@ def test_the_table_is_the_same_wherever_it_is_computed(functions: ModuleType, da
         serial = sweep(functions.spectrum, RIG, cases, executor=one)
     assert 0 < (serial["error"] != "").sum() < 32
     assert np.isfinite(serial["norm"]).sum() > 32
+    workers: Any = dask
+    assert workers._max_workers == sum(
+        workers._client.nthreads().values()
+    )  # which makes chunks as large as they may be
     for executor in (Processes(1), Processes(2), dask):
         assert_identical(sweep(functions.spectrum, RIG, cases, executor=executor), serial)
 
