@@ -1,9 +1,14 @@
-"""`DesignSearch`: blocks of an excitation by exchange, then refined whole; what is best is an `ExperimentDesign`."""
+"""`DesignSearch`: blocks of an excitation by exchange, then refined whole; what is best is an `ExperimentDesign`.
+
+A short run is simulated in a fraction of the time: the search also begins with a quarter of the duration, whose
+information counts four times. Where that does better, it is refined, played twice in a row, and refined again.
+"""
 
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +26,10 @@ from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
 from pneuopt.shooting.budget import CpuBudget
 
-BLOCKS = 8  # of a run: more are refined longer, fewer make poorer mixtures
+BLOCKS = 8  # of the shortest run: more are refined longer, fewer make poorer mixtures
+MOST_REPEATS = 4  # times that the shortest run fits into the duration: more make runs without slow motions
+BEGIN_SHARE = 0.08  # of the time [1] for each of the lengths a search begins with: less tells them apart wrongly
+PART_SHARE = 0.6  # of the time left [1] for a part of the run: more leaves none to mend what its repetition spoils
 MIN_BLOCK_SAMPLES = 50  # of a block: shorter ones hold no slow motion
 VARIATIONS = 12  # of a block at once, in SIMD lanes: more are better and take longer
 SPREADS = (0.5, 0.2, 0.08)
@@ -76,13 +84,15 @@ class DesignSearch:
     rng: np.random.Generator
     budget: CpuBudget
     progress: ProgressReporter
+    repeats: int = 1  # times that the run's information counts
+    _parts: "dict[int, DesignSearch]" = field(default_factory=dict)
     tried: int = 0
     substeps: int = MIN_SUBSTEPS
 
     def design(self) -> ExperimentDesign:
         """Choose blocks, refine the runs, and predict what they tell."""
         self.substeps = max(self.run.stable_substeps(p) for p in self.plants)
-        chosen = self._refine([self._fit_into_limits(blocks) for blocks in self._choose_blocks()])
+        chosen = self._find_blocks()
         signals = np.stack([self._signal(blocks) for blocks in chosen])
         nominal, fine = self.plants[0], 2 * self.substeps
         shown = self.run.simulate(signals, nominal, fine)
@@ -94,9 +104,9 @@ class DesignSearch:
         table = tabulate_design(nominal, self.run.free, self.judge.targets, self.known, gained)
         origin = self.run.origin
         steps = tuple(tuple(b.describe(self.run.excitation.unit) for b in blocks) for blocks in chosen)
-        units = {q.name: q.unit for q in self.run.channels}
+        units, tried = {q.name: q.unit for q in self.run.channels}, sum(s.tried for s in (self, *self._parts.values()))
         before, after = (float(self.judge.deviation(f[None])) for f in (self.known, self.known + gained))
-        figures = {"before": before, "after": after, "tried": float(self.tried), "origin": origin}
+        figures = {"before": before, "after": after, "tried": float(tried), "origin": origin}
         figures |= {"plants": float(len(self.plants)), "cpu_seconds": self.budget.seconds}
         return ExperimentDesign(
             self.run.excitation.name,
@@ -109,6 +119,37 @@ class DesignSearch:
             figures,
             units,
         )
+
+    def _find_blocks(self) -> list[list[Block]]:
+        """The blocks of all runs, found in the whole duration or in a part of it, whichever has begun better."""
+        whole = self._begin()
+        search, runs = self, whole
+        if (part := self._part(MOST_REPEATS)) is not self:
+            with suppress(InputError):  # a part may allow no wave, or end where the next one breaks a limit
+                begun = part._begin()
+                if part._figure(begun) < self._figure(whole):
+                    search, runs = part, begun
+        try:
+            while search is not self:
+                runs = search._refine(runs, self.budget.part(PART_SHARE))
+                search = self._part(search.repeats // 2)
+                runs = search._fit_into_limits([blocks * 2 for blocks in runs])
+        except InputError:
+            runs = whole
+        return self._refine(min(runs, whole, key=self._figure), self.budget)
+
+    def _begin(self) -> list[list[Block]]:
+        """Blocks of the library, refined for a while."""
+        return self._refine(self._fit_into_limits(self._choose_blocks()), self.budget.part(BEGIN_SHARE))
+
+    def _part(self, repeats: int) -> "DesignSearch":
+        """The search for runs that are so many times shorter; this one where they would be too short."""
+        samples = self.samples // repeats
+        if repeats == 1 or samples < BLOCKS * MIN_BLOCK_SAMPLES:
+            return self
+        coarse = -(-self.substeps // 2)
+        part = replace(self, samples=samples, repeats=repeats, substeps=coarse, tried=0)
+        return self._parts.setdefault(repeats, part)
 
     @cached_property
     def _grid(self) -> Array:
@@ -159,24 +200,32 @@ class DesignSearch:
         ordered = sorted(picked, key=lambda i: waves[i].amplitude)
         return [[waves[i] for i in ordered[r :: self.runs]] for r in range(self.runs)]
 
-    def _fit_into_limits(self, blocks: list[Block]) -> list[Block]:
-        """The blocks in a row, all made smaller until the whole run keeps the limits."""
+    def _fit_into_limits(self, runs: list[list[Block]]) -> list[list[Block]]:
+        """The blocks of each run in a row, all made smaller until the whole run keeps the limits."""
+        return [self._shrink(blocks) for blocks in runs]
+
+    def _shrink(self, blocks: list[Block]) -> list[Block]:
         sizes = np.geomspace(1.0, 1e-3, 25)
         rows = [[replace(b, amplitude=b.amplitude * size) for b in blocks] for size in sizes.tolist()]
         _, keeps = self._evaluate(np.stack([self._signal(row) for row in rows]))
         require(bool(keeps.any()), "the blocks of a run, one behind the other, keep no limits; plan a shorter duration")
         return rows[int(np.argmax(keeps))]
 
-    def _refine(self, runs: list[list[Block]]) -> list[list[Block]]:
+    def _figure(self, runs: list[list[Block]]) -> float:
+        """The criterion after these runs."""
+        gains = self._evaluate(np.stack([self._signal(blocks) for blocks in runs]))[0]
+        return float(self.judge.deviation(self.known + gains.sum(axis=1)))
+
+    def _refine(self, runs: list[list[Block]], budget: CpuBudget) -> list[list[Block]]:
         """Change the runs by chance, far and near in turn, and keep what is better within the limits."""
         every = self._evaluate(np.stack([self._signal(blocks) for blocks in runs]))[0]
         best = float(self.judge.deviation(self.known + every.sum(axis=1)))
         fastest = max(CYCLES_A_SAMPLE / self.run.sample_time, 2 / self._grid[-1])
         ends, quiet = (1 / float(self._grid[-1]), fastest), 0
-        while quiet < QUIET_CYCLES and not self.budget.is_spent:
+        while quiet < QUIET_CYCLES and not budget.is_spent:
             before = best
-            for spread, r in itertools.product(SPREADS, list(range(self.runs)) * (ROUNDS_A_SPREAD * self._blocks)):
-                if self.budget.is_spent:
+            for r, spread in itertools.product(list(range(self.runs)) * (ROUNDS_A_SPREAD * len(runs[0])), SPREADS):
+                if budget.is_spent:
                     break
                 others = self.known + every.sum(axis=1) - every[:, r]
                 tried = [vary_run(runs[r], self.rng, spread, self._reach, ends, self._waves) for _ in range(VARIATIONS)]
@@ -210,7 +259,7 @@ class DesignSearch:
         for i, (rows, found) in shown.items():
             kept = keeps[rows]
             gains[i, rows[kept]] = self.run.information(found[kept], self.plants[i], self.substeps)
-        return gains, keeps
+        return self.repeats * gains, keeps
 
     def _signal(self, blocks: Sequence[Block]) -> Array:
         return np.clip(join_blocks(blocks, self._grid), *self._reach)

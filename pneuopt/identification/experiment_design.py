@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 REACHED_ROOM = (
     0.02  # share of a limit's width [1] within which it counts as active: less misses what a sample just missed
 )
+SHOWN_BLOCKS = 8  # of a run [1], in its summary: more fill a screen, and a controller plays the file
 USEFUL_RATIO = 1.5  # times that a target's interval shrinks [1], below which the run is hardly worth its time
 
 
@@ -199,7 +200,8 @@ class ExperimentDesign(Result):
         out = [Line(f"{self.channel} begins at {start}; about that, each block as long as the others:")]
         for k, blocks in enumerate(self.blocks, 1):
             lead = f"run {k}: " if len(self.blocks) > 1 else ""
-            out.append(Line(lead + "; ".join(blocks), indent=2))
+            more = f"; and {len(blocks) - SHOWN_BLOCKS} more" if len(blocks) > SHOWN_BLOCKS else ""
+            out.append(Line(lead + "; ".join(blocks[:SHOWN_BLOCKS]) + more, indent=2))
         return out
 
 

@@ -33,12 +33,12 @@ def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int 
         So many parameters, the first ones, are each log's own; k are the others.
     """
     m, count, n, width = ends.shape
-    found, follows = np.zeros((m, width, width)), list[Array]()
-    for j in range(count):
-        found = found + grams[:, j]
-        if j < count - 1:
-            found, response = _advance(found, ends[:, j], 1 / jumps**2)
-            follows.append(response)
+    gaps, follows = _gap_information(ends[:, :-1], 1 / jumps**2), list[Array]()
+    found = grams[:, 0]
+    for j in range(count - 1):
+        ahead, response = _advance(found, gaps[:, j], n)
+        follows.append(response)
+        found = ahead + grams[:, j + 1]
     last = n + eliminated
     response = _respond(found, last)
     bread = found[:, last:, last:] + np.swapaxes(found[:, :last, last:], 1, 2) @ response
@@ -53,23 +53,28 @@ def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int 
     return _symmetric(bread @ _scaled_inverse(meat, UNINFORMED) @ bread)
 
 
-def _advance(information: Array, move: Array, weight: Array) -> tuple[Array, Array]:
+def _gap_information(ends: Array, weight: Array) -> Array:
+    """What each gap tells about its two nodes' states and the parameters, shape (..., 2 n + w, 2 n + w).
+
+    In nominal sizes: x_next = ends (x, p) + w, with w of variances 1 / `weight`, shape (n,).
+    """
+    n = len(weight)
+    slopes = np.concatenate([ends[..., :n], np.broadcast_to(-np.eye(n), (*ends.shape[:-1], n)), ends[..., n:]], axis=-1)
+    out = (np.swapaxes(slopes, -1, -2) * weight) @ slopes
+    place = np.arange(n)
+    out[..., place, place] += STATE_RIDGE
+    return np.asarray(out)
+
+
+def _advance(information: Array, gap: Array, n: int) -> tuple[Array, Array]:
     """The information about the next node's state and the parameters from that about this node's, shape (m, k, k).
 
-    And how this node's state follows those, shape (m, n_states, k). In nominal sizes: x_next = move (x, p) + w,
-    with w of variances 1 / `weight`, shape (n_states,).
+    And how this node's state follows those, shape (m, n, k); `gap` is of `_gap_information`.
     """
-    nx = len(weight)
-    own, by_p = move[:, :, :nx], move[:, :, nx:]
-    heavy = np.swapaxes(own, 1, 2) * weight
-    inner = information[:, :nx, :nx] + heavy @ own + STATE_RIDGE * np.eye(nx)
-    mixed = np.concatenate([-heavy, information[:, :nx, nx:] + heavy @ by_p], axis=2)
-    out = np.zeros_like(information)
-    out[:, :nx, :nx] = np.diag(weight)
-    out[:, :nx, nx:] = -weight[:, None] * by_p
-    out[:, nx:, :nx] = np.swapaxes(out[:, :nx, nx:], 1, 2)
-    out[:, nx:, nx:] = information[:, nx:, nx:] + (np.swapaxes(by_p, 1, 2) * weight) @ by_p
-    response = -np.linalg.solve(inner, mixed)
+    out, mixed = gap[:, n:, n:].copy(), gap[:, :n, n:].copy()
+    out[:, n:, n:] += information[:, n:, n:]
+    mixed[:, :, n:] += information[:, :n, n:]
+    response = np.asarray(-np.linalg.solve(gap[:, :n, :n] + information[:, :n, :n], mixed), dtype=np.float64)
     return _symmetric(out + np.swapaxes(mixed, 1, 2) @ response), response
 
 

@@ -33,6 +33,10 @@ class CpuBudget:
         """Whether no time is left."""
         return time.process_time() >= self._end
 
+    def part(self, share: float) -> "CpuBudget":
+        """A budget of this share [1] of the time that is left."""
+        return CpuBudget(max(share * (self._end - time.process_time()), 1e-9))
+
     def check(self) -> None:
         """Raise `BudgetSpentError` if no time is left."""
         if self.is_spent:

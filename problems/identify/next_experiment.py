@@ -1,14 +1,13 @@
 """The next experiment: the run that tells most about friction, beside a usual log of the same duration.
 
-    python problems/identify/next_experiment.py [--cpu-seconds 600] [--json FILE] [--out DIR]
+    python problems/identify/next_experiment.py [--cpu-seconds 120] [--json FILE] [--out DIR]
 
 Two cases: the bristles of B32 (LuGre; position and pressures logged, sampled position loop, beside the reference of the
 benchmark's log), and an axis like the EMPS (published values, force and position logged, position loop within its force
 and speed, beside smooth moves to and fro within the same limits). The usual log is identified first; a third of its
 standard errors is what the planned run shall reach. That run is simulated tightly, with noise, and identified likewise.
 Rows *.achieved.*: standard error by the fit over the predicted one; *.narrower.*: that of the usual log over the
-planned run's. The axis takes half a minute; the bristles end at the time that is given, as their search goes on gaining
-for minutes (in 60 s they come to some twice narrower).
+planned run's. Both searches end at the time that is given, and would go on gaining.
 """
 
 import sys
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEP, SEED = 1e-3, 1
-NARROWER, CPU_SECONDS = 3, 600.0  # times that intervals shall shrink [1]; of a search [s]
+NARROWER, CPU_SECONDS = 3, 120.0  # times that intervals shall shrink [1]; of a search [s]
 BRISTLES = ("friction.bristle_stiffness", "friction.bristle_damping")
 AXIS = {"load.mass": 95.1, "load.force": -3.16, "friction.coulomb": 20.4, "friction.viscous": 203.5}
 B32_GAINS = {"pid.Kp": 4.0, "pid.Kd": 0.15, "pid.Tf": 3e-3, "pid.lower": -0.6, "pid.upper": 0.6, "pid.c": 0.0}

@@ -13,6 +13,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.results import load_result
+from pneuopt.identification import design_search
 from pneuopt.identification.criteria import AOptimal, DOptimal, Precision, WantedPrecision
 from pneuopt.identification.experiment_design import ExperimentDesign
 from pneuopt.identification.identify import identify
@@ -130,6 +131,22 @@ def test_an_exact_model_of_a_log_that_often_turns_is_not_taken_for_a_wrong_one()
     truth = np.array([KNOWN.value(n) for n in found.index])
     assert ((found["value"] - truth).abs() < 4 * found["stderr"]).all(), found
     assert (found["stderr"] < 0.1 * truth).all()
+
+
+def test_a_search_that_begins_with_a_part_of_the_run_ends_no_worse_than_one_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def planned(repeats: int) -> ExperimentDesign:
+        monkeypatch.setattr(design_search, "MOST_REPEATS", repeats)
+        return next_experiment(
+            *(LOOP, KNOWN.freed(*FREE)), duration=3.4, limits=LIMITS, noise=NOISE, plants={}, cpu_seconds=1e-6
+        )
+
+    whole, parts = planned(1), planned(4)
+    assert parts.stats["tried"] > whole.stats["tried"]
+    assert parts.stats["after"] <= whole.stats["after"] * (1 + 1e-9)
+    assert len(parts.runs[0].t) == 1700
+    assert all(room <= 0 for room in parts.room.values())
 
 
 def test_what_a_fit_knows_counts_and_its_noise_is_taken() -> None:
