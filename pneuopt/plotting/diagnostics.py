@@ -67,7 +67,7 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
         grid[0], ("residuals", "autocorrelation", "correlation with inputs", "distribution"), strict=True
     ):
         axes.set_title(title, fontsize=10)
-    for axes, label in zip(grid[-1], ("time [s]", "lag [samples]", "lag [samples]", ""), strict=True):
+    for axes, label in zip(grid[-1], ("time [s]", "lag [samples]", "lag [samples]"), strict=False):
         axes.set_xlabel(label)
     note_omissions(figure, len(shown), len(channels), "channels")
     return figure
@@ -185,7 +185,7 @@ def _draw_distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experimen
     x = np.linspace(-edge, edge, 200)
     axes.plot(x, np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi), color=ORANGE, lw=1.2)
     axes.set_yticks([])
-    axes.set_ylabel(label, fontsize=8)
+    axes.set_xlabel(label)
 
 
 def _correlogram(e: Array, other: Array) -> Array:

@@ -24,9 +24,10 @@ from pneuopt.plotting import (
     plot_residuals,
 )
 from pneuopt.quantities.errors import ConvergenceError, InputError
-from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.report import Line, Report, Table, Tone, number_columns, text_columns
 from pneuopt.quantities.status import report_status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
 from pneuopt.report.data import data_section, provenance_section
 from pneuopt.report.page import Page, Picture, Section
 
@@ -95,6 +96,7 @@ def fit_page(
         _residual_section(result, experiments),
         Section("Simulated and fitted again", () if trial is None else (trial,)),
         _finding_section(findings),
+        _known_section(result),
         data_section((*experiments, *held_out), noise=_counted_noise(result)),
         provenance_section(result.provenance, {**source.hashes, **_hashes(held_out)}),
     )
@@ -161,6 +163,16 @@ def _estimate_section(result: IdentificationResult) -> Section:
         caption = "Correlation of the estimates; near 1 or -1 the logs tell little more than a combination of two."
         parts.append(Picture(partial(plot_correlation, result), alt, caption))
     return Section("Estimates", tuple(parts))
+
+
+def _known_section(result: IdentificationResult) -> Section:
+    """What the estimates stand on: the values that were given."""
+    found = {*result.estimates.index, *(width.name for width in result.widths)}
+    given = {n: q for n, q in result.parameters.items() if n not in found}
+    rows = tuple((n, write_value(q.value, q.unit, 6), q.source) for n, q in given.items())
+    lead = Line("not estimated: as the files state them, or by default")
+    heads = *text_columns("parameter"), *number_columns("value"), *text_columns("source")
+    return Section("Known values", (Report((lead, Table(heads, rows))),) if rows else ())
 
 
 def _agreement_section(result: IdentificationResult, experiments: Sequence[Experiment]) -> Section:

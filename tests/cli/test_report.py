@@ -49,7 +49,8 @@ def test_a_fit_has_its_page(folder: Path) -> None:
     assert "wrote page.html" in result.stdout
     read = page()
     assert verdict(read).startswith("converged: ")
-    assert headings(read) == ["Estimates", "Agreement with the logs", "Friction", "Residuals", "Data", "Provenance"]
+    wanted = ["Estimates", "Agreement with the logs", "Friction", "Residuals", "Known values", "Data", "Provenance"]
+    assert headings(read) == wanted
     for words in ("load.mass", "friction.coulomb", "95 % interval", "run_01", "run_02", "drive.toml"):
         assert words in read.text, words
     hashes = [words for tag, words in read.words if tag == "td" and len(words) == 64]

@@ -84,7 +84,7 @@ def test_residuals_show_what_is_left_in_them() -> None:
         (told,) = own.texts
         assert told.get_text().startswith("Ljung-Box p")
         assert ("< 1e-4" in told.get_text()) is expected
-        assert spread.get_ylabel() == "residual / noise"
+        assert (spread.get_xlabel(), spread.get_ylabel()) == ("residual / noise", "")
     with pytest.raises(InputError, match="1 runs do not match 2 experiments"):
         plot_residuals([run], [good, bad])
 

@@ -53,7 +53,9 @@ def test_a_fit_alone_has_tables_and_no_figure_of_its_logs(
 ) -> None:
     po.write_report(fit[0], tmp_path / "fit.html")
     read = read_page(tmp_path / "fit.html")
-    assert headings(read) == ["Estimates", "Agreement with the logs", "Provenance"]
+    assert headings(read) == ["Estimates", "Agreement with the logs", "Known values", "Provenance"]
+    assert "load.force 0 N" in read.text, "what was given"
+    assert "load.mass 5 kg" not in read.text, "a start is not"
     assert len(read.named("figure")) == 1, "the correlation"
 
 
@@ -63,7 +65,8 @@ def test_a_held_out_log_is_predicted(fit: tuple[IdentificationResult, Experiment
     po.write_report(result, tmp_path / "a.html", title="A & B", model=drive, experiments=log, held_out=[log])
     read = read_page(tmp_path / "a.html")
     assert ("h1", "A & B") in read.words
-    wanted = ["Estimates", "Agreement with the logs", "Held-out runs", "Friction", "Residuals", "Data", "Provenance"]
+    wanted = ["Estimates", "Agreement with the logs", "Held-out runs", "Friction", "Residuals", "Known values"]
+    wanted += ["Data", "Provenance"]
     assert headings(read) == wanted
     with pytest.raises(InputError, match="held-out logs are predicted with the model"):
         po.write_report(result, tmp_path / "b.html", held_out=log)
