@@ -41,7 +41,7 @@ from scipy.optimize import differential_evolution
 
 import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
-from pneuopt.plotting import BLUE, GREY, axes_grid
+from pneuopt.plotting import BLUE, GREY, RED, axes_grid, legend_above
 from pneuopt.tuning.race import Race
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.shade import SuccessHistory, first_population
@@ -285,15 +285,25 @@ PICKS: dict[str, Callable[[list[float]], float]] = {"best": min, "median": lambd
 
 
 def figure(study: Study) -> "Figure":
-    """Certified settling times of every seed, by method."""
-    picture, ((*all_axes,),) = axes_grid(1, len(study.runs), (3.2,), width=4.0 * len(study.runs))
+    """Certified settling times of every seed, by method; a cross at the top has no certificate."""
+    picture, (all_axes,) = axes_grid(1, len(study.runs), (3.2,), width=1.5 + 3.5 * len(study.runs))
     for axes, (row, methods) in zip(all_axes, study.runs.items(), strict=True):
-        for number, (method, runs) in enumerate(methods.items()):
-            times = [1e3 * r.settling_time for r in runs if r.settling_time < inf]
-            axes.plot([number] * len(times), times, "o", ms=4, color=BLUE if method == "racing" else GREY, alpha=0.6)
-        axes.axhline(1e3 * study.reference[row], color="k", lw=0.8, ls="--") if study.reference[row] < inf else None
-        axes.set(ylabel="certified settling time [ms]", title=row.replace("_", " gains, "), yscale="log")
-        axes.set_xticks(range(len(methods)), list(methods), rotation=60, fontsize=7)
+        top = 1.03e3 * max(r.settling_time for runs in methods.values() for r in runs if r.settling_time < inf)
+        for label, marker, colour, is_shown in (
+            ("racing", "o", BLUE, lambda m, r: m == "racing" and r.settling_time < inf),
+            ("rivals, with the same CPU time", "o", GREY, lambda m, r: m != "racing" and r.settling_time < inf),
+            ("without certificate", "x", RED, lambda _, r: r.settling_time == inf),
+        ):
+            runs = [(k, r) for k, (m, own) in enumerate(methods.items()) for r in own if is_shown(m, r)]
+            times = [min(1e3 * r.settling_time, top) for _, r in runs]
+            axes.plot([k for k, _ in runs], times, marker, ms=5, color=colour, alpha=0.7, label=label)
+        if study.reference[row] < inf:
+            axes.axhline(1e3 * study.reference[row], color="k", lw=0.8, ls="--", label="best design known")
+        axes.set_title(row.replace("_", " gains, "), fontsize=10)
+        axes.set_xticks(range(len(methods)), [m.removesuffix(".x1") for m in methods], rotation=30, ha="right")
+        axes.margins(x=0.12)
+    all_axes[0].set_ylabel("certified settling time [ms]")
+    legend_above(picture, all_axes[0])
     return picture
 
 

@@ -29,7 +29,7 @@ import numpy as np
 import pneuopt as po
 from pneuopt.evaluation.requirements import requirement_values
 from pneuopt.evaluation.specification import Specification, specify
-from pneuopt.plotting import BLUE, GREY, axes_grid
+from pneuopt.plotting import BLUE, GREY, RED, axes_grid, legend_above
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from problems.shared import random_problems
@@ -251,10 +251,12 @@ def figure(rows: "pd.DataFrame") -> "Figure":
     labels = [k.replace("_", "\n") for k in kinds]
     axes.bar(labels, solved, color=BLUE, label="solved")
     axes.bar(labels, refused, bottom=solved, color=GREY, label="refused")
-    axes.bar(labels, wrong, bottom=solved, color="tab:red", label="refused, though brute force finds a design")
+    axes.bar(labels, wrong, bottom=solved, color=RED, label="refused, though brute force finds a design")
     axes.set(ylabel="problems")
-    axes.tick_params(axis="x", labelsize=7)
-    axes.legend(frameon=False, fontsize=8)
+    axes.yaxis.get_major_locator().set_params(integer=True)
+    axes.tick_params(axis="x", labelsize=8)
+    axes.grid(False, axis="x")
+    legend_above(picture, axes)
     return picture
 
 
