@@ -50,7 +50,7 @@ def test_the_readmes_commands_and_edits_are_seen() -> None:
     assert [name for name, _ in jobs] == ["$"] * len(jobs)
     assert {words.split()[1] for _, words in jobs} == {"check", "identify", "tune", "simulate", "study", "export"}
     assert [words.split()[1] for name, words in own if name == "$"] == [
-        "init", "check", "identify", "init", "simulate", "tune", "study",
+        "init", "check", "identify", "init", "simulate", "tune", "study", "export",
     ]  # fmt: skip
     assert {name for name, _ in own} == {"$", "run_01.toml", "run_02.toml", "drive.toml", "study.toml"}
 
