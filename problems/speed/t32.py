@@ -1,7 +1,7 @@
 """T32s, the tuning benchmark: what `tune`'s search finds, beside rivals that get the same CPU time, over ten seeds.
 
     python problems/speed/t32.py [--seeds N] [--rows NAME ...] [--rivals [NAME ...]] [--times K ...]
-                                  [--without-conditions] [--best] [--json FILE] [--out DIR]
+                                  [--without-conditions] [--json FILE] [--out DIR]
 
 The plant, its gains and what is asked for are those of problems/shared/t32.py: settling to 2 %, overshoot 5 %, Ms 2 at
 every operating point, settled beyond the horizon. "corners" are the eight of mass and friction +-30 % and supply
@@ -17,13 +17,11 @@ rival searches on coarse samples and reads margins only of candidates that its l
 already; the twenty best are read again on fine samples with steps half as long, and the best of them is its answer.
 
 Each answer is printed to four digits and certified; the worst over the plants counts, and a design without certificate
-counts as infinite. "reference" is the best design known (t32_best.toml, certified anew here); --best searches for a
-better one, with ten times the trials and every seed, and prints it.
+counts as infinite. "reference" is the best design that any method has found here.
 """
 
 import sys
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -55,10 +53,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 SEEDS, FIRST_SEED = 3, 20  # the shares and patience of `Racing` were chosen on lower seeds
-BEST = Path(__file__).parents[1] / "shared" / "t32_best.toml"
 TIMES = (1,)  # CPU time of the rivals, over racing's
 REREAD = 20  # points of a rival that are read again on fine samples
-MORE_TRIALS = 10  # of the search for the best design, over racing's own
 OWN: dict[str, Any] = {"popsize": 4, "strategy": "randtobest1bin", "mutation": (0.3, 0.9), "recombination": 0.9}
 BOUNDS = {
     "5_corners.racing.within_5_percent": ">= 90",
@@ -79,10 +75,13 @@ class Run:
 
 @dataclass
 class Study:
-    """Runs by row and method, one a seed, and the best design known of each row, certified [s]."""
+    """Runs by row and method, one a seed."""
 
     runs: dict[str, dict[str, list[Run]]] = field(default_factory=dict)
-    reference: dict[str, float] = field(default_factory=dict)
+
+    def reference(self, row: str) -> float:
+        """The certified settling time of the best design that any method has found for a row [s]."""
+        return min(r.settling_time for runs in self.runs[row].values() for r in runs)
 
 
 class OutOfTimeError(Exception):
@@ -162,7 +161,6 @@ def run(
     study = Study()
     for name in names:
         search = prepare(name, spec, po.Racing())
-        study.reference[name] = known_best(search, name)
         for method, seed, result in compete(search, seeds, rivals, times):
             study.runs.setdefault(name, {}).setdefault(method, []).append(result)
             print(
@@ -198,9 +196,9 @@ def compete(
                 yield f"{rival}.x{times}", seed, certified(search, best_of(search, RIVALS[rival], limit, seed), limit)
 
 
-def with_seed(search: Search, seed: int, more_trials: int = 1) -> Search:
-    """The search with other random numbers, and more trials, on the same warm simulator."""
-    return search.with_specification(search.spec, po.Racing(seed=seed, trials=more_trials * po.Racing().trials))
+def with_seed(search: Search, seed: int) -> Search:
+    """The search with other random numbers, on the same warm simulator."""
+    return search.with_specification(search.spec, po.Racing(seed=seed))
 
 
 def tight(search: Search) -> Specification:
@@ -233,39 +231,16 @@ def certified(search: Search, point: Array, seconds: float) -> Run:
     return Run(time_, float(worst["Overshoot"]), float(worst["MaxSensitivity"]), seconds)
 
 
-def known_best(search: Search, name: str) -> float:
-    """The certified settling time of the best design known; inf where there is none, or it has no certificate [s]."""
-    key = name if search.spec.concerns(po.MaxSensitivity) else f"{name}_without_conditions"
-    known = tomllib.loads(BEST.read_text(encoding="utf-8")).get(key) if BEST.exists() else None
-    if known is None:
-        return inf
-    return certified(search, np.array([known[n] for n in search.space.names]), 0.0).settling_time
-
-
-def find_best(names: list[str], seeds: int, spec: Specification) -> None:
-    """Search with ten times the trials and every seed, and again about the best; print the design."""
-    for name in names:
-        search = prepare(name, spec, po.Racing())
-        points = [search.space.start]
-        for seed in range(seeds):
-            more = with_seed(search, seed, MORE_TRIALS)
-            points.append(more.find(search.method.margin, points[0], 0).point)
-        runs = [certified(search, point, 0.0).settling_time for point in points]
-        best = search.space.round_point(points[int(np.argmin(runs))], search.method.digits or 4)
-        print(f"[{name}]  # {min(runs):.5f} s; all: {' '.join(f'{r:.4f}' for r in runs)}")
-        print("\n".join(f'"{n}" = {v:.6g}' for n, v in zip(search.space.names, best.tolist(), strict=True)), flush=True)
-
-
 def main(study: Study) -> "DataFrame":
     claims = []
     for row, methods in study.runs.items():
-        reference = min(study.reference[row], *(r.settling_time for runs in methods.values() for r in runs))
+        reference = study.reference(row)
         claims.append(Claim(f"{row}.reference", reference, "s"))
         for method, runs in methods.items():
             times = [r.settling_time for r in runs]
             claims += [Claim(f"{row}.{method}.{label}", pick(times), "s") for label, pick in PICKS.items()]
             for name, share in (("within_2_percent", 1.02), ("within_5_percent", 1.05)):
-                value = 100 * float(np.mean([t <= share * reference for t in times]))
+                value = 100 * float(np.mean([t <= share * reference < inf for t in times]))
                 claims.append(
                     Claim(f"{row}.{method}.{name}", value, "% of seeds", None, BOUNDS.get(f"{row}.{method}.{name}", ""))
                 )
@@ -288,17 +263,22 @@ def figure(study: Study) -> "Figure":
     """Certified settling times of every seed, by method; a cross at the top has no certificate."""
     picture, (all_axes,) = axes_grid(1, len(study.runs), (3.2,), width=1.5 + 3.5 * len(study.runs))
     for axes, (row, methods) in zip(all_axes, study.runs.items(), strict=True):
-        top = 1.03e3 * max(r.settling_time for runs in methods.values() for r in runs if r.settling_time < inf)
-        for label, marker, colour, is_shown in (
-            ("racing", "o", BLUE, lambda m, r: m == "racing" and r.settling_time < inf),
-            ("rivals, with the same CPU time", "o", GREY, lambda m, r: m != "racing" and r.settling_time < inf),
-            ("without certificate", "x", RED, lambda _, r: r.settling_time == inf),
+        certified_times = [r.settling_time for runs in methods.values() for r in runs if r.settling_time < inf]
+        top = 1.03e3 * max(certified_times, default=STEP.horizon)
+        points = [(k, m == "racing", r.settling_time) for k, (m, runs) in enumerate(methods.items()) for r in runs]
+        for label, style, colour, chosen in (
+            ("racing", "o", BLUE, [(k, t) for k, is_ours, t in points if is_ours and t < inf]),
+            (
+                "rivals, with the same CPU time",
+                "o",
+                GREY,
+                [(k, t) for k, is_ours, t in points if not is_ours and t < inf],
+            ),
+            ("without certificate", "x", RED, [(k, t) for k, _, t in points if t == inf]),
         ):
-            runs = [(k, r) for k, (m, own) in enumerate(methods.items()) for r in own if is_shown(m, r)]
-            times = [min(1e3 * r.settling_time, top) for _, r in runs]
-            axes.plot([k for k, _ in runs], times, marker, ms=5, color=colour, alpha=0.7, label=label)
-        if study.reference[row] < inf:
-            axes.axhline(1e3 * study.reference[row], color="k", lw=0.8, ls="--", label="best design known")
+            times = [min(1e3 * t, top) for _, t in chosen]
+            axes.plot([k for k, _ in chosen], times, style, ms=5, color=colour, alpha=0.7, label=label)
+        axes.axhline(min(1e3 * study.reference(row), top), color="k", lw=0.8, ls="--", label="best found")
         axes.set_title(row.replace("_", " gains, "), fontsize=10)
         axes.set_xticks(range(len(methods)), [m.removesuffix(".x1") for m in methods], rotation=30, ha="right")
         axes.margins(x=0.12)
@@ -318,11 +298,7 @@ if __name__ == "__main__":
     )
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), help="which rows of the study")
     parser.add_argument("--without-conditions", action="store_true", help="ask for no Ms")
-    parser.add_argument("--best", action="store_true", help="search for the best designs, and print them")
     options = parser.parse_args()
     asked = specify(MINIMISE, [OVERSHOOT] if options.without_conditions else [OVERSHOOT, SENSITIVITY])
-    if options.best:
-        find_best(options.rows, options.seeds, asked)
-        sys.exit(0)
     study = run(options.rows, options.seeds, asked, options.rivals, options.times)
     sys.exit(finish(main(study), options, lambda: {"t32": figure(study)}))

@@ -243,6 +243,8 @@ def _violations(simulator: Simulator, spec: Specification, unit: Array) -> Array
 
 def figure(rows: "pd.DataFrame") -> "Figure":
     """By kind, how many problems were solved and refused, and how many refusals brute force contradicts."""
+    from matplotlib.ticker import MaxNLocator
+
     picture, ((axes,),) = axes_grid(1, 1, (3.4,), width=9.0)
     kinds = list(dict.fromkeys(rows["kind"]))
     solved = [int(((rows["kind"] == k) & (rows["outcome"] == "solved")).sum()) for k in kinds]
@@ -253,7 +255,7 @@ def figure(rows: "pd.DataFrame") -> "Figure":
     axes.bar(labels, refused, bottom=solved, color=GREY, label="refused")
     axes.bar(labels, wrong, bottom=solved, color=RED, label="refused, though brute force finds a design")
     axes.set(ylabel="problems")
-    axes.yaxis.get_major_locator().set_params(integer=True)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.tick_params(axis="x", labelsize=8)
     axes.grid(False, axis="x")
     legend_above(picture, axes)
