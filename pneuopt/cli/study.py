@@ -106,7 +106,7 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     tables |= {} if checks is None else {"checks": records(checks)}
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
     drawn = partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics)
-    page = partial(case_page, study, report, drawn, written, metrics)
+    page = partial(case_page, study, report, drawn, written, metrics, (task.loop, parameters))
     finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
     if journal is not None and stopped is None:
         journal.delete()

@@ -8,7 +8,7 @@ from pneuopt.cli.computing import Computing, keep_cases
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import Outputs, Writers, file_hashes, finish, read_fit_and_tuning, warn_of_status
 from pneuopt.cli.show_studies import lead_report, table_writer
-from pneuopt.cli.study_pages import sensitivity_page
+from pneuopt.cli.study_pages import Design, sensitivity_page
 from pneuopt.cli.terminal import progress
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.report import metric_units
@@ -55,13 +55,13 @@ def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Comp
             progress=report_progress,
             journal=journal,
         )
-    status = _write(study, outputs, found, slopes)
+    status = _write(study, outputs, found, slopes, (task.loop, parameters))
     if journal is not None and status != EXIT_INTERRUPTED:
         journal.delete()
     return status
 
 
-def _write(study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSensitivity | None) -> int:
+def _write(study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSensitivity | None, design: Design) -> int:
     """Show and write what was found; returns the exit status."""
     verdict, status = _verdict(found.cases)
     report = lead_report(verdict, status) + found.summary()
@@ -76,7 +76,7 @@ def _write(study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSens
     tables["provenance"] = file_hashes(study.path, study.drive, study.tuning)
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
     drawn = partial(plot_sensitivity, found, slopes)
-    page = partial(sensitivity_page, study, report, drawn)
+    page = partial(sensitivity_page, study, report, drawn, design)
     finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
     return status
 

@@ -61,12 +61,16 @@ function readMetrics(run, p, reference) {
   return { SettlingTime: settled - reference.at, Overshoot: 100 * over, PeakControl: peak };
 }
 
+function quantity(slider, value) {
+  return `${format(value * slider.scale)}${slider.unit === "1" ? "" : " " + slider.unit}`;
+}
+
 function tuningText(p) {
   const sections = {};
   for (const slider of DATA.sliders) {
     const [section, name] = slider.name.split(".");
     if (!DATA.controller.includes(section)) continue;
-    (sections[section] ||= []).push(`${name} = "${format(p[slider.place])}${slider.unit === "1" ? "" : " " + slider.unit}"`);
+    (sections[section] ||= []).push(`${name} = "${quantity(slider, p[slider.place])}"`);
   }
   return Object.entries(sections).map(([name, lines]) => [`[${name}]`, ...lines].join("\n")).join("\n");
 }
@@ -127,7 +131,7 @@ function startPage() {
     const input = element("input", { type: "range", min: "0", max: "1", step: "0.001", "aria-label": slider.name });
     const set = (value) => {
       p[slider.place] = value;
-      shown.textContent = `${format(value)}${slider.unit === "1" ? "" : " " + slider.unit}`;
+      shown.textContent = quantity(slider, value);
     };
     slider.reset = () => {
       input.value = sliderShare(slider, DATA.values[slider.place]);

@@ -13,6 +13,7 @@ from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.report import relevant_units
 from pneuopt.export.javascript import write_loop_javascript
 from pneuopt.models.load import GRAVITY
+from pneuopt.plotting.canvas import PLOT_UNITS
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.report.live_rest import RestFinder, is_refused
@@ -151,7 +152,8 @@ def _slider(finders: Sequence[RestFinder], parameters: ParameterSet, name: str) 
         return None
     is_log = low > 0 and high / low > LOG_RANGE
     place = list(loop.parameters).index(name)
-    return {"name": name, "place": place, "unit": p.unit, "low": low, "high": high, "isLog": is_log}
+    scale, unit = PLOT_UNITS.get(p.unit, (1.0, p.unit))  # a pressure in bar, as everywhere on the page
+    return {"name": name, "place": place, "scale": scale, "unit": unit, "low": low, "high": high, "isLog": is_log}
 
 
 def _runnable_end(finders: Sequence[RestFinder], name: str, value: float, end: float) -> float:

@@ -180,7 +180,8 @@ def test_a_study_has_its_page(folder: Path) -> None:
     result = run("study", "study.toml", "--report", "page.html", "--executor", "1", "-q")
     read = page()
     assert verdict(read) == result.stdout.splitlines()[0]
-    assert headings(read) == ["Cases", "Provenance"]
+    assert headings(read) == ["Cases", "The design", "Provenance"]
+    assert "pid.Kp 100 N*s/m" in read.text, "the gains that all cases share"
     assert len(read.named("figure")) == 1
 
 

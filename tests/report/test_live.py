@@ -180,6 +180,16 @@ def test_what_is_copied_is_read_back(folder: Path) -> None:
     assert read_tuning(folder / "copied.toml", loop.plant).parameters.value("pid.Ki") == 5000.0
 
 
+@needs_node
+def test_a_pressure_is_shown_in_bar(tmp_path: Path) -> None:
+    loop, p = t32_loop()
+    script = live_script(loop, [Step(0.2)], p)
+    (supply,) = (s for s in live_data(script)["sliders"] if s["name"] == "supply.pressure")
+    assert supply["low"] < p.value("supply.pressure") < supply["high"], "its ends stay in SI units"
+    shown = f"quantity({to_script(supply)}, 7.013e5)"
+    assert run_script(f"{script}console.log(JSON.stringify({shown}));", tmp_path) == "7.013 bar(a)"
+
+
 def test_a_load_force_has_a_slider_and_hardware_has_none() -> None:
     loop, p = axis_loop()
     data = live_data(live_script(loop, [STEP], p))
