@@ -18,7 +18,7 @@ from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import LeastSquares
 
-QUIET_CHECKS = ("sampling",)
+QUIET_CHECKS = ("sampling", "dwells")
 """Checks whose notes are no doubts of the log: they would stand in the status of every fit."""
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from pneuopt.logs.checks.balance import check_mass, check_offset
+from pneuopt.logs.checks.dwells import check_dwells
 from pneuopt.logs.checks.end_stops import check_end_stops
 from pneuopt.logs.checks.findings import PISTON, LogFinding, StatedAxis
 from pneuopt.logs.checks.jumps import check_jumps
@@ -39,7 +40,8 @@ def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFindi
         the pressures, brake the motion on balance, which no drive does; the piston runs against the valve's command, or
         to and fro without one; it jumps, or rests at a stop that the model lacks; force and acceleration are those of
         another mass than is stated; a pressure is a vacuum, or above the supply.
-        Then notes: a constant force that is not stated; jitter, a clipped sensor, a coarse resolution.
+        Then notes: a constant force that is not stated; jitter, a clipped sensor, a coarse resolution; of an axis that
+        stands still most of the time, which share is motion.
 
     Examples
     --------
@@ -104,6 +106,7 @@ CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {
     "offset": check_offset,
     "pressures": check_pressures,
     "sampling": check_sampling,
+    "dwells": check_dwells,
 }
 """The checks by the names under which a user accepts what they find: a log that is right all the same."""
 SINGLE_SAMPLE_CHECKS = ("motion", "jumps", "sampling")

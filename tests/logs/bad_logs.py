@@ -41,6 +41,22 @@ def jumped() -> Experiment:
     return only(swing(position=RIGHT["position"] + 0.05 * ((T > 1.5) & (T < 1.6))), "position", "force")
 
 
+def dwelling() -> Experiment:
+    """Four moves of 60 mm to and fro, each within .25 s of a second; while it stands, force and pressures hold it."""
+    rng, phase = np.random.default_rng(3), np.clip(4 * (T % 1.0), 0.0, 1.0)
+    side = np.where(T % 2.0 < 1.0, 1.0, -1.0)
+    v = side * 0.24 * (1 - np.cos(2 * np.pi * phase))
+    x = 0.1 + np.cumsum(v) * 1e-3
+    push = 30 * np.where(phase < 1.0, side, 0.4 * side) + 60 * v + 2.65 * np.gradient(v, T)
+    return swing(
+        position=x + 1e-5 * rng.standard_normal(T.size),
+        speed=v + 1e-3 * rng.standard_normal(T.size),
+        force=push,
+        pressure_a=5e5 + 5e2 * push + 1e3 * rng.standard_normal(T.size),
+        pressure_b=4.5e5 - 5e2 * push + 1e3 * rng.standard_normal(T.size),
+    )
+
+
 RIGHT = swing().trajectory
 BAD_LOGS = {
     "motion": only(swing(position=0.1 + 1e-5 * np.random.default_rng(1).standard_normal(T.size)), "position", "force"),
@@ -54,6 +70,7 @@ BAD_LOGS = {
     "offset": swing(force=RIGHT["force"] + 20.0),
     "pressures": only(swing(pressure_b=RIGHT["pressure_b"] - 4.3e5), "position", "pressure_b"),
     "sampling": only(swing(position=np.round(RIGHT["position"] / 5e-3) * 5e-3), "position"),
+    "dwells": dwelling(),
 }
 """By the name of the check."""
 STATED = {"mass": PISTON._replace(inertia=10.0), "offset": PISTON._replace(constant=0.0, offset_parameter="load.force")}

@@ -14,7 +14,7 @@ from pneuopt.logs.noise import noise_level
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
-from tests.logs.bad_logs import BAD_LOGS, STATED, T, swing
+from tests.logs.bad_logs import BAD_LOGS, STATED, T, dwelling, swing
 
 DATA = Path(__file__).parents[2] / "data"
 
@@ -52,6 +52,25 @@ def test_every_check_has_a_log_that_trips_it_alone_and_shows_why() -> None:
         inside = (shown.t >= shown.view[0]) & (shown.t <= shown.view[1])
         assert shown.contradiction[inside].any(), name
         assert all(curve.shape == shown.t.shape for panel in shown.panels for curve in panel.curves.values()), name
+
+
+def test_a_log_of_moves_and_dwells_says_what_share_is_motion() -> None:
+    """No check takes a dwell for a fault, whatever is logged of it."""
+    for channels in (("position",), ("speed",), ("position", "force"), ("position", "pressure_a", "pressure_b")):
+        (finding,) = examine(BAD_LOGS["dwells"].select(channels))
+        assert (finding.fault, finding.check, finding.channel) == (False, "dwells", channels[0])
+        shown = re.search(r"moves in (\d+)% of the log, (.*) of 4 s, in 4 moves, and stands", finding.message)
+        assert shown is not None, finding.message
+        assert int(shown[1]) == pytest.approx(24, abs=4)
+        assert float(shown[2]) == pytest.approx(0.01 * int(shown[1]) * 4, abs=0.03)
+
+
+def test_a_counted_position_does_not_move_while_its_last_count_flickers() -> None:
+    log, count = dwelling().select(["position"]), 1e-4
+    x = log.trajectory["position"] + 2e-5 * np.sin(211.0 * T)
+    coarse = replace(log, trajectory=log.trajectory.with_columns({"position": count * np.round(x / count)}), noise={})
+    (finding,) = (f for f in examine(coarse) if f.check == "dwells")
+    assert "in 4 moves" in finding.message
 
 
 def thinned(log: Experiment, every: int) -> Experiment:

@@ -6,8 +6,8 @@ def test_drawn_logs_are_right_and_spoilt_ones_are_refused() -> None:
     """The first seeds that are short, of every kind of motion; the script draws a hundred of any length."""
     logs = [log for log in map(draw_log, range(36)) if len(log.experiment.trajectory) < 20_000]
     assert {log.kind for log in logs} == {"one way", "sine", "sines", "strokes", "rests", "hunting"}
-    found = [f.check for log in logs for f in examine(log.experiment, log.axis) if f.check != "sampling"]
-    assert found == []
+    found = [(f.check, log.kind) for log in logs for f in examine(log.experiment, log.axis) if f.check != "sampling"]
+    assert set(found) <= {("dwells", "rests")}  # a note, and true
     slow = [
         log for log in logs if log.kind != "one way" and log.frequency < 2 and len(log.experiment.trajectory) < 5000
     ]
