@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 
@@ -9,13 +10,14 @@ from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.control.reference import Reference
+from pneuopt.control.reference import Reference, Step
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.counts import describe_counts, sees_speed
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.margins import frequency_response
+from pneuopt.evaluation.motion_requirements import FollowingError
 from pneuopt.evaluation.move_check import check_motion
 from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
 from pneuopt.evaluation.response import highest_dither_frequency
@@ -24,6 +26,7 @@ from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.units import write_value
 from pneuopt.tuning.space import Space
 
 # Frequencies at which the sign of the plant's static gain is read [rad per horizon]. A high one may meet phase lag that
@@ -48,13 +51,15 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
     Raises
     ------
     InputError
-        If a limit lies beyond the horizon, the dither cannot be sampled, the settling band is below half a count of an
-        encoder, the stroke is too short for a reference or the drive too weak for a move, no command holds it, or none
-        that the limits allow, or all gains allowed have the wrong sign.
+        If a limit lies beyond the horizon, settling and following error contradict each other, the dither cannot be
+        sampled, the settling band is below half a count of an encoder, the stroke is too short for a reference or the
+        drive too weak for a move, no command holds it, or none that the limits allow, or all gains allowed have the
+        wrong sign.
     """
     _check_dither(loop, space)
     for case in cases:
         _check_horizon(case.reference, spec)
+        _check_following(case, loop, spec)
     _check_noise(loop, space, spec)
     for case in cases:
         _check_counts(loop, case, space, spec)
@@ -81,6 +86,25 @@ def _check_horizon(reference: Reference, spec: Specification) -> None:
     first = min((t for t, _, _ in spec.envelope), default=0.0)
     message = f"StepEnvelope begins {first:g} s after the step, the record of reference {reference.label} ends after"
     require(first < record, f"{message} {record:g} s; lengthen its horizon, or let the bounds begin earlier")
+
+
+def _check_following(case: TuningCase, loop: ClosedLoop, spec: Specification) -> None:
+    """Check that a signal as near to the reference as its following error allows can settle as early as asked."""
+    most, reference, unit = spec.limit(FollowingError), case.reference, loop.feedback.unit
+    if not most < inf or not reference.changes:
+        return
+    shown, prefix = write_value(most, unit, 3), _case_prefix(case)
+    size = write_value(abs(reference.size), unit, 3)
+    told = (
+        f"{prefix}FollowingError: max {shown} is less than the step of {size}, its error at once; follow a move instead"
+    )
+    require(not isinstance(reference, Step) or most >= abs(reference.size), told)
+    asked = min(spec.limit(SettlingTime), reference.horizon - reference.at)
+    left = float(abs(reference.final - reference.values(np.array([reference.at + asked]))[0]))
+    half = band_share(spec.band, reference) * abs(reference.nominal_size)
+    told = f"{prefix}SettlingTime: max {asked:g} s comes when the reference still lacks {write_value(left, unit, 3)}"
+    room = f"more than the band and FollowingError's max {shown}; raise one of them, or speed and acceleration"
+    require(left <= half + most, f"{told}, {room}")
 
 
 def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:

@@ -10,11 +10,14 @@ import pytest
 
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference, Step
 from pneuopt.control.sensor import Encoder
+from pneuopt.evaluation.band import Tolerance
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.evaluate import respond
+from pneuopt.evaluation.motion_requirements import FollowingError
 from pneuopt.evaluation.requirements import (
     IAE,
     NoiseGain,
@@ -59,7 +62,7 @@ def lag(gain: float = 1.0) -> tuple[ClosedLoop, ParameterSet]:
 
 def refusal(
     model: tuple[ClosedLoop, ParameterSet],
-    step: Step,
+    step: Reference,
     limits: Sequence[Requirement] = (),
     minimise: Requirement | None = None,
 ) -> str:
@@ -184,6 +187,24 @@ def test_a_band_below_half_a_count_is_refused() -> None:
     check((loop, given, step), SettlingTime(band=0.025))
     finer = given | ParameterSet({"sensor.resolution": replace(given["sensor.resolution"], value=8e-4)})
     check((loop, finer, step), SettlingTime(band=0.02))
+
+
+def test_settling_before_the_reference_may_is_refused() -> None:
+    """Half way, at 25 ms, a move of 20 mm lacks 10 mm, which band and following error have to make up for."""
+    loop, given, step = counted()
+    move = Move(0.02, speed=1.0, acceleration=32.0, dwell=0.4)
+    assert move.values(np.array([0.025]))[0] == pytest.approx(0.01)
+    band = Tolerance(1e-3)
+    words = refusal((loop, given), move, [SettlingTime(band, max=0.025), FollowingError(8e-3)], IAE())
+    assert (
+        "reference 0 to 0.02 in 0.05 s: SettlingTime: max 0.025 s comes when the reference still lacks 10 mm" in words
+    )
+    assert "more than the band and FollowingError's max 8 mm; raise one of them, or speed and acceleration" in words
+    space = search_space(loop, given)
+    spec = specify(IAE(), [SettlingTime(band, max=0.025), FollowingError(9.1e-3)])
+    check_feasibility(loop, cases([move], NO_SCENARIOS, space.parameters, space.names), space, spec)
+    words = refusal((loop, given), step, [FollowingError(5e-3)], SettlingTime(band=0.05))
+    assert "FollowingError: max 5 mm is less than the step of 20 mm, its error at once; follow a move instead" in words
 
 
 def test_the_band_that_is_named_is_wide_enough() -> None:
