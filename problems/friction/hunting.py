@@ -12,7 +12,10 @@ Rows coulomb.*: no static friction beyond Coulomb's; what error is left fades as
 static.*: 1.5 times, gone within 1 mm/s. Rows gentle.*: the same 1.5 times, but falling so gently, over .2 m/s, that
 viscous friction covers it: the statement is about the fall, and not about the two levels. Rows dead_band.*: the PIDs of
 static.* whose integral has a dead band as wide as the largest error of their hunting: they rest, and leave an error.
-Rows without_integral.*: likewise, with Ki = 0.
+Rows without_integral.*: likewise, with Ki = 0. Rows reset_*: five of the PIDs, those that 5 ms sample fast enough, on
+each of the three frictions, with an integral that is reset where the error turns its sign: none breaks away once more
+in the second half of a minute. On a static friction that falls at once it is still pushed then, some tenths of a
+millimetre from the reference, and will slip again after minutes.
 """
 
 import sys
@@ -43,10 +46,15 @@ FRICTIONS: Mapping[str, dict[str, float]] = {
     "gentle": {"friction.static": 45.0, "friction.stribeck_velocity": 0.2},
 }
 SPEEDS, DAMPINGS, SHARES = (5.0, 40.0), (0.5, 1.2), (0.1, 1.0)  # [rad/s], of the pair, third pole over its speed
+# [s] of the PIDs with a reset, which is decided once a sample: the first of those whose filter is as slow; the share of
+# the integral that a reset keeps.
+SAMPLE_TIME, RESET_COUNT, RESET_RATIO = 5e-3, 5, 0.5
 SHOWN = 4  # which PID is drawn: one that hunts some ten times a minute
 BOUNDS = {
     "coulomb.hunting": "<= 0", "coulomb.largest_error": "<= 0.1", "static.hunting": ">= 30", "gentle.hunting": "<= 0",
     "gentle.largest_error": "<= 0.1", "dead_band.resting": ">= 30", "without_integral.resting": ">= 30",
+    "reset_coulomb.slips": "<= 0", "reset_static.slips": "<= 0", "reset_gentle.slips": "<= 0",
+    "reset_coulomb.largest_error": "<= 1", "reset_static.largest_error": "<= 1", "reset_gentle.largest_error": "<= 1",
 }  # fmt: skip
 
 
@@ -65,6 +73,8 @@ def run(count: int = COUNT) -> Job:
     bands = [{"pid.dead_band": 1.01 * end.error} for end in found["static"]]
     found["dead_band"] = [watch(g | static | band) for g, band in zip(gains, bands, strict=True)]
     found["without_integral"] = [watch(g | static | {"pid.Ki": 0.0}) for g in gains]
+    slow = [g for g in gains if g["pid.Tf"] >= SAMPLE_TIME][:RESET_COUNT]
+    found |= {f"reset_{name}": [watch_reset(g | friction) for g in slow] for name, friction in FRICTIONS.items()}
     return Job(found, gains)
 
 
@@ -81,9 +91,9 @@ def random_pids(count: int) -> Iterator[dict[str, float]]:
         yield {"pid.Kp": Kp, "pid.Ki": Ki, "pid.Kd": Kd, "pid.Tf": Tf}
 
 
-def axis() -> po.ClosedLoop:
+def axis(pid: po.PID | None = None) -> po.ClosedLoop:
     drive = po.ForceDrive(po.Karnopp(po.Stribeck()))
-    return po.ClosedLoop(drive.system(), po.PID(limits=False, dead_band=True), measured="position")
+    return po.ClosedLoop(drive.system(), pid or po.PID(limits=False, dead_band=True), measured="position")
 
 
 def watch(values: Mapping[str, float]) -> po.RestCase:
@@ -96,12 +106,21 @@ def watch(values: Mapping[str, float]) -> po.RestCase:
     return end
 
 
+def watch_reset(values: Mapping[str, float]) -> po.RestCase:
+    """A minute with an integral that is reset."""
+    loop = axis(po.PID(SAMPLE_TIME, limits=False, reset=True))
+    p = loop.parameters.with_values({**BODY, **values, "pid.reset_ratio": RESET_RATIO})
+    return po.check_rest(loop, STEP, p, duration=MINUTE).cases[0]
+
+
 def main(job: Job) -> "DataFrame":
     claims = []
     for name, ends in job.found.items():
         hunting = [end for end in ends if end.kind is po.RestKind.HUNTS]
         claims.append(Claim(f"{name}.hunting", len(hunting), f"of {len(ends)}"))
         claims.append(Claim(f"{name}.resting", sum(end.kind is po.RestKind.RESTS for end in ends), f"of {len(ends)}"))
+        if name.startswith("reset_"):
+            claims.append(Claim(f"{name}.slips", sum(end.slips for end in ends)))
         claims.append(Claim(f"{name}.largest_error", 1e3 * max(abs(end.error) for end in ends), "mm"))
         if hunting:
             periods = [end.period for end in hunting]

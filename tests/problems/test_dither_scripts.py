@@ -82,6 +82,15 @@ def test_hunting(tmp_path: Path) -> None:
     hunting.figure(hunting.Job(ends, [gains])).savefig(tmp_path / "hunting.png")
 
 
+@pytest.mark.slow
+def test_a_reset_ends_hunting_for_a_minute() -> None:
+    gains = next(g for g in hunting.random_pids(hunting.COUNT) if g["pid.Tf"] >= hunting.SAMPLE_TIME)
+    ends = {f"reset_{n}": [hunting.watch_reset(gains | friction)] for n, friction in hunting.FRICTIONS.items()}
+    rows = hunting.main(hunting.Job(ends, [gains])).set_index("name")
+    assert list(rows["value"][[f"{n}.slips" for n in ends]]) == [0, 0, 0]
+    assert rows["holds"].all()
+
+
 def test_force_loop(tmp_path: Path) -> None:
     """Gains by hand: the dither makes the force finer, the integral does not."""
     plain = {"pid.Kp": 5e-3, "dead_zone_inverse.smoothing": 2e-3}
