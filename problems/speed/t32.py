@@ -265,25 +265,25 @@ def figure(study: Study) -> "Figure":
     for axes, (row, methods) in zip(all_axes, study.runs.items(), strict=True):
         certified_times = [r.settling_time for runs in methods.values() for r in runs if r.settling_time < inf]
         top = 1.03e3 * max(certified_times, default=STEP.horizon)
-        points = [(k, m == "racing", r.settling_time) for k, (m, runs) in enumerate(methods.items()) for r in runs]
+        points = [
+            (k + 0.1 * (i - 0.5 * (len(runs) - 1)), m == "racing", r.settling_time)
+            for k, (m, runs) in enumerate(methods.items())
+            for i, r in enumerate(runs)
+        ]
+        rivals = [(x, t) for x, is_ours, t in points if not is_ours and t < inf]
         for label, style, colour, chosen in (
-            ("racing", "o", BLUE, [(k, t) for k, is_ours, t in points if is_ours and t < inf]),
-            (
-                "rivals, with the same CPU time",
-                "o",
-                GREY,
-                [(k, t) for k, is_ours, t in points if not is_ours and t < inf],
-            ),
-            ("without certificate", "x", RED, [(k, t) for k, _, t in points if t == inf]),
+            ("racing", "o", BLUE, [(x, t) for x, is_ours, t in points if is_ours and t < inf]),
+            ("rivals, the same CPU time", "o", GREY, rivals),
+            ("without certificate", "x", RED, [(x, t) for x, _, t in points if t == inf]),
         ):
             times = [min(1e3 * t, top) for _, t in chosen]
-            axes.plot([k for k, _ in chosen], times, style, ms=5, color=colour, alpha=0.7, label=label)
+            axes.plot([x for x, _ in chosen], times, style, ms=5, color=colour, alpha=0.7, label=label)
         axes.axhline(min(1e3 * study.reference(row), top), color="k", lw=0.8, ls="--", label="best found")
         axes.set_title(row.replace("_", " gains, "), fontsize=10)
         axes.set_xticks(range(len(methods)), [m.removesuffix(".x1") for m in methods], rotation=30, ha="right")
         axes.margins(x=0.12)
     all_axes[0].set_ylabel("certified settling time [ms]")
-    legend_above(picture, all_axes[0])
+    legend_above(picture, all_axes[0], columns=2 if len(study.runs) == 1 else 4)
     return picture
 
 
