@@ -136,7 +136,7 @@ def _guess_kind(table: Table) -> str:
         return "rotary"
     pressures = {"pressure_a", "pressure_b"} & found.keys()
     if "valve_voltage" in found and (pressures or "force" not in found):
-        return "pneumatic" if pressures else "linear"
+        return _PNEUMATIC if pressures or ("position" in found and "speed" not in found) else "linear"
     message = f"{table.path}: its columns do not say what drives the load; say it before --from"
     require("force" in found, f"{message}: pneuopt init KIND, one of {', '.join(first_kinds())}")
     return "force"
@@ -190,6 +190,7 @@ def _show_files(
             if column.channel in unused:
                 text = f"left out, column {column.column!r}: this kind of drive does not use it"
             say(f"{column.channel}: {text}", "  ")
+        _advise_command(guess, unused)
         if guess.unused:
             say(f"not read: {', '.join(guess.unused)}", "  ")
         say(f"a row every {write_value(guess.sample_time, 's')}", "  ")
@@ -201,6 +202,15 @@ def _show_files(
     typer.echo(f"  pneuopt identify drive.toml {place} -o fit.toml")
     typer.echo("  pneuopt tune fit.toml tuning.toml -o tuned.toml")
     typer.echo("What a key means: pneuopt keys KEY")
+
+
+def _advise_command(guess: LogGuess, unused: Container[str]) -> None:
+    """How a voltage that was left out becomes the force or torque that the log lacks."""
+    found = {column.channel: column.column for column in guess.columns}
+    command, unit = ("force", "N") if "force" not in unused else ("torque", "N*m")
+    if "valve_voltage" in unused and "valve_voltage" in found and command not in found:
+        entry = f'{command} = {{ column = "{found["valve_voltage"]}", unit = "V", scale = "1 {unit}/V" }}'
+        say(f"{command}: no column; where the voltage commands it, [columns] takes {entry} with its scale", "  ")
 
 
 def say(text: str, indent: str = "") -> None:

@@ -76,6 +76,7 @@ def test_a_second_log_gets_its_sidecar_beside_files_that_were_edited(tmp_path: P
         ("t_ms;Kraft [N];U Ventil;x ist", "force"),
         ("t_ms;M [N*m]", "rotary"),
         ("t_ms;U Ventil;v [m/s]", "linear"),
+        ("t_ms;U Ventil;x ist", "pneumatic"),  # the linear kind reads no position
     ],
 )
 def test_a_log_says_what_drives_the_load(columns: str, kind: str, tmp_path: Path) -> None:
@@ -95,6 +96,18 @@ def test_a_channel_that_the_drive_does_not_use_is_left_out(tmp_path: Path) -> No
     system = drive.system()
     check_logs(system, read_log(log, plant=system), system.parameters)
     assert "valve_voltage = false" in log.with_suffix(".toml").read_text("utf-8")
+
+
+@pytest.mark.parametrize(("kind", "command", "scale"), [("force", "force", "1 N/V"), ("rotary", "torque", "1 N*m/V")])
+def test_a_voltage_beside_no_force_is_said_to_be_its_command(
+    kind: str, command: str, scale: str, tmp_path: Path
+) -> None:
+    log = write_foreign_log(tmp_path / "run.csv", "t_ms;U Ventil;x ist")
+    code, output = run("init", kind, "--from", str(log), "-o", str(tmp_path))
+    entry = f'{command} = {{ column = "U Ventil", unit = "V", scale = "{scale}" }}'
+    assert (code, entry in " ".join(output.split())) == (0, True), output
+    beside = write_foreign_log(tmp_path / "beside.csv", "t_ms;Kraft [N];U Ventil;x ist")
+    assert "commands it" not in run("init", "force", "--from", str(beside), "-o", str(tmp_path))[1]
 
 
 def test_a_log_that_does_not_is_met_with_a_question(tmp_path: Path) -> None:
