@@ -14,15 +14,16 @@ from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-PULSE_WIDTH, PAUSE = 0.02, 0.012  # [s] defaults: a valve's spool cannot follow shorter pulses, longer ones go too far
+PULSE_WIDTH, PAUSE = 0.018, 0.016  # [s] defaults: a valve's spool cannot follow shorter pulses, longer ones go too far
 LEAST_LIMIT, LEAST_TOLERANCE = 1e-9, 1e-12  # [command's unit, error's unit] by which is divided
 PULSE_TOLERANCE = 1e-4  # [error's unit] default: a tenth of a millimetre
 GROWTH, BRAKE = 1.1, 0.6  # [1] defaults: a larger growth arrives sooner, or beyond the reference; see `brake`
 SHARE = 0.5  # part of the error that a pulse shall take away: a larger one overshoots, a smaller one needs more pulses
-# Of the ratio of the way wanted to that of the last pulse. A force that rises and falls at a given rate moves a body
-# over (P - F)^3, F being the breakaway force; a peak of 1.4 F so has a slope of 10 in logarithms. A larger exponent
-# throws the body to and fro, a smaller one learns slowly.
-EXPONENT = 0.1
+# Exponents of the ratio of the way wanted to that of the last pulse, where the peak rises and where it falls. A force
+# that rises and falls at a given rate moves a body over (P - F)^3, F being the breakaway force: a peak of 1.2 F has a
+# slope of 18 in logarithms, one of 1.6 F of 8. With larger ones the body is thrown to and fro, with smaller ones the
+# peak learns slowly.
+RISE, FALL = 0.05, 0.15
 STILL = 0.2  # of the tolerance: changes of the error below count as standstill; an encoder's count must lie below
 LEAST_WAY = 0.06  # of the tolerance: a pulse that has moved less counts as one that has moved this far
 
@@ -36,10 +37,11 @@ class ImpulsiveControl:
     peak comes down to the breakaway force. When the reference has come to rest and the error e has stood still for
     `pause`, pulse k begins, with the peak ::
 
-        P_1 = amplitude,    P_k = P_(k-1) min(growth, (|e|/(2 way))^.1)
+        P_1 = amplitude,    P_k = P_(k-1) min(growth, (|e|/(2 way))^g)
 
-    where way is that of the pulse before, towards its target and at least .06 tolerance: the peaks grow until the body
-    moves, and then so that a pulse takes away half of the error. For n samples, ``n = width/h max(1, P/limit)``, is
+    where way is that of the pulse before, towards its target and at least .06 tolerance, and g is .05 where the peak
+    rises and .15 where it falls: it grows until the body moves, and then so that a pulse takes away half of the error.
+    For n samples, ``n = width/h max(1, P/limit)``, is
     added ``sign(e) min(P, limit) s`` with ``s = sin(2 pi (k + 1/2)/n)``, the half below zero times `brake`: a valve's
     command is the rate of the force, which so rises and falls again. Where the command is a force, brake is 0. A
     reference that moves ends a pulse, and the next rest begins with `amplitude` again.
@@ -141,6 +143,6 @@ def _next_peak(e: Any, last: Any, before: Any, p: Symbols) -> ca.SX:
     """The signed peak of a pulse that begins at the error e, from the last one (0: none) and the error before that."""
     way = ca.fmax((before - e) * ca.if_else(last < 0, -1, 1), LEAST_WAY * p["tolerance"])
     ratio = ca.fmax(SHARE * ca.fabs(e), LEAST_WAY * p["tolerance"]) / way
-    factor = ca.fmin(p["growth"], ca.exp(EXPONENT * ca.log(ratio)))
+    factor = ca.fmin(p["growth"], ca.exp(ca.if_else(ratio > 1, RISE, FALL) * ca.log(ratio)))
     size = ca.if_else(ca.fabs(last) <= 0, p["amplitude"], ca.fabs(last) * factor)
     return ca.if_else(e < 0, -size, size)

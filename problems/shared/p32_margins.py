@@ -15,7 +15,7 @@ from problems.shared.p32 import RESERVE, SAMPLE_TIME, SPEEDS, STROKE, drive
 
 MAX_SENSITIVITY = "MaxSensitivity"
 PLACES = (RESERVE, STROKE / 2, STROKE - RESERVE)  # [m]
-POINTS = 80  # frequencies of a decade and more: fewer miss a peak by more than a hundredth
+POINTS = 80  # frequencies: fewer miss a peak by more than a hundredth
 STANDING_MASS = 1e12  # [kg] that no pressure moves
 SLIDING = "exact_linearisation.sliding"
 LEAST_POLE = 1e-2  # [rad/s]; those of a piston that sticks lie below, at zero but for rounding
@@ -33,6 +33,8 @@ class Margins:
         What differs from the nominal one.
     speeds : tuple of float
         Of the steady motions, both ways [m/s].
+    points : int
+        Frequencies.
     """
 
     def __init__(
@@ -41,10 +43,11 @@ class Margins:
         parameters: po.ParameterSet,
         plants: Sequence[Mapping[str, float]],
         speeds: tuple[float, ...] = SPEEDS,
+        points: int = POINTS,
     ) -> None:
         self.loop, self.plants, self.speeds = loop, plants, speeds
         self.parameters = loop.complete(parameters)
-        self.omega = np.geomspace(1.0, 0.9 * np.pi / SAMPLE_TIME, POINTS)
+        self.omega = np.geomspace(1.0, 0.9 * np.pi / SAMPLE_TIME, points)
 
     @cached_property
     def _points(self) -> tuple[Array, Array, Array]:
@@ -76,24 +79,35 @@ class Margins:
 
     def peaks_of(self, each: Sequence[Mapping[str, float]]) -> Array:
         """The same of several sets of gains, a row each."""
+        return np.asarray(self._all(each).max(axis=1))
+
+    def plant_peaks(self, gains: Mapping[str, float]) -> Array:
+        """The same of each plant, shape (plants, 2)."""
+        return np.asarray(self._all([gains]).reshape(len(self.plants), -1, 2).max(axis=1))
+
+    def _all(self, each: Sequence[Mapping[str, float]]) -> Array:
+        """Ms of sliding and of sticking at each steady motion of each plant, shape (gains, motions, 2)."""
         (_, x, u), k = self._points, len(each)
         p = np.vstack([self._rows(gains) for gains in each])
         x, u = np.tile(x, (k, 1)), np.tile(u, (k, 1))
         if not self.loop.is_composed:  # no pressure is fed back: nothing answers a command that moves nothing
             sliding = self._alone(p, x[None], u[None], {MAX_SENSITIVITY})[MAX_SENSITIVITY]
-            return np.column_stack([sliding.reshape(k, -1).max(axis=1), np.ones(k)])
+            return np.stack([sliding.reshape(k, -1), np.ones((k, len(x) // k))], axis=-1)
         stuck = p.copy()
         stuck[:, list(self.loop.parameters).index("load.mass")] = STANDING_MASS
         loops = self._linearise(np.vstack([p, stuck]), np.vstack([x, x]), np.vstack([u, u])).loop
-        return np.asarray(self._peaks(*loops).reshape(2, k, -1).max(axis=2).T)
+        return np.moveaxis(self._peaks(*loops).reshape(2, k, -1), 0, -1)
 
     def _peaks(self, A: Array, B: Array, C: Array, D: Array) -> Array:
         """Ms of open loops on the grid of frequencies, shape (m,)."""
         poles = np.linalg.eigvals(A - B @ C / (1 + D))
         unstable = np.where(np.abs(poles) > LEAST_POLE, poles.real, -1.0).max(axis=1) > 0
-        s = 1j * self.omega[:, None, None, None] * np.eye(A.shape[-1])
-        opened = (C @ np.linalg.solve(s - A, np.broadcast_to(B, (len(s), *B.shape))))[..., 0, 0] + D[:, 0, 0]
-        return np.where(unstable, inf, np.maximum(np.abs(1 / (1 + opened)).max(axis=0), np.abs(1 / (1 + D[:, 0, 0]))))
+        direct, one = D[:, 0, 0], np.eye(A.shape[-1])
+        least = np.abs(1 + direct)
+        for w in self.omega:
+            opened = (C @ np.linalg.solve(1j * w * one - A, B.astype(complex)))[:, 0, 0] + direct
+            least = np.minimum(least, np.abs(1 + opened))
+        return np.where(unstable, inf, 1 / least)
 
     @cached_property
     def _linearise(self) -> ComposedLoops:

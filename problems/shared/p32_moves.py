@@ -26,6 +26,9 @@ class Profile:
     exponent : float
         The acceleration of a distance d is ``acceleration (d/longest)^exponent``, since short moves leave a controller
         less time.
+    short : float
+        By how much the motion ends before the distance, to which the reference then jumps: of a piston that is slow to
+        brake the error at the end is then still one that pulses forwards take away [m].
     """
 
     speed: float
@@ -33,10 +36,12 @@ class Profile:
     creep_speed: float
     creep_distance: float
     exponent: float = 0.0
+    short: float = 0.0
 
     def corners(self, distance: float) -> tuple[Array, Array]:
         """Instants at which the acceleration changes [s], and the speeds there [m/s], of a positive distance."""
         a = self.acceleration * (distance / max(DISTANCES)) ** self.exponent
+        distance -= self.short
         creep = min(self.creep_distance, distance / 2)
         slow = min(self.creep_speed, sqrt(a * distance))
         stop = slow**2 / (2 * a)

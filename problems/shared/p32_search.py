@@ -11,23 +11,30 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from problems.shared.arrays import Array
-from problems.shared.p32 import HARDWARE, MAX_OVERSHOOT, MAX_SENSITIVITY, SPEEDS, TOLERANCE, Trip, drive, plants, trips
+from problems.shared.p32 import HARDWARE, MAX_OVERSHOOT, MAX_SENSITIVITY, TOLERANCE, Trip, drive, plants, trips
 from problems.shared.p32_margins import Margins
 from problems.shared.p32_moves import Outing
 from problems.shared.p32_simulator import FastSimulator, Lane, Reading, read
 from problems.shared.p32_structures import Structure, gains
 
 # Costs [s] of what breaks a limit: of a tenfold error or overshoot, and of Ms. Smaller ones trade a limit for time.
-DECADE, SENSITIVITY = 0.4, 0.5
-MEAN = 0.1  # weight of the mean over all moves beside the worst: without it a search sees one move at a time
-HOPELESS = 3.0  # Ms from which on nothing is simulated
-DWELL = 0.6  # [s] after each move, in a search
+DECADE, SENSITIVITY = 3.0, 5.0
+RESERVE = 0.6  # of the overshoot's limit: a search sees some of the moves, on some of the plants
+MEAN = 0.3  # weight of the mean over all moves beside the worst: without it a search sees one move at a time
+HOPELESS, UNSTABLE = 3.0, 50.0  # Ms from which on nothing is simulated, and what that costs at least [s]
+DWELL = 0.8  # [s] after each move, in a search
+COARSE = 32  # frequencies of Ms in a search
 BATCH = 24  # candidates that are simulated together: more take memory, fewer time
 MEMBERS = 24
+SPREAD = 0.08  # standard deviation of the members about the start, in the unit cube
 AXES = ("load.mass", "friction.coulomb", "supply.pressure")
 NEVER, WORST = 1.5, 1e4  # [s] for a move that does not end, and the largest share of a limit that is told from others
-SEARCHED = (0, 4, 6, 8)  # the trips of a search: 10 mm at the beginning, 50 mm in the middle, 200 mm at both ends
-LIVELY = {"load.mass": 3.5, "friction.viscous": 56.0, "supply.pressure": 7.7e5}  # the plant with the largest Ms
+SEARCHED = (0, 1, 2, 4, 8)  # the trips of a search: 10 mm everywhere, 50 mm in the middle, 200 mm
+# The plants with the largest Ms where the loop is quick, and where it is slow.
+EXTREME = (
+    {"load.mass": 3.5, "friction.viscous": 56.0, "supply.pressure": 7.7e5},
+    {"load.mass": 3.5, "friction.viscous": 104.0, "supply.pressure": 6.3e5},
+)
 
 
 class OutOfTimeError(Exception):
@@ -59,7 +66,7 @@ class Task:
         loop, parameters = self.structure.loop(), self.structure.parameters()
         self.simulator = FastSimulator(loop, parameters)
         self.coarse = FastSimulator(loop, parameters, substeps=2)
-        self.margins = Margins(loop, parameters, [LIVELY], SPEEDS[-1:])
+        self.margins = Margins(loop, parameters, EXTREME, points=COARSE)
 
     def costs(self, points: Array) -> Array:
         """Costs of points of shape (m, n) [s], and the best kept."""
@@ -67,7 +74,7 @@ class Task:
             raise OutOfTimeError
         values = [self.structure.values(point) for point in np.clip(points, 0.0, 1.0)]
         peaks = np.nan_to_num(self.margins.peaks_of([gains(v) for v in values]).max(axis=1), nan=inf)
-        found = HOPELESS + np.minimum(peaks, 100.0)
+        found = UNSTABLE + np.minimum(peaks, 100.0)
         hopeful = np.flatnonzero(peaks < HOPELESS)
         for part in (hopeful[k : k + BATCH] for k in range(0, len(hopeful), BATCH)):
             found[part] = self._simulated([values[k] for k in part]) + SENSITIVITY * np.maximum(
@@ -109,32 +116,23 @@ class Task:
 def _cost(found: Reading) -> Array:
     """Cost of each move [s], shape (m, 2)."""
     late = np.where(np.isfinite(found.settling), found.settling, NEVER)
-    shares = (found.error / TOLERANCE, found.overshoot / MAX_OVERSHOOT)
+    shares = (found.error / TOLERANCE, found.overshoot / (RESERVE * MAX_OVERSHOOT))
     decades = sum(np.log10(np.clip(np.nan_to_num(share, nan=WORST), 1.0, WORST)) for share in shares)
     return np.asarray(late + DECADE * decades)
 
 
-def search(task: Task, seconds: float, *, seed: int = 0, start: Array | None = None) -> dict[str, float]:
-    """The best values that differential evolution finds in a CPU time [s]."""
+def search(task: Task, seconds: float, start: Mapping[str, float], *, seed: int = 0) -> dict[str, float]:
+    """The best values that differential evolution finds in a CPU time [s], from values given and from random points."""
     task.begun, task.limit = time.process_time(), seconds
-    n = len(task.structure.ranges)
-
-    def batch(unit: Array) -> Array:
-        return task.costs(np.atleast_2d(unit.T))
-
+    drawn = np.random.default_rng(seed)
+    n, half, at = len(task.structure.ranges), MEMBERS // 2, task.structure.point(start)
+    near = np.clip(at + SPREAD * np.vstack([np.zeros(n), drawn.standard_normal((half - 1, n))]), 0.0, 1.0)
     settings: dict[str, Any] = {"vectorized": True, "updating": "deferred", "maxiter": 10**9, "tol": 0, "atol": 0}
-    first = np.random.default_rng(seed).random((MEMBERS, n))
-    if start is not None:
-        first[: MEMBERS // 2] = np.clip(
-            start + 0.08 * np.random.default_rng(seed).standard_normal((MEMBERS // 2, n)), 0, 1
-        )
-        first[0] = start
+    settings |= {"init": np.vstack([near, drawn.random((MEMBERS - half, n))]), "polish": False, "seed": seed}
+    settings |= {"mutation": (0.3, 0.9), "recombination": 0.9, "strategy": "randtobest1bin"}
     solve: Any = differential_evolution
     with suppress(OutOfTimeError):
-        solve(
-            batch, [(0.0, 1.0)] * n, init=first, polish=False, seed=seed, mutation=(0.3, 0.9),
-            recombination=0.9, strategy="randtobest1bin", **settings,
-        )  # fmt: skip
+        solve(lambda unit: task.costs(np.atleast_2d(unit.T)), [(0.0, 1.0)] * n, **settings)
     assert task.point is not None
     return task.structure.values(task.point)
 

@@ -120,7 +120,7 @@ class FastSimulator:
     def run(self, lanes: Sequence[Lane], seed: int = 0) -> tuple[Array, Array]:
         """Positions [m] and speeds [m/s] of all lanes, shape (m, n), a sample a column; short outings end at rest."""
         columns = [q.name for q in self.loop.inputs]
-        known = {lane.outing: lane.outing.trajectory().matrix(columns) for lane in lanes}
+        known = {outing: outing.trajectory().matrix(columns) for outing in {lane.outing for lane in lanes}}
         n = max(len(rows) for rows in known.values())
         u = np.zeros((len(lanes), n, len(columns) + len(NOISY)))
         p = np.tile(self._base, (len(lanes), 1))

@@ -9,7 +9,7 @@ import numpy as np
 import pneuopt as po
 from problems.shared.arrays import Array
 from problems.shared.exact_linearisation import ExactLinearisation
-from problems.shared.p32 import COUNT, LIMIT, SAMPLE_TIME, drive
+from problems.shared.p32 import COUNT, LIMIT, SAMPLE_TIME, TOLERANCE, drive
 from problems.shared.p32_moves import Profile
 
 Range = tuple[float, float]
@@ -42,7 +42,7 @@ class Structure:
 
     def parameters(self) -> po.ParameterSet:
         """Of the loop on the nominal plant, with the fixed values."""
-        return self.loop().complete(drive()[1]).with_values({**COMMAND, **self.fixed})
+        return self.loop().complete(drive()[1]).with_values({**COMMAND, **gains(self.fixed)})
 
     def values(self, point: Array) -> dict[str, float]:
         """What a point of the unit cube stands for."""
@@ -59,7 +59,8 @@ class Structure:
         """Of its reference."""
         if self.step:
             return None
-        return Profile(**{n.removeprefix("move."): v for n, v in values.items() if n.startswith("move.")})
+        own = {**self.fixed, **values}
+        return Profile(**{n.removeprefix("move."): v for n, v in own.items() if n.startswith("move.")})
 
 
 def gains(values: Mapping[str, float]) -> dict[str, float]:
@@ -90,9 +91,15 @@ def linearisation() -> po.ClosedLoop:
     return _cascade(ExactLinearisation(drive()[1]), po.DeadZoneInverse())
 
 
-def adaptive_linearisation() -> po.ClosedLoop:
-    """The same, with a friction that is learned while the reference moves."""
-    return _cascade(ExactLinearisation(drive()[1], adapts=True), po.DeadZoneInverse())
+def impulsive() -> po.ClosedLoop:
+    """The same, with friction and mass that are learned on the way, and pulses where it stops outside the tolerance."""
+    return _cascade(ExactLinearisation(drive()[1], adapts=True), po.ImpulsiveControl(), po.DeadZoneInverse())
+
+
+def impulsive_feedback() -> po.ClosedLoop:
+    """The state feedback, with such pulses."""
+    parts = (po.MotionFeedforward(), po.FrictionFeedforward(), po.PressureFeedback())
+    return _cascade(*parts, po.ImpulsiveControl(), po.DeadZoneInverse())
 
 
 def pid() -> po.ClosedLoop:
@@ -101,40 +108,35 @@ def pid() -> po.ClosedLoop:
     return po.ClosedLoop(drive()[0].system(), loop, measured="position", sensor=po.Encoder(COUNT))
 
 
-INVERSE: dict[str, Range] = {"dead_zone_inverse.width": (0.05, 0.18), "dead_zone_inverse.smoothing": (2e-3, 0.2)}
+INVERSE: dict[str, Range] = {"dead_zone_inverse.width": (0.05, 0.3), "dead_zone_inverse.smoothing": (2e-3, 0.2)}
 OUTER: dict[str, Range] = {"position_loop.Kp": (3.0, 80.0), "sensor.filter": (3e-4, 5e-3)}
 PRESSURE: dict[str, Range] = {"pressure_feedback.gain": (1e-6, 4e-5), "pressure_feedback.time": (0.01, 2.0)}
 AHEAD: dict[str, Range] = {"motion_feedforward.speed": (0.8, 4.0), "motion_feedforward.acceleration": (1e-3, 0.3)}
 FRICTION: dict[str, Range] = {"friction_feedforward.level": (1e-3, 1.0), "friction_feedforward.smoothing": (1e-3, 0.1)}
+STATES = MOVE | {"pid.Kp": (0.5, 8.0)} | OUTER | AHEAD | FRICTION | PRESSURE | INVERSE
+EXACT = MOVE | {
+    "exact_linearisation.speed_gain": (10.0, 200.0),
+    "exact_linearisation.force_gain": (20.0, 400.0),
+    "exact_linearisation.friction": (1.0, 80.0),
+    "exact_linearisation.smoothing": (1e-4, 0.05),
+    "exact_linearisation.rise": (0.1, 1.5),
+} | OUTER | INVERSE  # fmt: skip
+LEARNS = {"exact_linearisation.adaptation": (100.0, 2e4), "exact_linearisation.mass_adaptation": (10.0, 2e4)}
+PULSES: dict[str, Range] = {"impulsive_control.amplitude": (0.5, 3.5), "impulsive_control.growth": (1.04, 1.2)}
+# No pulse comes within what the encoder can tell of the tolerance; a motion that ends short by twice the tolerance does
+# not pass the end where the piston is slow to brake, and leaves the rest to pulses.
+WITHIN = {"impulsive_control.tolerance": TOLERANCE - 2 * COUNT, "impulsive_control.limit": LIMIT}
+WITHIN |= {"move.short": 2 * TOLERANCE}
+BARE = {"pid.Kp": 0.0}  # what the exact linearisation commands is no part of a PID
 STRUCTURES: Mapping[str, Structure] = {
-    "state_feedback": Structure(
-        state_feedback, MOVE | {"pid.Kp": (0.5, 8.0)} | OUTER | AHEAD | FRICTION | PRESSURE | INVERSE
-    ),
+    "impulsive": Structure(impulsive, EXACT | LEARNS | PULSES, BARE | WITHIN),
+    "impulsive_feedback": Structure(impulsive_feedback, STATES | PULSES, WITHIN),
+    "state_feedback": Structure(state_feedback, STATES),
     "cascade": Structure(
         cascade,
         MOVE | {"pid.Kp": (0.5, 8.0), "pid.Ki": (0.1, 100.0), "motion_feedforward.speed": (0.8, 4.0)} | OUTER | INVERSE,
     ),
-    "linearisation": Structure(
-        linearisation,
-        MOVE
-        | {"exact_linearisation.speed_gain": (10.0, 200.0), "exact_linearisation.force_gain": (20.0, 400.0)}
-        | {"exact_linearisation.friction": (1.0, 80.0), "exact_linearisation.smoothing": (1e-4, 0.05)}
-        | {"exact_linearisation.rise": (0.1, 1.5)}
-        | OUTER
-        | INVERSE,
-        {"pid.Kp": 0.0},
-    ),
-    "adaptive": Structure(
-        adaptive_linearisation,
-        MOVE
-        | {"exact_linearisation.speed_gain": (10.0, 200.0), "exact_linearisation.force_gain": (20.0, 400.0)}
-        | {"exact_linearisation.friction": (1.0, 80.0), "exact_linearisation.smoothing": (1e-4, 0.05)}
-        | {"exact_linearisation.rise": (0.1, 1.5)}
-        | {"exact_linearisation.adaptation": (100.0, 2e4), "exact_linearisation.mass_adaptation": (10.0, 2e4)}
-        | OUTER
-        | INVERSE,
-        {"pid.Kp": 0.0},
-    ),
+    "linearisation": Structure(linearisation, EXACT, BARE),
     "pid": Structure(
         pid,
         {"pid.Kp": (1.0, 300.0), "pid.Ki": (0.1, 1000.0), "pid.Kd": (0.05, 20.0), "pid.Tf": (5e-4, 0.02)}

@@ -18,7 +18,7 @@ from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.trajectories import Trajectory
 
 H, COUNT = 1e-3, 1e-5  # [s, m]
-GIVEN = {"amplitude": 2.0, "limit": 2.5, "width": 8e-3, "pause": 3e-3, "tolerance": 1e-4, "growth": 1.2, "brake": 0.6}
+GIVEN = {"amplitude": 2.0, "limit": 2.5, "width": 8e-3, "pause": 3e-3, "tolerance": 1e-4, "growth": 1.1, "brake": 0.6}
 
 
 def pulses_by_hand(errors: Array, speeds: Array) -> tuple[Array, set[str]]:
@@ -36,8 +36,9 @@ def pulses_by_hand(errors: Array, speeds: Array) -> tuple[Array, set[str]]:
         if standing >= 3 and abs(e) > GIVEN["tolerance"]:
             way = (before - e) * np.sign(peak)
             ratio = 0.5 * abs(e) / max(way, 0.06 * GIVEN["tolerance"])
-            seen |= {"first"} if not peak else {"grows"} if ratio**0.1 > 1.2 else {"more"} if ratio > 1 else {"less"}
-            peak = float(np.sign(e)) * (abs(peak) * min(1.2, ratio**0.1) if peak else 2.0)
+            factor = ratio ** (0.05 if ratio > 1 else 0.15)
+            seen |= {"first"} if not peak else {"grows"} if factor > 1.1 else {"more"} if ratio > 1 else {"less"}
+            peak = float(np.sign(e)) * (abs(peak) * min(1.1, factor) if peak else 2.0)
             n = int(np.floor(8 * max(1.0, abs(peak) / 2.5) + 0.5))
             seen |= {"longer"} if n > 8 else set()
             wave = np.sin(2 * np.pi * (np.arange(n) + 0.5) / n)

@@ -9,6 +9,7 @@ import pneuopt as po
 from pneuopt.control.compensation import Instant
 from problems.shared.exact_linearisation import ExactLinearisation
 from problems.shared.p32 import SAMPLE_TIME, drive, fresh_plants, plants, trips
+from problems.shared.p32_margins import Margins
 from problems.shared.p32_moves import Outing, Profile
 from problems.shared.p32_search import Task, searched_plants
 from problems.shared.p32_simulator import FastSimulator, Lane, read
@@ -117,16 +118,33 @@ def test_the_linearisation_gives_the_force_the_rate_that_it_asks_for() -> None:
 
 
 @pytest.mark.slow
+def test_the_largest_ms_of_a_plant_is_among_all() -> None:
+    structure, known = STRUCTURES["state_feedback"], [{}, {"load.mass": 3.5}]
+    margins = Margins(structure.loop(), structure.parameters(), known, points=8)
+    each, values = margins.plant_peaks(GAINS), margins.peaks(GAINS)
+    assert each.shape == (2, 2)
+    assert tuple(each.max(axis=0)) == values
+    alone = Margins(structure.loop(), structure.parameters(), known[1:], points=8)
+    assert tuple(each[1]) == pytest.approx(alone.peaks(GAINS))
+
+
+@pytest.mark.slow
 def test_a_design_is_read_certified_and_drawn() -> None:
     structure = STRUCTURES[p32.WINNER]
     values = p32.designs()[p32.WINNER]
     found = p32.evaluate(structure, values, {"nominal": {}}, 1.0)
     rows = {claim.name: claim.value for claim in p32.rows("x", found)}
-    assert rows["x.standing"] == 100.0
-    assert rows["x.within"] < 1.2
-    job = p32.Job({p32.WINNER: found}, {}, {})
-    assert len(p32.main(job)) == len(rows)
+    assert rows["x.standing"] == rows["x.kept"] == 100.0
+    assert rows["x.within"] <= 0.1
+    assert found.sound.tolist() == [True]
+    bare = p32.evaluate(structure, {**values, **p32.WITHOUT["pulses"][1]}, {"nominal": {}}, 1.0)
+    assert not bare.kept.all()
+    job = p32.Job({p32.WINNER: found, "linearisation": found}, {"linearisation": found}, {"pulses": bare})
+    claims = p32.main(job).set_index("name")["value"]
+    assert claims["linearisation.slower"] == 1.0
+    assert claims["fresh.linearisation.plants"] == 100.0
+    assert claims["without.pulses.kept"] < 100.0
     assert p32.figure(job).axes
     task = Task(structure, {"nominal": {}})
-    assert max(task.margins.peaks(gains(values))) <= 2.0  # the Ms that the search reads; at 50 mm/s it is larger
+    assert max(task.margins.peaks(gains(values))) <= 2.0
     assert task.read(values).error.shape == (9, 2)
