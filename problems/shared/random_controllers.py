@@ -51,6 +51,7 @@ RANGES = {
     "width": (0.004, 0.02),
     "period": (0.02, 0.08),
     "filter": (0.0, 0.01),
+    "tolerance": (0.025, 0.1),  # beyond a count of the sensor, within the reference's steps
     **dict.fromkeys(("Kp_slope", "Kp_curve", "K_slope", "K_curve", "position_loop_Kp_slope"), (-0.5, 0.5)),
     **dict.fromkeys(("Kp_load", "K_load"), (-1.0, 1.0)),
     "load": (2.0, 9.0),
