@@ -14,15 +14,16 @@ and prints them for that file, from which all other runs read them; its head say
 
 A piston that sticks outside the tolerance lets go with 20 N too much, on air of 5.5 N/mm, and an integral or a gain so
 moves it further than .1 mm before the valve answers. A pulse ends whatever the piston does, and moves it the less the
-nearer its peak comes to the breakaway force, which the next pulses learn.
+nearer its peak comes to the breakaway force, which the next pulses learn. With them all moves on 99 of 100 drawn plants
+keep all limits, within 1.3 s; of the 162 moves of the nominal plant and the corners one passes the end by .116 mm.
 
 Rows NAME.kept: of the 162 moves of nine plants, the share that comes to +-.1 mm, stays there, passes the end by no
 more and then stands; NAME.worst_time: the longest time to that, infinite where a move never does; NAME.slower: that
 time over the winner's; NAME.within: the tolerance that all moves keep; NAME.max_sensitivity over all plants. Rows
-fresh.*: drawn plants, and which share of them keeps all limits, Ms among them, on all moves. Rows without.*: a design
-without one of its parts, its other gains unchanged. --certify runs a trip of the winner on three plants on the
-event-accurate model, behind the rig's sensors, with 10 s of standing. Bounds are the limits of the statement, and a
-share of 95 % of the drawn plants.
+fresh.*: drawn plants, and which share of them keeps all limits, Ms among them, on all moves. Rows that begin with
+"without" show a design without one of its parts, its other gains unchanged. --certify runs a trip of the winner on
+three plants on the event-accurate model, behind the rig's sensors, with 10 s of standing. Bounds are the limits of the
+statement, and a share of 95 % of the drawn plants.
 """
 
 import argparse
@@ -190,10 +191,8 @@ def run(count: int = FRESH, certify: bool = False) -> Job:
     given, known = drive()[1], designs()
     corners, drawn = plants(given), fresh_plants(given, count) if count else {}
     found = {n: evaluate(STRUCTURES[n], values, corners) for n, values in known.items()}
-    fresh = {n: evaluate(STRUCTURES[n], known[n], drawn, 1.0) for n in known} if count else {}
-    without = {
-        part: evaluate(STRUCTURES[n], {**known[n], **change}, corners, 1.0) for part, (n, change) in WITHOUT.items()
-    }
+    fresh = {n: evaluate(STRUCTURES[n], known[n], drawn) for n in known} if count else {}
+    without = {part: evaluate(STRUCTURES[n], {**known[n], **change}, corners) for part, (n, change) in WITHOUT.items()}
     few = {own: list(corners.values())[k] for own, k in CERTIFIED.items()}
     return Job(found, fresh, without, tuple(certified(STRUCTURES[WINNER], known[WINNER], few)) if certify else ())
 
