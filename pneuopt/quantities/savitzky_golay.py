@@ -33,8 +33,8 @@ def savitzky_golay(column: Array, window: int, order: int, *, derivative: int = 
 
     Examples
     --------
-    >>> savitzky_golay(np.array([0.0, 1.0, 4.0, 9.0, 16.0]), 5, 2, derivative=1).round(9).tolist()
-    [0.0, 2.0, 4.0, 6.0, 8.0]
+    >>> savitzky_golay(np.array([1.0, 4.0, 9.0, 16.0, 25.0]), 5, 2, derivative=1).round(9).tolist()
+    [2.0, 4.0, 6.0, 8.0, 10.0]
     """
     weights, half = _weights(window, order, derivative), window // 2
     out = np.empty(column.size)
