@@ -11,6 +11,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from scipy.signal import savgol_filter
 
 from pneuopt.control.command import pid_reference
 from pneuopt.control.compensation import Instant
@@ -24,7 +25,6 @@ from pneuopt.dynamics.system import DiscreteSystem, Motion, Symbols, System, def
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
-from pneuopt.quantities.savitzky_golay import savitzky_golay
 from pneuopt.quantities.trajectories import Trajectory
 
 MOTION = ("speed", "position")  # signals of which one follows from the other where a log lacks it
@@ -305,7 +305,7 @@ def _signal_along_log(measured: Trajectory, wanted: str, feedback: str, referenc
     t, step = measured.t, float(np.median(np.diff(measured.t)))
     if wanted == "speed" and "position" in measured:
         window = min(DIFFERENTIATION_WINDOW, (len(t) - 1) // 2 * 2 + 1)
-        return savitzky_golay(measured.fill_gaps("position"), window, 2, derivative=1, step=step)
+        return np.asarray(savgol_filter(measured.fill_gaps("position"), window, 2, deriv=1, delta=step))
     message = f"{name}: the loop feeds back {wanted!r}; log it, or the motion it follows from"
     require(wanted == "position" and "speed" in measured, message, LogError)
     speed = measured.fill_gaps("speed")

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.signal import savgol_filter
 
 from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.models.friction import FrictionModel, law_inputs
@@ -20,7 +21,6 @@ from pneuopt.models.load import GRAVITY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.savitzky_golay import savitzky_golay
 from pneuopt.quantities.trajectories import Trajectory
 
 # Spread of the steps [1], over the usual one, that the filter takes as even: above, derivatives of a log that lacks
@@ -111,7 +111,7 @@ def filter_channel(measured: Trajectory, name: str, derivative: int) -> Array:
     window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
     window = min(window, (len(measured) - 1) // 2 * 2 + 1)
     column = measured.fill_gaps(name)
-    return savitzky_golay(column, window, min(3, window - 1), derivative=derivative, step=step)
+    return np.asarray(savgol_filter(column, window, min(3, window - 1), deriv=derivative, delta=step))
 
 
 @dataclass(frozen=True, eq=False)
