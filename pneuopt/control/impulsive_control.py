@@ -40,19 +40,19 @@ class ImpulsiveControl:
         P_1 = amplitude,    P_k = P_(k-1) min(growth, (|e|/(2 way))^g)
 
     where way is that of the pulse before, towards its target and at least .06 tolerance, and g is .05 where the peak
-    rises and .15 where it falls: it grows until the body moves, and then so that a pulse takes away half of the error.
-    For n samples, ``n = width/h max(1, P/limit)``, is
-    added ``sign(e) min(P, limit) s`` with ``s = sin(2 pi (k + 1/2)/n)``, the half below zero times `brake`: a valve's
-    command is the rate of the force, which so rises and falls again. Where the command is a force, brake is 0. A
+    rises and .15 where it falls: the peak grows until the body moves, and then so that a pulse takes away half of the
+    error. At sample j of the ``n = width/h max(1, P/limit)`` samples of a pulse, the command is changed by
+    ``sign(e) min(P, limit) s`` with ``s = sin(2 pi (j + 1/2)/n)``, the half below zero times `brake`: a valve's command
+    is the rate of the force, which so rises and falls again. Where the command is a force, brake has to be 0. A
     reference that moves ends a pulse, and the next rest begins with `amplitude` again.
 
-    Standstill is an error that changes by less than a fifth of the tolerance. A sampled controller computes it, which
-    therefore it needs. Its pulses are left out of the loop's rest and of its margins, as a knocker's are.
+    Standstill is an error that changes by less than a fifth of the tolerance. It is counted in samples, so the PID has
+    to be a sampled one. The pulses are left out of the loop's rest and of its margins, as a knocker's are.
 
     S. Yang & M. Tomizuka, Adaptive pulse width control for precise positioning under the influence of stiction and
-    Coulomb friction, ASME J. Dyn. Syst. Meas. Control 110 (1988) 221-227, adapt the width of pulses to their way, R.
-    Kased & T. Singh, High precision point-to-point maneuvering of an experimental structure subject to friction via
-    adaptive impulsive control, the height as well.
+    Coulomb friction, ASME J. Dyn. Syst. Meas. Control 110 (1988) 221-227, adapt the width of pulses to their way.
+    R. Kased & T. Singh, High precision point-to-point maneuvering of an experimental structure subject to friction via
+    adaptive impulsive control, State University of New York at Buffalo, compare it with a height that adapts.
     """
 
     section: ClassVar[str] = "impulsive_control"
