@@ -39,7 +39,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.plotting import BLUE, GREY, RED, axes_grid
+from pneuopt.plotting import BLUE, GREY, RED, axes_grid, legend_above
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame
 from problems.shared.p32 import (
@@ -219,22 +219,28 @@ def figure(job: Job) -> "Figure":
         for row, distance in enumerate(DISTANCES):
             panel = panels[row][column]
             _draw_moves(panel, job.found[name], distance)
-            panel.set(ylim=(-1.0, 0.4))
+            panel.set_yscale("symlog", linthresh=1e3 * TOLERANCE)
+            panel.set(ylim=(-10.0, 1.0))
+            panel.set_yticks((-10.0, -1.0, -0.1, 0.0, 0.1, 1.0), ("-10", "-1", "-0.1", "0", "0.1", "1"))
             if not column:
                 panel.set(ylabel=f"{1e3 * distance:.0f} mm:\nerror [mm]")
         panels[0][column].set_title(name)
         panels[-1][column].set(xlabel="time since each move's beginning [s]")
+    for colour, label in ((BLUE, "nominal plant"), (GREY, "corners"), (RED, "tolerance")):
+        panels[0][0].plot([], [], color=colour, label=label)
+    legend_above(picture, panels[0][0], columns=3)
     return picture
 
 
 def _draw_moves(panel: "Axes", result: Result, distance: float) -> None:
-    """The moves of one distance: blue of the nominal plant, grey of the corners."""
+    """The moves of one distance."""
     for k, outing in enumerate(result.outings):
         if outing.trip.distance == distance:
+            colour = BLUE if k < len(list(trips())) else GREY
             for begin, end, final, way in outing.moves:
                 at = np.arange(begin, min(begin + round(SHOWN / SAMPLE_TIME), end), STRIDE)
                 own = 1e3 * np.sign(way) * (result.position[k, at] - final)
-                panel.plot(SAMPLE_TIME * (at - begin), own, color=BLUE if k < len(list(trips())) else GREY, lw=0.6)
+                panel.plot(SAMPLE_TIME * (at - begin), own, color=colour, lw=0.6)
     for edge in (-1e3 * TOLERANCE, 1e3 * TOLERANCE):
         panel.axhline(edge, color=RED, lw=0.7)
 
