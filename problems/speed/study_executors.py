@@ -7,9 +7,8 @@ each certified by `evaluate` over a step of 1 s. Each executor serves a study in
 for linear algebra. Row case.cpu: CPU seconds of a certified case within the study in one thread, once the first ten are
 done. Rows *.differ: cells of the table, without "seconds", whose bits differ from those of one thread. Rows
 *.efficiency_cpu: CPU seconds in one thread over those of all processes together, their start and imports included.
-Rows *.start: CPU seconds of the same study of twenty cases, most of which is the start; rows *.efficiency_cpu.going and
-*.efficiency.going: the efficiencies of the other cases, by the differences from that study, as of one that goes on for
-hours.
+Shown beside them: "start", the CPU seconds of the same study of twenty cases, most of which is the start; and what ends
+in "going", the efficiencies of the other cases, by the differences from that study, as of one that goes on for hours.
 The wall efficiency, wall time in one thread over twice that on two workers, tells nothing unless two cores are idle: it
 is shown beside the number of cores that the study had on average.
 """
