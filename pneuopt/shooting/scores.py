@@ -56,8 +56,8 @@ class FitScores:
         first, out = np.searchsorted(groups[order], np.arange(int(groups.max()) + 1)), list[Array]()
         for draws in np.array_split(np.arange(count), min(count, batches)):
             found = self._respond(roots @ rng.standard_normal((*grams.shape[:2], len(draws))))
-            out.append(np.add.reduceat(found[:, order], first, axis=1))
-        return np.concatenate(out)
+            out.append(np.add.reduceat(found[order], first))
+        return np.moveaxis(np.concatenate(out, axis=2), 2, 0)
 
     def residual_sums(self) -> tuple[Array, Array]:
         """Sum of each segment's residuals by output, shape (m, n_outputs), and its derivatives, (m, n_outputs, k).
@@ -93,19 +93,19 @@ class FitScores:
         return np.asarray(data + np.tensordot(gaps, gaps, ((0, 1), (0, 1))))
 
     def _respond(self, noise: Array) -> Array:
-        """Scores of fits to noise, given as the gradient of each segment's data, shape (m, n_columns, count)."""
+        """Scores, shape (m, k, count), of fits to noise: the gradient of each segment's data, (m, n_columns, count)."""
         linear, (m, n, count) = self._equations.linearisation, (*self._equations.gaps.shape, noise.shape[2])
         step = np.zeros_like(noise)
         step[:, :n] = -self._equations.arrow.solve_nodes(noise[:, :n].reshape(m * n, count), 0.0).reshape(m, n, count)
         step -= self.directions @ np.linalg.solve(
-            self.whole_information, np.einsum("mck,mcr->kr", self.directions, noise)
+            self.whole_information, np.tensordot(self.directions, noise, ((0, 1), (0, 1)))
         )
         ends = linear.end_sensitivities @ step
         ends[:-1] -= step[1:, :n]
         ends[~self._equations.segments.linked] = 0.0
-        data = np.einsum("mck,mcr->rmk", self.directions, noise + linear.grams[:, :-1, :-1] @ step)
         gaps = ends / self.optimum.gap_deviations[:, None]
-        return np.asarray(data + np.einsum("mnk,mnr->rmk", self._gap_directions, gaps))
+        data = np.swapaxes(self.directions, 1, 2) @ (noise + linear.grams[:, :-1, :-1] @ step)
+        return np.asarray(data + np.swapaxes(self._gap_directions, 1, 2) @ gaps)
 
 
 def fit_scores(optimum: Optimum) -> FitScores | None:
