@@ -205,17 +205,6 @@ def test_a_start_that_is_too_stiff_to_be_searched_holds_nothing(monkeypatch: pyt
     assert (dict(held.held), fit.unidentifiable, calls) == ({}, (), 1)
 
 
-def test_a_search_that_is_cut_names_the_parameter_that_would_still_move() -> None:
-    problem = posed(Stribeck())
-    start = problem.candidates()[0]
-    far = replace(start, parameters={**start.parameters, "friction.static": 90.0, VELOCITY: 0.004})
-    few = replace(problem.method, stages=(Stage(1e-3, 1), Stage(1e-5, 2)))
-    unsettled = solve_least_squares(problem.transcription(far), few)
-    assert not unsettled.status.converged
-    assert len(unsettled.unsettled) == 1
-    assert unsettled.unsettled[0] in unsettled.status.verdict
-
-
 @pytest.mark.parametrize("name", ["friction.static", VELOCITY])
 def test_a_parameter_that_did_not_settle_is_held_and_the_others_are_fitted(name: str) -> None:
     problem = posed(Stribeck())

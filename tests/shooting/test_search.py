@@ -221,3 +221,11 @@ def test_noise_of_the_states_that_has_not_settled_is_not_tried_again(monkeypatch
     fit = solve_least_squares(shaken(2e-3), LeastSquares())
     assert fit.jumps is None
     assert len(tried) == len(set(tried)) > 0
+
+
+def test_a_search_that_is_cut_names_the_parameter_that_would_still_move() -> None:
+    fit = solve_least_squares(two_logs(), LeastSquares(stages=(Stage(1e-3, 1), Stage(1e-5, 1))))
+    assert fit.status.code is Code.NOT_CONVERGED
+    assert len(fit.unsettled) == 1
+    assert fit.unsettled[0] in fit.status.verdict
+    assert solve_least_squares(two_logs()).unsettled == ()
