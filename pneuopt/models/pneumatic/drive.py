@@ -75,7 +75,7 @@ class PneumaticDrive:
     chamber: ChamberModel = field(default_factory=Polytropic)
     cylinder: Cylinder = field(default_factory=Cylinder)
 
-    @property
+    @cached_property
     def parameters(self) -> ParameterSet:
         """Parameters cylinder.*, valve.*, supply.pressure, ambient.*, gas.constant, chamber.*, load.*, friction.*."""
         parts = {
