@@ -9,10 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.logs.experiments import Experiment
+from pneuopt.shooting.budget import BudgetSpentError
 from pneuopt.shooting.integration_steps import choose_integration
 from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.state_filter import filter_nodes
@@ -48,12 +50,19 @@ def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
 
 
 def filter_states(problem: EstimationProblem, start: Start) -> Start:
-    """The start with states along the logs that fit its parameters (`shooting.state_filter`)."""
+    """The start with states along the logs that fit its parameters (`shooting.state_filter`).
+
+    Where the CPU budget ends before that, the start is as it was.
+    """
     segments = segment(problem.transcription(start))
     q = np.array([p.value for p in segments.transcription.parameters.values()])
-    nodes = filter_nodes(segments, start_nodes(segments), q)
-    segments, substeps = choose_integration(segments, nodes, q)
-    run = segments.run(nodes, q, substeps, states=True)
+    try:
+        with check_during_runs(problem.method.budget.check):
+            nodes = filter_nodes(segments, start_nodes(segments), q)
+            segments, substeps = choose_integration(segments, nodes, q)
+            run = segments.run(nodes, q, substeps, states=True)
+    except BudgetSpentError:
+        return start
     names = (e.name for e in problem.experiments)
     return replace(start, states=dict(zip(names, segments.trajectories(run), strict=True)))
 

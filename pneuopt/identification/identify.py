@@ -186,8 +186,7 @@ def _fit_and_review(
     held, fit = hold_order(held, fit, label)
     reviewed = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
     result = replace(mark_order(held, reviewed), widths=widths, window=chosen)
-    if problem.method.budget is not None:
-        result = replace(result, status=problem.method.budget.name_end(result.status))
+    result = replace(result, status=problem.method.budget.name_end(result.status))
     if doubts.found:
         result = replace(result, status=result.status.with_details(str(doubts.found)))
     return replace(result, status=result.status.with_details(str(chosen))) if chosen else result

@@ -265,8 +265,7 @@ class _Race:
             return _Trial(widths, inf, inf, 0, problem.parameters, too_stiff=True)
         fit = solve_least_squares(transcription, method)
         if fit.status.code is Code.INTERRUPTED:
-            if method.budget is not None:
-                method.budget.check()
+            method.budget.check()
             raise KeyboardInterrupt
         too_stiff = fit.stats["iterations"] == 0 and is_too_stiff(transcription, method)
         cost = inf if too_stiff or not fit.stats["cost"] < inf else fit.stats["cost"]

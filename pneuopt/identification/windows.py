@@ -135,6 +135,8 @@ def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
     trials, start, iterations = list[_Trial](), problem.start_from(fit), FIRST_ITERATIONS
     for length in reversed(lengths):
         trials.append(_try_length(problem, start, length, iterations))
+        if trials[-1].fit.status.code is Code.INTERRUPTED:
+            break
         start, iterations = trials[-1].problem.start_from(trials[-1].fit), NEXT_ITERATIONS
     found = [trial for trial in trials if trial.is_answer]
     if not found:

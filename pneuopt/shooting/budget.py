@@ -16,7 +16,7 @@ class CpuBudget:
     Parameters
     ----------
     seconds : float
-        Of this process, all its threads together [s].
+        Of this process, all its threads together [s]; infinite: no budget.
 
     Raises
     ------

@@ -55,8 +55,8 @@ class LeastSquares:
         States whose rate holds no free parameter keep their gaps this much smaller.
     progress : callable, optional
         Receives one line of text an iteration.
-    budget : CpuBudget, optional
-        Ends the search as Ctrl-C does, before the trial step that comes next.
+    budget : CpuBudget
+        Ends the search as Ctrl-C does, within the run that goes on by then; by default none.
     max_misfit : float
         Squared residuals a sample, in noise variances, beyond which the search ends after the first stage, or before
         the last where the gaps do not absorb the misfit, for a caller who has other starts to try.
@@ -80,7 +80,7 @@ class LeastSquares:
     tolerance: float = 0.1
     kinematic: float = 0.01
     progress: ProgressCallback | None = field(default=None, repr=False, compare=False)
-    budget: CpuBudget | None = field(default=None, repr=False, compare=False)
+    budget: CpuBudget = field(default=CpuBudget(math.inf), repr=False, compare=False)
     max_misfit: float = math.inf
     allows_state_noise: bool = True
     known_costs: tuple[tuple[float, float], ...] = field(default=(), repr=False, compare=False)

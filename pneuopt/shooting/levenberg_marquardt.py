@@ -8,7 +8,6 @@ import numpy as np
 
 from pneuopt.quantities.arrays import Array
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
-from pneuopt.shooting.budget import CpuBudget
 from pneuopt.shooting.equations import NormalEquations, missed_curvature, normal_equations
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.segments import IntegrationCorrection, Segments
@@ -103,16 +102,13 @@ class Descent:
         self.objective, self.damping, self._is_negligible = objective, damping, is_negligible
         self.node_damping = np.zeros(objective.segments.count)
 
-    def step(self, current: Iterate, budget: CpuBudget | None = None) -> Iterate | None:
+    def step(self, current: Iterate) -> Iterate | None:
         """The next iterate; None if no damping lowers the cost, or the step would be negligible.
 
-        After the first try the damping rises only at the nodes that have overshot, if there are any. A budget that is
-        spent raises `BudgetSpentError` before the next try, for ten of them by fine integration steps take seconds.
+        After the first try the damping rises only at the nodes that have overshot, if there are any.
         """
         raise_by, scaling = 10.0, self.objective.scaling
         for k in range(MAX_TRIES):
-            if budget is not None:
-                budget.check()
             reduced = current.equations.arrow.eliminate(self.damping, self.node_damping)
             step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
             if k == 0 and step:
@@ -133,7 +129,7 @@ class Descent:
             self.damping, raise_by = max(self.damping, MIN_DAMPING) * raise_by, 3 * raise_by
         return None
 
-    def leap(self, current: Iterate, budget: CpuBudget | None = None) -> tuple[Iterate, int]:
+    def leap(self, current: Iterate) -> tuple[Iterate, int]:
         """Take undamped steps, which may raise the cost for a while: the best iterate among them, and their number.
 
         Over a kink of the model, at which a descent creeps, this is the way (the watchdog technique: Chamberlain et
@@ -142,8 +138,6 @@ class Descent:
         trial: Iterate | None = current
         best, taken = current, 0
         while trial is not None and math.isfinite(trial.cost) and taken < MAX_LEAP_STEPS:
-            if budget is not None:
-                budget.check()
             best, trial = min(best, trial, key=lambda each: each.cost), self._step_undamped(trial)
             taken += trial is not None
         return best if trial is None else min(best, trial, key=lambda each: each.cost), taken

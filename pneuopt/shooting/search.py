@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.dynamics.compiled.rollout import RolloutResult
+from pneuopt.dynamics.compiled.rollout import RolloutResult, check_during_runs
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
@@ -82,10 +82,9 @@ class Search:
         self.steps = IntegrationSteps(segments, nodes, self.scaling.values(self.scaling.start), method.substeps)
         self.segments = segments = self.steps.segments
         self.gap_scales = gap_scales(segments, method.kinematic)
-        self.iterations, self.stage_began, self.stage = 0, 0, method.stages[0]
+        self.iterations, self.stage_began, self.noisy_gaps, self.has_stalled = 0, 0, False, False
+        self.stage, self.stage_ends, self.unsettled_gaps = method.stages[0], list[StageEnd](), set[float]()
         self.correction: IntegrationCorrection | None
-        self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[StageEnd]()
-        self.unsettled_gaps = set[float]()
         self.substeps = self.output_substeps = self.steps.start
         self.correction, self.integration_change, self.is_coarse = None, math.nan, False
         self.node_damping = np.zeros(segments.count)  # where the stage has ended, of each node alone
@@ -95,7 +94,8 @@ class Search:
         """Run all stages; an interruption (Ctrl-C) ends them with the best iterate so far, marked."""
         began = time.perf_counter()
         try:
-            status = self._run_stages()
+            with check_during_runs(self.method.budget.check):
+                status = self._run_stages()
         except KeyboardInterrupt:
             status = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
         return end_search(self, status, time.perf_counter() - began)
@@ -296,7 +296,7 @@ class Search:
             if not status.converged:
                 break
             before = self.snapshot()
-            change = self._apply_finer_steps(self.output_substeps if self.method.substeps else 2 * self.output_substeps)
+            change = self._apply_finer_steps((1 if self.method.substeps else 2) * self.output_substeps)
             if not math.isfinite(self.current.cost):
                 self.restore(before)
                 break
@@ -338,7 +338,7 @@ class Search:
                 self._correct_residuals(fine_steps(self.segments, self.substeps, self.stage.refine))
                 descent.objective = self._objective()
             descent.damps_nodes = self.noisy_gaps or is_near_end(self)
-            trial = descent.step(self.current, self.method.budget)
+            trial = descent.step(self.current)
             self.node_damping = descent.node_damping
             if trial is None:
                 return True
@@ -356,7 +356,7 @@ class Search:
         """Leap over a kink at which a descent with noise of the states creeps; return whether that helps."""
         if not self.noisy_gaps:
             return False
-        before, (self.current, taken) = self.current.cost, descent.leap(self.current, self.method.budget)
+        before, (self.current, taken) = self.current.cost, descent.leap(self.current)
         self.iterations += taken
         return self.current.cost < before
 

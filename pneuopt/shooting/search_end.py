@@ -1,6 +1,7 @@
 """`end_search`: the `Fit` at the end of a search, and the statuses by which one ends early."""
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from pneuopt.dynamics.compiled.rollout import RolloutResult
@@ -56,8 +57,7 @@ def end_search(search: "Search", status: Status, seconds: float) -> Fit:
     q = search.scaling.values(current.z)
     free = transcription.parameters.free_names
     values = dict(zip(free, q[transcription.free].tolist(), strict=True))
-    is_run = search.correction is not None and math.isfinite(search.integration_change)  # at these very nodes
-    run = search.correction.fine_run if is_run and search.correction else search.run(search.output_substeps)
+    run = _final_run(search, status)
     at_bound, held = search.scaling.at_bound(current.z) & ~search.scaling.held, search.scaling.held
     keep = search.scaling.has_effect(equations) & ~at_bound & ~held
     covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
@@ -72,7 +72,7 @@ def end_search(search: "Search", status: Status, seconds: float) -> Fit:
         search.segments.trajectories(run),
         transcription.parameters.with_values(values),
         status,
-        _stats(search, run, seconds),
+        _stats(search, status, run, seconds),
         covariance,
         equations.chi_square,
         equations.count,
@@ -85,7 +85,18 @@ def end_search(search: "Search", status: Status, seconds: float) -> Fit:
     )
 
 
-def _stats(search: "Search", run: RolloutResult, seconds: float) -> dict[str, float]:
+def _final_run(search: "Search", status: Status) -> RolloutResult:
+    """The run of the last iterate by the finest steps, with states; those of an interrupted search are by its own."""
+    correction = search.correction
+    if correction is not None and math.isfinite(search.integration_change):  # of these very nodes
+        return correction.fine_run
+    if status.code is not Code.INTERRUPTED or not math.isfinite(search.current.cost):
+        return search.run(search.output_substeps)
+    run = search.run(search.substeps)
+    return run if correction is None else replace(run, y=run.y + correction.y, x_end=run.x_end + correction.x_end)
+
+
+def _stats(search: "Search", status: Status, run: RolloutResult, seconds: float) -> dict[str, float]:
     return {
         "iterations": float(search.iterations),
         "seconds": seconds,
@@ -94,7 +105,7 @@ def _stats(search: "Search", run: RolloutResult, seconds: float) -> dict[str, fl
         "largest_gap": search.current.equations.largest_gap,
         "gap_share": search.current.equations.gap_share,
         "gap_deviation": search.stage.gap,
-        "integration_error": _integration_error(search, run),
+        "integration_error": _integration_error(search, status, run),
     }
 
 
@@ -112,10 +123,8 @@ def _doubtful_parameters(search: "Search") -> tuple[tuple[str, ...], tuple[str, 
     return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)
 
 
-def _integration_error(search: "Search", run: RolloutResult) -> float:
-    """Largest change of an output when the steps are halved [noise standard deviations]."""
-    return (
-        search.integration_change
-        if math.isfinite(search.integration_change)
-        else search.largest_change(search.run(2 * search.output_substeps).y - run.y)
-    )
+def _integration_error(search: "Search", status: Status, run: RolloutResult) -> float:
+    """Largest change of an output when the steps are halved [noise standard deviations]; NaN without an optimum."""
+    if math.isfinite(search.integration_change) or not status.converged:
+        return search.integration_change
+    return search.largest_change(search.run(2 * search.output_substeps).y - run.y)

@@ -1,11 +1,12 @@
 """A CPU budget ends a search with the best values so far, and the status says so first."""
 
-import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
+from pneuopt.dynamics.compiled.rollout import Gram, Rollout
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.models.drive import ForceDrive
@@ -35,8 +36,14 @@ def test_a_spent_budget_leaves_the_best_values_and_says_so_first() -> None:
 
 
 def test_a_search_begins_again_where_a_budget_has_ended_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = itertools.count()  # seconds that pass with each reading
-    monkeypatch.setattr("pneuopt.shooting.budget.time.process_time", lambda: float(next(clock)))
+    gram, evaluations = Rollout.gram, list[Gram]()
+
+    def evaluate(*given: Any, **options: Any) -> Gram:
+        evaluations.append(gram(*given, **options))  # each takes a second
+        return evaluations[-1]
+
+    monkeypatch.setattr(Rollout, "gram", evaluate)
+    monkeypatch.setattr("pneuopt.shooting.budget.time.process_time", lambda: float(len(evaluations)))
     stated = PARAMETERS.with_values({"friction.smoothing": 1.1e-3})  # no width is left to choose before the search
     ended = fit(4.0, stated)
     monkeypatch.undo()

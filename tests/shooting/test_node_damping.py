@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import OptimizeResult, least_squares
 
+from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -199,12 +201,12 @@ def test_a_search_with_noise_of_the_states_that_creeps_leaps(
     search, leaps, taken = Search(segment(wrong_squares()), LeastSquares()), list[float](), list[float]()
     search.noisy_gaps, search.current = True, iterate(1000.0)
 
-    def creep(descent: Descent, current: Iterate, _: object) -> Iterate:
+    def creep(descent: Descent, current: Iterate) -> Iterate:
         descent.promised = 35.0
         taken.append(current.cost)
         return iterate(current.cost - 0.1)
 
-    def leap(_: Descent, current: Iterate, budget: object) -> tuple[Iterate, int]:
+    def leap(_: Descent, current: Iterate) -> tuple[Iterate, int]:
         leaps.append(current.cost)
         return iterate(current.cost - 1.0) if helps and len(leaps) < 3 else current, 4
 
@@ -226,14 +228,17 @@ def test_a_budget_ends_a_step_between_its_tries() -> None:
     objective = Objective(segments, ParameterScaling(segments.transcription), np.array([GAP]), 1)
     current, tried = objective.evaluate(start_nodes(segments), objective.scaling.start), list[Iterate]()
     descent = Descent(objective, 1e-3, lambda *_: False)
+    go_on = descent._trial
 
-    def spend(*_: object) -> Iterate:
+    def spend(*given: Any) -> Iterate:
+        if tried:
+            return go_on(*given)
         budget.seconds, budget._end = 0.0, 0.0
         tried.append(current)  # no lower, so that another damping would be tried
         return current
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(descent, "_trial", spend)
-        with pytest.raises(BudgetSpentError):
-            descent.step(current, budget)
+        with pytest.raises(BudgetSpentError), check_during_runs(budget.check):
+            descent.step(current)
     assert len(tried) == 1

@@ -2,22 +2,25 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
+from pneuopt.shooting.budget import CpuBudget
 from pneuopt.shooting.equations import correct_residuals, normal_equations
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search import Search
 from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH, StageEnd
-from pneuopt.shooting.segments import IntegrationCorrection, segment, start_nodes
+from pneuopt.shooting.segments import IntegrationCorrection, Segments, segment, start_nodes
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.stage_end import FINE_TOLERANCE
 from tests.shooting.test_least_squares import TRUTH, found, shaken, two_logs
@@ -52,6 +55,34 @@ def test_a_last_stage_that_does_not_soon_converge_is_left_for_the_stages_between
     assert stages.index("6/6") < stages.index("2/6")
     assert fit.status.converged
     assert fit.stats["gap_deviation"] == OTHERS[-1].gap
+
+
+def test_a_budget_that_ends_in_refinement_leaves_coarse_runs_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    budget, steps, refined = CpuBudget(1e9), list[int](), list[RolloutResult]()
+    run, refine = Segments.run, Search._refine_steps
+
+    def spend(search: Search, status: Status) -> Status:
+        assert status.converged
+        assert search.correction is not None
+        refined.append(search.run(search.output_substeps))
+        budget._end = 0.0
+        steps.clear()
+        return refine(search, status)
+
+    def count(segments: Segments, nodes: Array, q: Array, substeps: int, **options: Any) -> RolloutResult:
+        steps.append(substeps)
+        return run(segments, nodes, q, substeps, **options)
+
+    monkeypatch.setattr(Search, "_refine_steps", spend)
+    monkeypatch.setattr(Segments, "run", count)
+    search = Search(segment(two_logs()), LeastSquares(budget=budget))
+    fit = search.solve()
+    assert fit.status.code is Code.INTERRUPTED
+    assert steps[1:] == [search.substeps]  # the first one has not begun
+    assert search.substeps < search.output_substeps
+    assert math.isnan(fit.stats["integration_error"])
+    assert fit.optimum is not None
+    assert search.largest_change(fit.optimum.run.y - refined[0].y) < 0.1
 
 
 def test_corrected_residuals_have_the_cost_of_a_run_with_the_correction() -> None:

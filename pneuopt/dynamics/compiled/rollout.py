@@ -9,8 +9,10 @@ import ctypes
 import functools
 import itertools
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +31,18 @@ BRIEF_STEPS = 20_000
 short runs wait for a thread (30 us)."""
 MAX_SUBSTEPS = 2**31 - 1  # integration steps a sample [1]: more do not fit the C int that counts them
 VM_BATCH = 1000  # segments of a batch in the CasADi VM; more take memory for their derivatives, fewer time
+CHECK_SECONDS = 0.1  # between two checks of a long run [s]: longer overruns a CPU budget, shorter takes time itself
+_check: ContextVar[Callable[[], None]] = ContextVar("check", default=lambda: None)
+
+
+@contextmanager
+def check_during_runs(check: Callable[[], None]) -> Iterator[None]:
+    """Call `check` before each run and now and then during it, in this context; what it raises ends the run."""
+    token = _check.set(check)
+    try:
+        yield
+    finally:
+        _check.reset(token)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +191,7 @@ class Rollout:
         -------
         RolloutResult
         """
+        _check.get()()
         return self._run(*self._check_arrays(x0, u, p, t, h, substeps), substeps, states)
 
     def gram(
@@ -206,6 +221,7 @@ class Rollout:
         -------
         Gram
         """
+        _check.get()()
         given = self._check_arrays(x0, u, p, t, h, substeps)
         y, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (measured, weight))
         shape = (*given[3].shape, self.n_outputs)
@@ -255,6 +271,7 @@ class Rollout:
     def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         parts = []
         for i in range(0, len(measured), VM_BATCH):
+            _check.get()()
             x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + VM_BATCH] for a in (*given, measured, weight))
             run = run_in_vm(self._functions, (x0, u, p, t, h), self._starts, substeps, 0, self._threads)
             dy, dx_end = (np.swapaxes(a, -1, -2) for a in (run.dy, run.dx_end))
@@ -307,7 +324,7 @@ class Rollout:
         stop: ctypes.c_int,
         kept: tuple[Any, ...],
     ) -> None:
-        """Make the calls, each in a thread of its own; Ctrl-C stops them, since this thread only waits.
+        """Make the calls, each in a thread of its own; Ctrl-C or a check stops them, since this thread only waits.
 
         A single short call of so many steps is made here: a thread would take longer than its work.
         """
@@ -317,11 +334,20 @@ class Rollout:
         running = [_pool(self._threads).submit(_call_part, function, call, (stop, *kept)) for call in calls]
         try:
             for each in running:
-                each.result()
+                _await(each)
         except BaseException:
             stop.value = 1
             wait(running)
             raise
+
+
+def _await(part: Future[None]) -> None:
+    """Wait for a thread's part, with checks (`check_during_runs`)."""
+    while True:
+        try:
+            return part.result(CHECK_SECONDS)
+        except TimeoutError:
+            _check.get()()
 
 
 def _call_part(function: Callable[..., None], call: tuple[object, ...], kept: tuple[Any, ...]) -> None:  # noqa: ARG001
