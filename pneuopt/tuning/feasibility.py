@@ -223,8 +223,9 @@ def _response_sign(slow: complex, faster: complex) -> float:
     """The sign of a plant's response, by those at a frequency and at twice it."""
     if abs(slow.real) >= abs(slow.imag):
         return float(np.sign(slow.real))
-    # it integrates, with a lag of 90 degrees, or differentiates, with a lead, as where a drifting position counters
-    return float(np.sign(-slow.imag if abs(faster) < abs(slow) else slow.imag))
+    # It integrates, or a drifting position counters: k s/(s - d), whose phase a stable and an unstable d turn opposite
+    # ways; its real part has the sign of k for both.
+    return float(np.sign(-slow.imag if abs(faster) < abs(slow) else slow.real))
 
 
 def _parameter_range(space: Space, n: str) -> tuple[float, float]:

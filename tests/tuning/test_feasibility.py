@@ -155,6 +155,22 @@ def test_a_drift_slower_than_the_horizon_does_not_turn_the_sign() -> None:
     prepare_task(loop, step, gains, specify(SettlingTime()))
 
 
+@pytest.mark.parametrize("position", [0.08, 0.42])
+@pytest.mark.parametrize("amplitude", [0.3, 1.0])
+def test_a_drift_within_the_horizon_does_not_turn_the_sign(position: float, amplitude: float) -> None:
+    """Near either end of the stroke, under dither, the position drifts away, or comes back, within a few seconds."""
+    drive, rig = t32()
+    loop = ClosedLoop(drive.system(), PID(sample_time=1e-3), Dither(60.0))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
+    hardware = {"valve.dead_zone": 0.05, "friction.coulomb": 10.0, "friction.static": 14.0}
+    start = {"pid.Kp": 2.0, "pid.Ki": 20.0, "dither.amplitude": amplitude, "pid.lower": -5.0, "pid.upper": 5.0}
+    given = (rig.fixed("*") | own).with_values(hardware | start)
+    gains = given.with_bounds({"pid.Kp": (0.2, 30.0), "pid.Ki": (0.5, 300.0)}).freed("pid.Kp", "pid.Ki")
+    for speed in (0.05, -0.05):
+        step = Step(speed, horizon=0.8, start={"position": position})
+        prepare_task(loop, step, gains, specify(SettlingTime()))
+
+
 def test_a_dither_above_the_sampling_limit_is_refused_by_its_upper_bound() -> None:
     loop, given = cylinder(frequency=100.0)
     wide = given.with_values({"dither.amplitude": 0.5})
