@@ -70,7 +70,7 @@ def confirm_infeasible(
         lambda points: limit_excess(quick.values(points, stable), stable),
         simulator.space,
         lambda excess: excess <= -room,
-        progress,
+        lambda excess: progress(f"confirming that no design keeps all limits: {_describe_closest(excess)}"),
     )
     share = float(limit_excess(simulator.values(found[None], stable), stable)[0])
     return Confirmation(found, share, count)
@@ -104,7 +104,12 @@ def find_candidates(
         rooms.extend(values[values <= 0].tolist())
         return values
 
-    _, count = _minimise_excess(record, space, lambda _: False, progress)
+    _, count = _minimise_excess(
+        record,
+        space,
+        lambda _: False,
+        lambda excess: progress(f"searching for other designs that keep all limits: {_describe_closest(excess)}"),
+    )
     chosen = list[Array]()
     for k in np.argsort(rooms, kind="stable").tolist():
         unit = space.to_unit(kept[k])
@@ -114,7 +119,7 @@ def find_candidates(
 
 
 def _minimise_excess(
-    excess: Callable[[Array], Array], space: Space, is_enough: Callable[[float], bool], progress: ProgressCallback
+    excess: Callable[[Array], Array], space: Space, is_enough: Callable[[float], bool], report: Callable[[float], None]
 ) -> tuple[Array, int]:
     """The point with the least excess that SciPy's differential evolution finds, shape (n,), and how many it tried."""
     count = 0
@@ -125,7 +130,7 @@ def _minimise_excess(
         return excess(space.from_unit(np.clip(unit.T, 0.0, 1.0)))
 
     def is_found(intermediate_result: OptimizeResult) -> bool:
-        progress(f"confirming that no design keeps all limits: closest {100 * intermediate_result.fun:.3g} % beyond")
+        report(float(intermediate_result.fun))
         return is_enough(float(intermediate_result.fun))
 
     settings: Any = {
@@ -142,6 +147,18 @@ def _minimise_excess(
     }
     found: Any = differential_evolution(cost, **settings)
     return space.from_unit(np.clip(found.x, 0.0, 1.0)), count
+
+
+def _describe_closest(excess: float) -> str:
+    """How far the best candidate so far lies beyond its limits, or within them, in words.
+
+    Examples
+    --------
+    >>> _describe_closest(0.123), _describe_closest(-0.61)
+    ('the closest is 12.3 % beyond them', 'the best stays 61 % below them')
+    """
+    share = f"{100 * abs(excess):.3g} %"
+    return f"the closest is {share} beyond them" if excess > 0 else f"the best stays {share} below them"
 
 
 def describe_confirmation(simulations: int) -> str:

@@ -94,7 +94,10 @@ def test_an_interrupted_second_search_is_no_answer() -> None:
 def test_candidates_lie_within_the_limits_and_apart() -> None:
     two = {n: Parameter(0.5, "1", 0.0, 1.0, free=True) for n in ("pid.Kp", "pid.Ki")}
     space = Space(ParameterSet(two), tuple(two))
-    points, count = find_candidates(lambda at: np.linalg.norm(at - 0.3, axis=1) - 0.2, space, lambda _: None)
+    said = list[str]()
+    points, count = find_candidates(lambda at: np.linalg.norm(at - 0.3, axis=1) - 0.2, space, said.append)
+    assert "searching for other designs" in said[-1]
+    assert said[-1].endswith("% below them")
     assert count > 100
     assert len(points) == MAX_CANDIDATES
     assert np.linalg.norm(points[0] - 0.3) < 0.01
