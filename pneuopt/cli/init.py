@@ -97,7 +97,9 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     )
     write_files({path: text for path, text in placed.items() if path not in kept}, force)
     if guessed is not None:
-        say(f"the log's columns are those of a {name} drive; pneuopt init KIND --from LOG for another")
+        others = ", ".join(kind for kind in first_kinds() if kind != name)
+        say(f"by the log's columns a {name} drive; for another KIND, one of {others}:")
+        typer.echo(f"  pneuopt init KIND --from {log} --force")
     written = [n for n in files if folder / n not in kept]
     _show_files(folder, written, guess, unused, ask.assumed, log)
     return EXIT_SUCCESS

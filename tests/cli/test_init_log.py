@@ -83,8 +83,18 @@ def test_a_log_says_what_drives_the_load(columns: str, kind: str, tmp_path: Path
     log = write_foreign_log(tmp_path / "run.csv", columns)
     code, output = run("init", "--from", str(log), "-o", str(tmp_path))
     assert code == 0
-    assert f"columns are those of a {kind} drive" in " ".join(output.split())
+    assert f"by the log's columns a {kind} drive" in " ".join(output.split())
     assert read_drive(tmp_path / "drive.toml")[0].kind == kind
+
+
+def test_another_kind_than_the_guessed_one_is_written_as_the_screen_says(tmp_path: Path) -> None:
+    """A voltage and a position may be a motor's, too: the command that is shown replaces the files of the guess."""
+    log = write_foreign_log(tmp_path / "run.csv", "t_ms;U Ventil;x ist")
+    _, output = run("init", "--from", str(log), "-o", str(tmp_path))
+    shown = next(line for line in output.splitlines() if "pneuopt init KIND" in line).split()
+    code, output = run("init", "force", *shown[shown.index("--from") :], "-o", str(tmp_path))
+    assert code == 0, output
+    assert read_drive(tmp_path / "drive.toml")[0].kind == "force"
 
 
 def test_a_channel_that_the_drive_does_not_use_is_left_out(tmp_path: Path) -> None:
