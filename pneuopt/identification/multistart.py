@@ -152,7 +152,7 @@ def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
         return
     warm = replace(problem, method=replace(problem.method, stages=stages[-REFIT_STAGES:]))
     start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters))
-    whole, fit = fit_holding_unidentifiable(warm, start)
+    whole, fit = fit_holding_unidentifiable(warm, start, HOPELESS_MISFIT)
     yield replace(whole, method=problem.method), fit, f"{label}, of a part"
 
 

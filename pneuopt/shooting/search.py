@@ -315,7 +315,7 @@ class Search:
         Where an iterate explains the log to its noise, the finer steps correct its residuals within the stage.
         """
         has_ended = self.run_stage(iterations)
-        if self.stage.refine > 1 and self.correction is None:
+        if self.stage.refine > 1 and self.correction is None and not self._is_hopeless():
             before = self.snapshot()
             self._apply_finer_steps(fine_steps(self.segments, self.substeps, self.stage.refine))
             if math.isfinite(self.current.cost):

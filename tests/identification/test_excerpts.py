@@ -9,12 +9,13 @@ import pytest
 from pneuopt.identification import multistart
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.excerpts import EXCERPT_SEGMENTS, cut_excerpts, filter_states
-from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.catalog import b32
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
+from pneuopt.shooting.search_end import ABANDONED_START
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 from problems.shared.b32 import GAINS, run_loop
@@ -121,6 +122,20 @@ def test_a_short_search_ends_where_it_leads_nowhere(monkeypatch: pytest.MonkeyPa
     assert not short.status.converged
     assert short.stats["iterations"] <= problem.method.stages[0].iterations
     assert [method.allows_state_noise for method in methods] == [False]
+
+
+def test_the_whole_log_is_left_where_the_answer_of_its_part_does_not_explain_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From states that do not fit together a search crept for half of a CPU budget, at a hundred times the noise."""
+    problem, _ = posed()
+    parts, (log,) = cut_excerpts(problem), problem.experiments
+    monkeypatch.setattr(multistart, "cut_excerpts", lambda _: parts)
+    precise = replace(problem, experiments=(replace(log, noise={n: v / 30 for n, v in log.noise.items()}),))
+    *_, (_, whole, label) = multistart._tries_of_long_logs(precise)
+    assert label.endswith("of a part")
+    assert whole.status is ABANDONED_START
+    assert whole.stats["iterations"] <= problem.method.stages[-REFIT_STAGES].iterations
 
 
 def test_ctrl_c_in_the_short_search_ends_all() -> None:

@@ -186,6 +186,26 @@ def test_nothing_is_iterated_to_the_end_before_finer_steps_follow(monkeypatch: p
     assert fit.stats["iterations"] < fine.stats["iterations"]
 
 
+@pytest.mark.parametrize(("limit", "is_refined"), [(3.0, False), (math.inf, True)])
+def test_a_search_that_is_far_off_takes_no_finer_steps(
+    limit: float, is_refined: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The short search of a minute's log went on in finer steps at 160 times the noise, for half of a CPU budget."""
+    steps, refine = list[int](), Search._apply_finer_steps
+
+    def record(search: Search, fine: int) -> float:
+        steps.append(fine)
+        return refine(search, fine)
+
+    monkeypatch.setattr(Search, "_apply_finer_steps", record)
+    stages = FIRST, OTHERS[-1]
+    method = LeastSquares(stages=stages, allows_state_noise=False, max_misfit=limit)
+    fit = solve_least_squares(shaken(2e-3), method)
+    assert fit.stats["gap_deviation"] == stages[-1].gap
+    assert 2 * fit.stats["cost"] > 3 * fit.count
+    assert bool(steps) == is_refined
+
+
 @pytest.mark.parametrize(("share", "is_left"), [(0.5, True), (2.0, False)])
 def test_a_search_that_is_far_off_before_its_last_stage_is_left(share: float, is_left: bool) -> None:
     """The last stage took a Stribeck log's first start 60 iterations, and led nowhere."""
