@@ -1,10 +1,12 @@
-"""Air and valve travel against mass balances, and the search's figure against the certificate's."""
+"""Air and valve travel against mass balances and SciPy, and the search's figure against the certificate's."""
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.moves import Move, MoveProfile
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
@@ -14,7 +16,12 @@ from pneuopt.evaluation.meter import meter_record
 from pneuopt.evaluation.requirements import METRICS, AirUse, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
+from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
+from pneuopt.models.pneumatic.cylinder import Cylinder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.pneumatic.gas import Smoothing
+from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -62,6 +69,87 @@ def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave(sid
     assert x == pytest.approx(0.25, abs=1e-4)
     assert litres == pytest.approx(1e3 * gained / ANR_DENSITY, rel=2e-3)
     np.testing.assert_allclose(spool[0], run["valve.spool"], atol=1e-12)
+
+
+HARDWARE = {
+    "cylinder.bore": 0.032,
+    "cylinder.rod": 0.012,
+    "cylinder.stroke": 0.3,
+    "cylinder.dead_volume_a": 2e-5,
+    "cylinder.dead_volume_b": 3e-5,
+    "valve.conductance": 2e-8,
+    "valve.critical_ratio": 0.3,
+    "valve.dead_zone": 0.03,
+    "valve.rounding": 1e-4,
+    "valve.span": 5.0,
+    "supply.pressure": 7e5,
+    "ambient.pressure": 1e5,
+    "ambient.temperature": 288.0,
+    "gas.constant": 287.0,
+    "chamber.exponent": 1.2,
+    "load.mass": 5.0,
+    "friction.viscous": 80.0,
+}
+GAIN, SAMPLE_TIME, TRAVEL_TIME, DWELL = 30.0, 1e-3, 0.5, 0.4  # [V/m, s, s, s]
+BEGIN, DISTANCE, START_PRESSURE = 0.1, 0.12, 3.5e5  # [m, m, Pa(a)]
+
+
+def air_by_scipy() -> float:
+    """Litres that a drive with sharp edges draws over a move of least jerk, under a sampled P controller."""
+    h = HARDWARE
+    area_a = np.pi / 4 * h["cylinder.bore"] ** 2
+    area_b = area_a - np.pi / 4 * h["cylinder.rod"] ** 2
+    heat = h["gas.constant"] * h["ambient.temperature"]
+    supply, ambient = h["supply.pressure"], h["ambient.pressure"]
+
+    def flow(high: float, low: float, opening: float) -> float:
+        """ISO 6358-1 [kg/s]."""
+        if low > high:
+            return -flow(low, high, opening)
+        choked = h["valve.conductance"] * 1.185 * np.sqrt(293.15 / h["ambient.temperature"]) * opening * high
+        beyond = max(low / high - h["valve.critical_ratio"], 0.0) / (1 - h["valve.critical_ratio"])
+        return float(choked * np.sqrt(1 - beyond**2))
+
+    def rates(_t: float, z: np.ndarray, spool: float) -> list[float]:
+        y, v, a, b, _ = z
+        to_a, to_b = (max(0.0, sign * spool - h["valve.dead_zone"]) for sign in (1, -1))
+        into_a, into_b = flow(supply, a, to_a), flow(supply, b, to_b)
+        volume_a = h["cylinder.dead_volume_a"] + area_a * y
+        volume_b = h["cylinder.dead_volume_b"] + area_b * (h["cylinder.stroke"] - y)
+        force = area_a * (a - ambient) - area_b * (b - ambient) - h["friction.viscous"] * v
+        rise_a = h["chamber.exponent"] / volume_a * (heat * (into_a - flow(a, ambient, to_b)) - area_a * v * a)
+        rise_b = h["chamber.exponent"] / volume_b * (heat * (into_b - flow(b, ambient, to_a)) + area_b * v * b)
+        return [v, force / h["load.mass"], rise_a, rise_b, into_a + into_b]
+
+    balanced = ambient + area_b / area_a * (START_PRESSURE - ambient)
+    z = np.array([BEGIN, 0.0, balanced, START_PRESSURE, 0.0])
+    for k in range(round((TRAVEL_TIME + DWELL) / SAMPLE_TIME)):
+        s = min(k * SAMPLE_TIME / TRAVEL_TIME, 1.0)
+        error = BEGIN + DISTANCE * (10 * s**3 - 15 * s**4 + 6 * s**5) - z[0]
+        spool = float(np.clip(GAIN * error / h["valve.span"], -1.0, 1.0))
+        z = solve_ivp(rates, (0.0, SAMPLE_TIME), z, args=(spool,), rtol=1e-5, atol=1e-8).y[:, -1]
+    assert z[0] == pytest.approx(BEGIN + DISTANCE, abs=5e-3)
+    return float(z[4]) / 1.185 * 1e3
+
+
+def test_the_air_of_a_move_is_that_of_the_equations_in_plain_scipy() -> None:
+    """Of a sampled P controller on a drive whose edges are sharp and close."""
+    valve = ProportionalValve(spool=Spool.RIGID, smoothing=Smoothing(corner=1e-3, zero=1e-3, pressure=1.0))
+    drive = PneumaticDrive(valve, Viscous(), cylinder=Cylinder(stops=False))
+    loop = ClosedLoop(drive.system(), PID(SAMPLE_TIME), measured="position")
+    p = loop.parameters.with_values(HARDWARE | {"pid.Kp": GAIN, "pid.Ki": 0.0})
+    # A move of least jerk is as fast as its peak speed allows, 15/8 of its mean.
+    move = Move(
+        DISTANCE,
+        speed=15 / 8 * DISTANCE / TRAVEL_TIME,
+        acceleration=1e3,
+        profile=MoveProfile.MINIMUM_JERK,
+        initial=BEGIN,
+        dwell=DWELL,
+        start={"pressure_b": START_PRESSURE},
+    )
+    assert move.duration == pytest.approx(TRAVEL_TIME)
+    assert evaluate(loop, move, p)[move.label]["AirUse"] == pytest.approx(air_by_scipy(), rel=5e-4)
 
 
 def test_a_closed_valve_draws_nothing_and_travel_counts_to_and_fro() -> None:
