@@ -25,6 +25,10 @@ SHARE = 0.5  # part of the error that a pulse shall take away: a larger one over
 # peak learns slowly.
 RISE, FALL = 0.05, 0.15
 STILL = 0.2  # of the tolerance: changes of the error below count as standstill; an encoder's count must lie below
+# Factor by which the peak rises at least towards one that has gone too far, and beyond it, should it no longer move the
+# body: a larger one throws it, a smaller one takes more pulses.
+LEAST_RISE = 1.02
+LEAST_PEAK = 1e-9  # [command's unit] by which is divided
 LEAST_WAY = 0.06  # of the tolerance: a pulse that has moved less counts as one that has moved this far
 
 
@@ -37,14 +41,17 @@ class ImpulsiveControl:
     peak comes down to the breakaway force. When the reference has come to rest and the error e has stood still for
     `pause`, pulse k begins, with the peak ::
 
-        P_1 = amplitude,    P_k = P_(k-1) min(growth, (|e|/(2 way))^g)
+        P_1 = amplitude,    P_k = P_(k-1) min(most, (|e|/(2 way))^g)
 
     where way is that of the pulse before, towards its target and at least .06 tolerance, and g is .05 where the peak
     rises and .15 where it falls: the peak grows until the body moves, and then so that a pulse takes away half of the
-    error. At sample j of the ``n = width/h max(1, P/limit)`` samples of a pulse, the command is changed by
-    ``sign(e) min(P, limit) s`` with ``s = sin(2 pi (j + 1/2)/n)``, the half below zero times `brake`: a valve's command
-    is the rate of the force, which so rises and falls again. Where the command is a force, brake has to be 0. A
-    reference that moves ends a pulse, and the next rest begins with `amplitude` again.
+    error. It grows by `growth` at most, and where a pulse with the peak C has moved the body further than that, to the
+    same side of the reference, by ``max(1.02, sqrt(C/P_(k-1)))`` from then on: half of the gap to C, since near the
+    breakaway force a slightly higher peak moves the body many times as far. At sample j of the
+    ``n = width/h max(1, P/limit)`` samples of a pulse, the command is changed by ``sign(e) min(P, limit) s`` with
+    ``s = sin(2 pi (j + 1/2)/n)``, the half below zero times `brake`: a valve's command is the rate of the force, which
+    so rises and falls again. Where the command is a force, brake has to be 0. A reference that moves ends a pulse, and
+    the next rest begins with `amplitude` again.
 
     Standstill is an error that changes by less than a fifth of the tolerance. It is counted in samples, so the PID has
     to be a sampled one. The pulses are left out of the loop's rest and of its margins, as a knocker's are.
@@ -99,18 +106,19 @@ class ImpulsiveControl:
         return on.speed_input
 
     def states(self, on: SensedSignal, command: Quantity) -> tuple[Quantity, ...]:
-        """The error that has stood, and for how many samples; the pulse, its sample, length, peak, error before it."""
+        """The error that has stood, for how many samples; the pulse, its length, peak, error before; the ceiling."""
         error = Quantity("error", on.error_unit)
         return (
             error,
             *(Quantity(n, "1") for n in ("standing", "phase", "length")),
             replace(command, name="peak"),
             replace(error, name="before"),
+            replace(command, name="ceiling"),
         )
 
     def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
         """No pulse so far."""
-        return [0.0] * 6
+        return [0.0] * 7
 
     def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The states after a sample, and the pulse [the command's unit]."""
@@ -122,7 +130,9 @@ class ImpulsiveControl:
         standing = ca.if_else(stays, x["standing"] + 1, 0)
         fires = ca.logic_and(standing >= pause, ca.fabs(e) > p["tolerance"])
         last = ca.if_else(rests, x["peak"], 0)
-        peak = ca.if_else(fires, _next_peak(e, last, x["before"], p), last)
+        known = ca.if_else(rests, x["ceiling"], 0)
+        next_peak, ceiling = _next_peak(e, last, x["before"], known, p)
+        peak = ca.if_else(fires, next_peak, last)
         longer = ca.fmax(1.0, ca.fabs(peak) / p["limit"])
         length = ca.if_else(fires, ca.floor(width * longer + 0.5), ca.if_else(rests, x["length"], 0))
         phase = ca.if_else(fires, 0, ca.fmin(x["phase"] + 1, length))
@@ -134,15 +144,23 @@ class ImpulsiveControl:
             "length": length,
             "peak": peak,
             "before": ca.if_else(fires, e, x["before"]),
+            "ceiling": ca.if_else(fires, ceiling, known),
         }
         acts = ca.logic_and(phase < length, p["amplitude"] > 0)
         return now, ca.if_else(acts, peak / longer * ca.fmax(wave, p["brake"] * wave), 0)
 
 
-def _next_peak(e: Any, last: Any, before: Any, p: Symbols) -> ca.SX:
-    """The signed peak of a pulse that begins at the error e, from the last one (0: none) and the error before that."""
+def _next_peak(e: Any, last: Any, before: Any, ceiling: Any, p: Symbols) -> tuple[ca.SX, ca.SX]:
+    """The signed peak of a pulse that begins at the error e, and the ceiling from then on.
+
+    Known are the last peak (0: none), the error before it, and the ceiling, the last peak that went too far (0: none).
+    """
     way = ca.fmax((before - e) * ca.if_else(last < 0, -1, 1), LEAST_WAY * p["tolerance"])
     ratio = ca.fmax(SHARE * ca.fabs(e), LEAST_WAY * p["tolerance"]) / way
-    factor = ca.fmin(p["growth"], ca.exp(ca.if_else(ratio > 1, RISE, FALL) * ca.log(ratio)))
-    size = ca.if_else(ca.fabs(last) <= 0, p["amplitude"], ca.fabs(last) * factor)
-    return ca.if_else(e < 0, -size, size)
+    size, turns = ca.fabs(last), last * e < 0
+    known = ca.if_else(turns, 0, ca.if_else(ratio < 1, size, ceiling))
+    halfway = ca.fmax(ca.sqrt(known / ca.fmax(size, LEAST_PEAK)), LEAST_RISE)
+    most = ca.if_else(known > 0, ca.fmin(p["growth"], halfway), p["growth"])
+    factor = ca.fmin(most, ca.exp(ca.if_else(ratio > 1, RISE, FALL) * ca.log(ratio)))
+    found = ca.if_else(size <= 0, p["amplitude"], size * factor)
+    return ca.if_else(e < 0, -found, found), known

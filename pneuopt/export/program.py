@@ -46,6 +46,7 @@ STATE_MEANINGS: Mapping[str, str] = {
     "impulsive_control.length": "samples of the last pulse",
     "impulsive_control.peak": "peak of the last pulse, with its sign",
     "impulsive_control.before": "error at the last pulse's onset",
+    "impulsive_control.ceiling": "peak of the last pulse towards this side that went too far; 0: none",
 }
 _UNNAMED_CONSTANTS = (0.5, 1.0, 2.0)  # sample times [s] that are found in many formulas, where their name would mislead
 

@@ -24,12 +24,12 @@ GIVEN = {"amplitude": 2.0, "limit": 2.5, "width": 8e-3, "pause": 3e-3, "toleranc
 def pulses_by_hand(errors: Array, speeds: Array) -> tuple[Array, set[str]]:
     """What is added at each sample, from the errors and the reference's speeds, and what has happened."""
     added, seen = np.zeros(len(errors)), set()
-    stood = standing = peak = before = 0.0
+    stood = standing = peak = before = ceiling = 0.0
     pulse: list[float] = []
     for k, (e, v) in enumerate(zip(errors.tolist(), speeds.tolist(), strict=True)):
         if v:
             seen |= {"cut"} if pulse else set()
-            peak, pulse = 0.0, []
+            peak, ceiling, pulse = 0.0, 0.0, []
         still = not v and not pulse and abs(e - stood) < 0.2 * GIVEN["tolerance"]
         standing = standing + 1 if still else 0
         stood = stood if still else e
@@ -37,8 +37,11 @@ def pulses_by_hand(errors: Array, speeds: Array) -> tuple[Array, set[str]]:
             way = (before - e) * np.sign(peak)
             ratio = 0.5 * abs(e) / max(way, 0.06 * GIVEN["tolerance"])
             factor = ratio ** (0.05 if ratio > 1 else 0.15)
+            ceiling = 0.0 if peak * e < 0 else abs(peak) if ratio < 1 else ceiling
+            most = min(1.1, max(1.02, np.sqrt(ceiling / abs(peak)))) if ceiling else 1.1
             seen |= {"first"} if not peak else {"grows"} if factor > 1.1 else {"more"} if ratio > 1 else {"less"}
-            peak = float(np.sign(e)) * (abs(peak) * min(1.1, factor) if peak else 2.0)
+            seen |= {"halves"} if 1.02 < most < min(1.1, factor) else {"creeps"} if 1.02 == most < factor else set()
+            peak = float(np.sign(e)) * (abs(peak) * min(most, factor) if peak else 2.0)
             n = int(np.floor(8 * max(1.0, abs(peak) / 2.5) + 0.5))
             seen |= {"longer"} if n > 8 else set()
             wave = np.sin(2 * np.pi * (np.arange(n) + 0.5) / n)
@@ -70,7 +73,7 @@ def test_the_command_is_that_of_a_hand_recursion(cascaded: bool) -> None:
         x[order.index("position")] = y
         x = np.array(loop.update(k * H, x, [reference[k], speeds[k]], p)).ravel()
         found.append(x[order.index("pid.command")])
-    assert seen == {"first", "grows", "more", "less", "longer", "cut"}
+    assert seen == {"first", "grows", "more", "less", "halves", "creeps", "longer", "cut"}
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
