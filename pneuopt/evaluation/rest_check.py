@@ -66,13 +66,18 @@ class NoHunting:
     ----------
     duration : float
         For how long each reference is watched [s].
+    repeatability : float
+        Largest range of the errors at rest over the references, such as moves from several starts [measured unit].
     """
 
     duration: float = USUAL_DURATION
+    repeatability: float = inf
 
     def __post_init__(self) -> None:
         proper = 0 < self.duration < inf
         require(proper, f"NoHunting: duration must be positive and finite, got {self.duration:g} s; 60 s is usual")
+        told = f"NoHunting: repeatability must be positive, got {self.repeatability:g}; leave it out for any"
+        require(self.repeatability > 0, told)
 
 
 class RestKind(Enum):

@@ -46,14 +46,14 @@ class Specification:
     band : float or Tolerance
         Half width of the settling band, a fraction of the step or in the measured unit; 2 % unless a requirement
         names another.
-    rest : float
-        For how long a loop is watched on its rig, where it shall not hunt (`NoHunting`) [s]; 0 where that is not asked.
+    rest : NoHunting or None
+        How a loop shall end on its rig; None where that is not asked.
     """
 
     weights: Mapping[Requirement, float]
     limits: tuple[Requirement, ...]
     band: Band
-    rest: float = 0.0
+    rest: NoHunting | None = None
 
     @property
     def envelope(self) -> EnvelopeBounds:
@@ -167,7 +167,8 @@ def specify_limits(
 
     Errors are as for `specify`.
     """
-    rest = max((q.duration for q in subject_to if isinstance(q, NoHunting)), default=0.0)
+    asked = [q for q in subject_to if isinstance(q, NoHunting)]
+    rest = NoHunting(max(q.duration for q in asked), min(q.repeatability for q in asked)) if asked else None
     found = _specify_requirements([q for q in subject_to if not isinstance(q, NoHunting)], weights)
     return replace(found, rest=rest)
 

@@ -45,6 +45,7 @@ from pneuopt.files.tuning_keys import (
     ACCEPT_KEY,
     BUDGET_KEYS,
     NO_HUNTING_KEY,
+    NO_HUNTING_KEYS,
     SCENARIO_KEYS,
     TUNING_KEYS,
     limit_key,
@@ -55,6 +56,7 @@ from pneuopt.quantities.keys import Takes
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
+from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import read_value, write_value
 from pneuopt.tuning.method import Method
 
@@ -272,8 +274,7 @@ def _read_requirements(
     for key, given in table.get("limits", {}).items():
         spot = f"{where} {key}"
         if key == NO_HUNTING_KEY:
-            duration = read_value(given, "s", where=spot)
-            found.append(construct_at(partial(NoHunting, duration), where))
+            found.append(_read_no_hunting(given, loop.feedback.unit, spot))
             continue
         bound = REQUIREMENTS_BY_KEY[key].metric.sense.value
         entry = given if isinstance(given, dict) else {bound: given}
@@ -283,6 +284,16 @@ def _read_requirements(
         limit = {bound: read_bound(key, entry[bound], units[key], at)} if bound in entry else {}
         found.append(_make_requirement(key, entry, limit, loop.feedback.unit, spot))
     return tuple(found)
+
+
+def _read_no_hunting(given: Any, measured: str, where: str) -> NoHunting:
+    """Read no_hunting: a duration, or a table with it and the repeatability."""
+    entry = given if isinstance(given, dict) else {"duration": given}
+    check_names("key", entry, NO_HUNTING_KEYS, where)
+    units = {"duration": "s", "repeatability": difference_unit(measured)}
+    at = {n: f"{where} {n}" if entry is given else where for n in entry}
+    values = {n: read_value(entry[n], units[n], where=at[n]) for n in entry}
+    return construct_at(lambda: NoHunting(**values), where)
 
 
 def _make_requirement(

@@ -18,6 +18,7 @@ from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.requirements import SettlingTime, StepEnvelope
+from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.files.method import METHOD_SECTION
 from pneuopt.files.reference_keys import REFERENCE_KEYS
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY
@@ -104,8 +105,18 @@ BUDGET_KEYS: Mapping[str, Key] = {
 
 NO_HUNTING_KEY = "no_hunting"
 """Key under [limits] of `NoHunting`, which has no metric."""
+_REPEATABILITY = Key("largest range of its errors at rest over the references", unit="{measured}", example='"0.1 mm"')
+NO_HUNTING_KEYS: Mapping[str, Key] = {
+    "duration": Key("for how long it is watched", unit="s", usual=NoHunting.duration),
+    "repeatability": _REPEATABILITY,
+}
 _NO_HUNTING = Key(
-    "the loop comes to rest, watched for so long on the rig's model", unit="s", condition="with --rig", example='"60 s"'
+    "the loop comes to rest, watched for so long on the rig's model",
+    Takes.PARAMETER,
+    "s",
+    keys=NO_HUNTING_KEYS,
+    condition="with --rig",
+    example='"60 s"',
 )
 
 

@@ -10,11 +10,12 @@ import numpy as np
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import metric_name, requirement_values, upper_limit, user_value
-from pneuopt.evaluation.rest_check import RestKind, check_rest
+from pneuopt.evaluation.rest_check import NoHunting, RestKind, check_rest
 from pneuopt.evaluation.rig import Rig
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
+from pneuopt.quantities.units import write_value
 from pneuopt.tuning.method import TuningTask
 from pneuopt.tuning.result import TuningResult
 
@@ -31,8 +32,11 @@ def check_rig(rig: Rig | None, task: TuningTask) -> None:
     """
     if rig is None:
         told = "NoHunting is read on the event-accurate model of the rig, which sticks; give rig=, or --rig rig.toml"
-        require(not task.spec.rest, told)
+        require(task.spec.rest is None, told)
         return
+    compares = task.spec.rest is not None and np.isfinite(task.spec.rest.repeatability)
+    told = "NoHunting: repeatability is a range over references, and there is one; give more, from several starts"
+    require(not compares or len(task.references) > 1, told)
     require(rig.loop is not None, "the rig has no controller; make it of the loop, Rig(ClosedLoop(...), sensors)")
     signals = [(own.feedback.name, own.command.name, own.pid) for own in (rig.loop, task.loop) if own is not None]
     message = f"the rig's loop controls {signals[0][:2]}, the loop to be tuned {signals[-1][:2]}, or with another PID"
@@ -66,17 +70,22 @@ def certify_on_rig(task: TuningTask, result: TuningResult, rig: Rig) -> TuningRe
     if breaks:
         return _reject(task, result, found, breaks)
     result = replace(result, on_rig=found)
-    return _watch_rest(task, result, rig, own) if task.spec.rest else result
+    return result if spec.rest is None else _watch_rest(task, result, rig, own, spec.rest)
 
 
-def _watch_rest(task: TuningTask, result: TuningResult, rig: Rig, parameters: ParameterSet) -> TuningResult:
-    """The result with how the loop ends on the rig; where it does not come to rest, it is no longer certified."""
-    rest = check_rest(rig, task.references, parameters, duration=task.spec.rest)
-    if rest.rests:
-        told = f"on the rig it comes to rest, watched for {task.spec.rest:g} s"
-        return replace(result, rest=rest, status=result.status.with_details(told))
-    restless = tuple(f"on the rig {case.sentence}" for case in rest.cases if case.kind is not RestKind.RESTS)
-    return replace(_reject(task, result, result.on_rig, restless), rest=rest)
+def _watch_rest(
+    task: TuningTask, result: TuningResult, rig: Rig, parameters: ParameterSet, wanted: NoHunting
+) -> TuningResult:
+    """The result with how the loop ends on the rig; where it does not end as wanted, it is no longer certified."""
+    rest = check_rest(rig, task.references, parameters, duration=wanted.duration)
+    breaks = tuple(f"on the rig {case.sentence}" for case in rest.cases if case.kind is not RestKind.RESTS)
+    if rest.rests and rest.repeatability > wanted.repeatability:
+        reached, limit = (write_value(v, rest.unit, 3) for v in (rest.repeatability, wanted.repeatability))
+        breaks = (f"on the rig its errors at rest range over {reached}, the limit of repeatability is {limit}",)
+    if breaks:
+        return replace(_reject(task, result, result.on_rig, breaks), rest=rest)
+    told = f"on the rig it comes to rest, watched for {wanted.duration:g} s"
+    return replace(result, rest=rest, status=result.status.with_details(told))
 
 
 def _breaks(task: TuningTask, found: "pd.DataFrame") -> Iterator[str]:

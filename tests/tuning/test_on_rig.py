@@ -11,7 +11,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import IAE, Overshoot, SettlingTime
-from pneuopt.evaluation.rest_check import NoHunting
+from pneuopt.evaluation.rest_check import NoHunting, check_rest
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
@@ -101,7 +101,7 @@ def test_a_loop_that_hunts_on_the_rig_is_not_certified_where_that_is_asked(width
     design = prepare_search(task).certify_point(task.space.start)
     own = values.select(n for n in values if n in STUCK.parameters)
     on_rig = evaluate(rig, step, own)
-    found = _watch_rest(task, replace(design, on_rig=on_rig), rig, own)
+    found = _watch_rest(task, replace(design, on_rig=on_rig), rig, own, NoHunting(8.0))
     assert found.rest is not None
     assert found.rest.duration == 8.0
     if width:
@@ -120,3 +120,34 @@ def test_no_hunting_asks_for_a_rig_and_a_duration() -> None:
         tune(LOOP, STEP, given(), minimise=SettlingTime(), subject_to=[NoHunting()], plants={})
     with pytest.raises(InputError, match="NoHunting: duration must be positive"):
         NoHunting(0.0)
+    with pytest.raises(InputError, match="NoHunting: repeatability must be positive"):
+        NoHunting(repeatability=0.0)
+    one, rig = [NoHunting(repeatability=1e-4)], Rig(STICKING, SENSORS)
+    with pytest.raises(InputError, match="repeatability is a range over references, and there is one; give more"):
+        tune(LOOP, STEP, given(), minimise=SettlingTime(), subject_to=one, rig=rig, plants={})
+
+
+def test_of_several_limits_on_rest_the_tightest_hold() -> None:
+    asked = specify(IAE(), [NoHunting(8.0), NoHunting(20.0, 1e-3), NoHunting(5.0, 1e-4)]).rest
+    assert asked == NoHunting(20.0, 1e-4)
+    assert specify(IAE()).rest is None
+
+
+@pytest.mark.slow  # 6 to 8 s
+def test_a_design_that_stops_elsewhere_from_another_start_is_not_certified_where_that_is_asked() -> None:
+    """Without an integral a body sticks short of the reference, on the side from which it comes."""
+    steps = [Step(0.1, horizon=0.6), Step(-0.1, initial=0.2, horizon=0.6)]
+    rig = Rig(STUCK, {"position": Sensor()})
+    values = PUSHED.parameters.with_values(HUNTING | {"pid.Ki": 0.0})
+    free = values.with_bounds({"pid.Kp": (4900.0, 5100.0)}).freed("pid.Kp")
+    task = prepare_task(PUSHED, steps, free, specify(IAE(), [NoHunting(2.0)]))
+    design = prepare_search(task).certify_point(task.space.start)
+    own = values.select(n for n in values if n in STUCK.parameters)
+    span = check_rest(rig, steps, own, duration=2.0).repeatability
+    assert 1e-4 < span < 0.1
+    wide, narrow = (_watch_rest(task, design, rig, own, NoHunting(2.0, k * span)) for k in (1.01, 0.99))
+    assert "on the rig it comes to rest, watched for 2 s" in str(wide.status)
+    assert not narrow.status.converged
+    told = rf"on the rig its errors at rest range over {1e3 * span:.3g} mm, the limit of repeatability is \S+ mm"
+    assert re.match(told, narrow.status.verdict)
+    assert narrow.rest is not None
