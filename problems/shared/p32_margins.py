@@ -16,7 +16,7 @@ from problems.shared.p32 import RESERVE, SAMPLE_TIME, SPEEDS, STROKE, drive
 MAX_SENSITIVITY = "MaxSensitivity"
 PLACES = (RESERVE, STROKE / 2, STROKE - RESERVE)  # [m]
 POINTS = 80  # frequencies: fewer miss a peak by more than a hundredth
-STANDING_MASS = 1e12  # [kg] that no pressure moves
+STANDING_MASS = 1e15  # [kg] that no pressure moves; one of 1e12 has integrals drift faster than LEAST_POLE
 SLIDING = "exact_linearisation.sliding"
 LEAST_POLE = 1e-2  # [rad/s]; those of a piston that sticks lie below, at zero but for rounding
 
@@ -98,15 +98,16 @@ class Margins:
         loops = self._linearise(np.vstack([p, stuck]), np.vstack([x, x]), np.vstack([u, u])).loop
         return np.moveaxis(self._peaks(*loops).reshape(2, k, -1), 0, -1)
 
+    def response(self, gains: Mapping[str, float], omega: Array) -> Array:
+        """L(jw) of the loop cut at the command, a row each steady motion of each plant, at frequencies [rad/s]."""
+        _, x, u = self._points
+        return _response(*self._linearise(self._rows(gains), x, u).loop, omega)
+
     def _peaks(self, A: Array, B: Array, C: Array, D: Array) -> Array:
         """Ms of open loops on the grid of frequencies, shape (m,)."""
         poles = np.linalg.eigvals(A - B @ C / (1 + D))
         unstable = np.where(np.abs(poles) > LEAST_POLE, poles.real, -1.0).max(axis=1) > 0
-        direct, one = D[:, 0, 0], np.eye(A.shape[-1])
-        least = np.abs(1 + direct)
-        for w in self.omega:
-            opened = (C @ np.linalg.solve(1j * w * one - A, B.astype(complex)))[:, 0, 0] + direct
-            least = np.minimum(least, np.abs(1 + opened))
+        least = np.minimum(np.abs(1 + D[:, 0, 0]), np.abs(1 + _response(A, B, C, D, self.omega)).min(axis=1))
         return np.where(unstable, inf, 1 / least)
 
     @cached_property
@@ -116,3 +117,10 @@ class Margins:
     @cached_property
     def _alone(self):  # type: ignore[no-untyped-def]  # a MarginFunction
         return batch_margin_function(self.loop, self.omega)
+
+
+def _response(A: Array, B: Array, C: Array, D: Array, omega: Array) -> Array:
+    """Frequency responses of systems, shape (m, frequencies)."""
+    one = np.eye(A.shape[-1])
+    found = [(C @ np.linalg.solve(1j * w * one - A, B.astype(complex)) + D)[:, 0, 0] for w in omega]
+    return np.stack(found, axis=-1)

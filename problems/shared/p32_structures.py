@@ -1,7 +1,7 @@
 """The controllers that compete on P32: their loops, what of them is free, and the reference that each follows."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,10 @@ class Structure:
     def parameters(self) -> po.ParameterSet:
         """Of the loop on the nominal plant, with the fixed values."""
         return self.loop().complete(drive()[1]).with_values({**COMMAND, **gains(self.fixed)})
+
+    def changed(self, change: Callable[[po.ClosedLoop], po.ClosedLoop]) -> "Structure":
+        """The same with a loop that a function changes."""
+        return replace(self, loop=lambda: change(self.loop()))
 
     def values(self, point: Array) -> dict[str, float]:
         """What a point of the unit cube stands for."""

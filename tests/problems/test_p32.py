@@ -11,6 +11,7 @@ from problems.shared.exact_linearisation import ExactLinearisation
 from problems.shared.p32 import SAMPLE_TIME, drive, fresh_plants, plants, trips
 from problems.shared.p32_margins import Margins
 from problems.shared.p32_moves import Outing, Profile
+from problems.shared.p32_rules import OMEGA, OUTER, RULED_GAINS, RULES, cascade_by_rule, ultimate_cycle
 from problems.shared.p32_search import Task, searched_plants
 from problems.shared.p32_simulator import FastSimulator, Lane, read
 from problems.shared.p32_structures import STRUCTURES, gains
@@ -132,19 +133,44 @@ def test_the_largest_ms_of_a_plant_is_among_all() -> None:
 def test_a_design_is_read_certified_and_drawn() -> None:
     structure = STRUCTURES[p32.WINNER]
     values = p32.designs()[p32.WINNER]
-    found = p32.evaluate(structure, values, {"nominal": {}}, 1.0)
+    found = p32.evaluate(structure, values, {"nominal": {}}, 2.0)
     rows = {claim.name: claim.value for claim in p32.rows("x", found)}
     assert rows["x.standing"] == rows["x.kept"] == 100.0
     assert rows["x.within"] <= 0.1
     assert found.sound.tolist() == [True]
-    bare = p32.evaluate(structure, {**values, **p32.WITHOUT["pulses"][1]}, {"nominal": {}}, 1.0)
+    bare = p32.evaluate(structure, {**values, **p32.WITHOUT["pulses"][1]}, {"nominal": {}}, 2.0)
     assert not bare.kept.all()
-    job = p32.Job({p32.WINNER: found, "linearisation": found}, {"linearisation": found}, {"pulses": bare})
+    job = p32.Job(
+        {p32.WINNER: found, "linearisation": found}, {"linearisation": found}, {"pulses": bare}, {"more": bare}
+    )
     claims = p32.main(job).set_index("name")["value"]
     assert claims["linearisation.slower"] == 1.0
     assert claims["fresh.linearisation.plants"] == 100.0
-    assert claims["without.pulses.kept"] < 100.0
+    assert claims["without.pulses.kept"] == claims["with.more.kept"] < 100.0
     assert p32.figure(job).axes
     task = Task(structure, {"nominal": {}})
     assert max(task.margins.peaks(gains(values))) <= 2.0
     assert task.read(values).error.shape == (9, 2)
+
+
+def test_an_ultimate_cycle_is_that_of_a_triple_lag() -> None:
+    """Of K/(T s + 1)^3: the gain 8/K at the frequency sqrt(3)/T; of several loops the one that oscillates first."""
+    loops = [K / (1 + 1j * T * OMEGA) ** 3 for K, T in ((2.0, 0.1), (0.5, 0.01))]
+    assert ultimate_cycle(np.array(loops)) == pytest.approx((4.0, np.sqrt(3) / 0.1), rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rule", RULES)
+def test_the_gains_of_a_rule_are_its_shares_of_those_that_are_barely_stable(rule: str) -> None:
+    """Stability by the closed loop's poles, of which the rule knows nothing."""
+    structure, share = STRUCTURES["cascade"], RULES[rule][0]
+    found = gains(cascade_by_rule(rule, p32.designs()["cascade"]))
+    margins = Margins(structure.loop(), structure.parameters(), [{}], points=8)
+
+    def is_stable(speed: float, integral: float, position: float) -> bool:
+        own = {"pid.Kp": speed, "pid.Ki": integral, "position_loop.Kp": position}
+        return bool(np.isfinite(margins.peaks(found | own)[0]))
+
+    Kp, Ki, K = (found[n] for n in RULED_GAINS)
+    assert [is_stable(k * Kp / share, 0.0, 0.0) for k in (0.99, 1.01)] == [True, False]
+    assert [is_stable(Kp, Ki, k * K / OUTER) for k in (0.99, 1.01)] == [True, False]
