@@ -150,6 +150,8 @@ function startPage() {
   copy.addEventListener("click", () => (text.select(), document.execCommand("copy")));
   place.append(element("p", {}, select, " ", reset, " ", copy), lamps, ...canvases, sliders, text);
   place.hidden = false;
+  const link = document.getElementById("live-link");
+  if (link) link.hidden = false;
 
   function draw() {
     const reference = DATA.references[chosen];

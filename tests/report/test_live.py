@@ -231,5 +231,8 @@ def test_a_page_runs_our_script_and_no_other() -> None:
     assert text.count("<script>") == text.count("</script>") == 1
     (live,) = (attrs for attrs in read.named("section") if attrs["id"] == "live")
     assert "hidden" in live, "without scripts nothing is missing that stands there"
+    whole = read_page(render_page(page))
+    (link,) = (attrs for attrs in whole.named("li") if attrs.get("id") == "live-link")
+    assert ("hidden" in link, "#live" in [a["href"] for a in whole.named("a")]) == (True, True), "the script shows it"
     assert "<script>" not in render_page(page, draws=False), "an interrupted command makes none"
     assert "<" not in to_script({HOSTILE: float("inf")})
