@@ -246,7 +246,7 @@ def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: flo
     measured = Variable("measured", law.measured.unit, f"the {law.measured.name}, as the controller's input shows it")
     inputs = (wanted, measured, *_more_inputs(loop))
     declared = {n: (q.unit, q.meaning) for n, q in loop.parameters.items()}
-    declared[CENTRE] = (unit, "output while the command is zero: where the valve is closed")
+    declared[CENTRE] = (unit, "output while the command is zero, as a valve's centre")
     units = {q.name: q.unit for q in loop.states} | {SAMPLE: "1"}
     return ControllerProgram(
         loop.pid.sample_time or 0.0,
