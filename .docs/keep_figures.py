@@ -10,7 +10,10 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 FIGURES = Path(__file__).with_name("figures")
-WIDTH, COLOURS = 1200, 96  # pixels, as many as a page shows on a sharp screen; in a palette, a third of the bytes
+WIDTH = 1200  # pixels, as many as a page shows on a sharp screen
+# A palette takes a third of the bytes. This one covers the colours evenly, so that a small star or the end of a colour
+# bar keeps its own; the usual one, by how many pixels have a colour, turned yellow into orange.
+PALETTE = {"colors": 256, "method": Image.Quantize.MAXCOVERAGE, "dither": Image.Dither.NONE}
 
 
 def keep(path: Path) -> Path:
@@ -23,7 +26,7 @@ def keep(path: Path) -> Path:
             (width, round(drawn.height * width / drawn.width)), Image.Resampling.LANCZOS
         )
     kept = FIGURES / path.name
-    small.quantize(COLOURS).save(kept, optimize=True, pnginfo=said)
+    small.quantize(**PALETTE).save(kept, optimize=True, pnginfo=said)
     return kept
 
 

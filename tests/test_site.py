@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
@@ -96,6 +97,22 @@ def test_a_kept_figure_is_small_and_says_what_drew_it(
         assert image.size == (1200, 400)
     assert pages.drawing_command(kept, "problems/tune/p32.py") == command
     assert pages.drawing_command(ROOT / ".docs/figures/crawl.png", "a.py PATH") == "python a.py PATH --out out"
+
+
+def test_a_kept_figure_shows_the_colours_that_were_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A star of a few pixels on a map keeps its colour, too."""
+    keeper = load("keep_figures")
+    monkeypatch.setattr(keeper, "FIGURES", tmp_path)
+    picture, drawn = Figure(figsize=(12, 4)), tmp_path / "out" / "map.png"
+    drawn.parent.mkdir()
+    axes = picture.subplots()
+    axes.imshow(np.linspace(0, 1, 300).reshape(10, 30), cmap="viridis")
+    axes.plot(15, 5, "*", color="#e57c00", ms=12)
+    picture.savefig(drawn, dpi=100, metadata={"Description": "python problems/a.py --out out"})
+    with Image.open(drawn) as image:
+        asked = np.asarray(image.convert("RGB"), dtype=int)
+    with Image.open(keeper.keep(drawn)) as image:
+        assert np.abs(np.asarray(image.convert("RGB"), dtype=int) - asked).max() <= 25
 
 
 @pytest.mark.slow
