@@ -212,7 +212,9 @@ def _advise_command(guess: LogGuess, unused: Container[str]) -> None:
     command, unit = ("force", "N") if "force" not in unused else ("torque", "N*m")
     if "valve_voltage" in unused and "valve_voltage" in found and command not in found:
         entry = f'{command} = {{ column = "{found["valve_voltage"]}", unit = "V", scale = "1 {unit}/V" }}'
-        say(f"{command}: no column; where the voltage commands it, [columns] takes {entry} with its scale", "  ")
+        held = f'[intersample] {command} = "held", for a controller holds it over a sample'
+        say(f"{command}: no column; where the voltage commands it, [columns] takes {entry} with its scale, and", "  ")
+        say(held, "    ")
 
 
 def say(text: str, indent: str = "") -> None:

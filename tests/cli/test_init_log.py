@@ -11,6 +11,7 @@ from pneuopt.files.first_files import first_files, first_kinds
 from pneuopt.files.tuning import read_tuning
 from pneuopt.identification.checks import check_logs
 from pneuopt.logs.read_log import read_log
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
 from tests.cli.test_init import run
 
@@ -116,6 +117,11 @@ def test_a_voltage_beside_no_force_is_said_to_be_its_command(
     code, output = run("init", kind, "--from", str(log), "-o", str(tmp_path))
     entry = f'{command} = {{ column = "U Ventil", unit = "V", scale = "{scale}" }}'
     assert (code, entry in " ".join(output.split())) == (0, True), output
+    assert f'[intersample] {command} = "held"' in output
+    sidecar = log.with_suffix(".toml").read_text("utf-8").replace("\n[columns]", f"\n[columns]\n{entry}")
+    log.with_suffix(".toml").write_text(f'{sidecar}\n[intersample]\n{command} = "held"\n', encoding="utf-8")
+    system = read_drive(tmp_path / "drive.toml")[0].system()
+    assert read_log(log, plant=system).intersample[command] is Intersample.HELD
     beside = write_foreign_log(tmp_path / "beside.csv", "t_ms;Kraft [N];U Ventil;x ist")
     assert "commands it" not in run("init", "force", "--from", str(beside), "-o", str(tmp_path))[1]
 
