@@ -11,7 +11,7 @@ motions of the margins; it counts where it oscillates at the least gain. The spe
 
 and the position's P, with the speed's loop closed, the ``.5 K_u`` of Ziegler and Nichols. The feedforward of the speed
 is what the valve needs, the mean of both ways, the inverse's width the valve's dead zone. Kessler's optima, and several
-equal poles, are for speed loops with real poles: the air gives this one a damping of .2, which a PI does not raise.
+equal poles, are for speed loops with real poles: the air gives this one a pair of little damping, which no PI raises.
 """
 
 from collections.abc import Mapping
