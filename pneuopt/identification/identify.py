@@ -32,6 +32,7 @@ from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
 from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
+from pneuopt.identification.profiled_optimum import fit_from_profiles
 from pneuopt.identification.repairs import input_behaviour, known_runs, window_runs
 from pneuopt.identification.result import ChosenWindow, IdentificationResult
 from pneuopt.identification.review import review_fit
@@ -184,7 +185,10 @@ def _fit_and_review(
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
     held, fit = hold_order(held, fit, label)
-    reviewed = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
+    reviewed, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
+    while better := fit_from_profiles(held, fit, profiles):
+        fit = better
+        reviewed, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
     result = replace(mark_order(held, reviewed), widths=widths, window=chosen)
     result = replace(result, status=problem.method.budget.name_end(result.status))
     if doubts.found:

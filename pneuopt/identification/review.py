@@ -49,7 +49,7 @@ MIN_REPORTED_GAP = 1e-4  # of a state's nominal size: smaller gaps are integrati
 
 def review_fit(
     problem: EstimationProblem, result: IdentificationResult, unidentifiable: Sequence[str] = ()
-) -> IdentificationResult:
+) -> tuple[IdentificationResult, tuple[Profile, ...]]:
     """Review the intervals of a fit, and mark what its logs do not identify.
 
     Parameters
@@ -62,11 +62,13 @@ def review_fit(
 
     Returns
     -------
-    IdentificationResult
+    result : IdentificationResult
         The result with its verdict; where the search did not converge, without any interval, and with the worst place
         in its status. Doubtful intervals are replaced by those of the profile likelihood; a parameter with an open
         interval, or one that the logged motion does not excite, has no standard deviation. Ctrl-C leaves the other
         intervals as they are, and the status says so.
+    profiles : tuple of Profile
+        Those that were traced.
     """
     start = problem.start_from(result)
     if not result.status.converged:
@@ -76,14 +78,9 @@ def review_fit(
             if result.status.code is Code.INTERRUPTED
             else _locate_failure(problem, start, result.status, verdict)
         )
-        blank = _blank_intervals(result.estimates, result.estimates.index)
-        return replace(
-            result,
-            estimates=_add_notes(blank, verdict),
-            covariance=result.covariance * math.nan,
-            status=status,
-            verdict=verdict,
-        )
+        estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict)
+        unknown = result.covariance * math.nan
+        return replace(result, estimates=estimates, covariance=unknown, status=status, verdict=verdict), ()
     result = replace(result, estimates=_blank_intervals(result.estimates, unidentifiable))
     profiles, waiting = _profiles(problem, result)
     trusted = result.stats["chi_square_ratio"] <= MAX_CHI_SQUARE_RATIO
@@ -97,7 +94,8 @@ def review_fit(
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _widen_covariance(result.covariance, estimates["stderr"])
     status = _name_part(problem, _name_interruption(result.status, waiting), verdict)
-    return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
+    result = replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
+    return result, tuple(profiles.values())
 
 
 def _blank_covariance(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
