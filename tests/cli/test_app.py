@@ -278,8 +278,9 @@ def test_a_signal_ends_a_real_process_with_its_status(name: str, status: int, fo
     code = (
         "import os, signal, sys\n"
         "from pneuopt.cli import tune\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a job in the background inherits it as ignored
         "number = getattr(signal, sys.argv.pop(1))\n"
+        "own = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL\n"
+        "signal.signal(number, own)\n"  # a job in the background, or under nohup, inherits it as ignored
         "tune.tune = lambda *a, **k: os.kill(os.getpid(), number)\n"
         "from pneuopt.__main__ import main\n"
         "main()\n"
