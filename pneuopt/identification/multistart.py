@@ -13,10 +13,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.excerpts import cut_excerpts, filter_states
 from pneuopt.identification.fit_order import are_alike, is_optimum, rank
-from pneuopt.identification.identifiability import rejects_held_values
+from pneuopt.identification.identifiability import rejects_held_values, rests_on_prior
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
@@ -323,7 +325,8 @@ def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
     problem : EstimationProblem
         With what is held.
     fit : Fit
-        The given one, where nothing was unsettled, or the rest does not converge either.
+        The given one, where nothing was unsettled, the rest does not converge either, or only the prior of what is held
+        tells of it.
     """
     held, part = problem, fit
     warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
@@ -336,7 +339,17 @@ def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
         part = part.with_effort_of(before)
         if part.status.code in (Code.INTERRUPTED, Code.DIVERGED):
             return problem, fit
-    return held, part
+    return (problem, fit) if _rests_on_held(held, part) else (held, part)
+
+
+def _rests_on_held(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether the logs tell nothing of any other parameter where those held may be ten times as large."""
+    if fit.covariance is None or fit.prior_covariance is None:
+        return False
+    names = fit.parameters.free_names
+    values, free = np.array([fit.parameters.value(n) for n in names]), [n not in problem.held for n in names]
+    covariance = fit.covariance + fit.prior_covariance
+    return bool(rests_on_prior(covariance, fit.prior_covariance, values, problem.held.values())[free].all())
 
 
 def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:

@@ -205,22 +205,6 @@ def test_a_start_that_is_too_stiff_to_be_searched_holds_nothing(monkeypatch: pyt
     assert (dict(held.held), fit.unidentifiable, calls) == ({}, (), 1)
 
 
-@pytest.mark.parametrize("name", ["friction.static", VELOCITY])
-def test_a_parameter_that_did_not_settle_is_held_and_the_others_are_fitted(name: str) -> None:
-    problem = posed(Stribeck())
-    done = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
-    assert done.status.converged
-    assert starting.fit_a_part(problem, done, "start") == (problem, done)
-    status = Status(Code.NOT_CONVERGED, (f"{name} would still move", "try more iterations"))
-    off = done.parameters.with_values({name: 1.05 * done.parameters.value(name)})
-    unsettled = replace(done, status=status, unsettled=(name,), parameters=off)
-    held, part = starting.fit_a_part(problem, unsettled, "start")
-    assert part.status.converged
-    assert held.held == {name: off.value(name)}
-    assert part.parameters.value(name) == off.value(name)
-    assert part.parameters.value("friction.coulomb") == pytest.approx(30, rel=0.1)
-
-
 def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a model that misses its log a little two starts agree; settling the others costs six times as much."""
     problem, labels = posed(Stribeck()), list[str]()
