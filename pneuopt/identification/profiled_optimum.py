@@ -27,7 +27,8 @@ def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[P
     Returns
     -------
     Fit or None
-        None where every estimate lies in its interval. The given one, not converged, where no better one is found.
+        None where every estimate lies in its interval. The given one, not converged, where no better one is found; of
+        an interrupted search the better of both, marked.
     """
     found = next((p for p in profiles if not p.low <= p.estimate <= p.high), None)
     if found is None:
@@ -38,8 +39,10 @@ def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[P
     method = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
     start = replace(start, parameters={**start.parameters, **values})
     better = solve_least_squares(problem.transcription(start), method).with_effort_of(fit)
-    is_better = better.status.converged and better.stats["cost"] < fit.stats["cost"]
-    if is_better or better.status.code is Code.INTERRUPTED:
+    is_better = better.stats["cost"] < fit.stats["cost"]
+    if better.status.code is Code.INTERRUPTED:
+        return better if is_better else replace(fit, status=better.status)
+    if is_better and better.status.converged:
         return better
-    verdict = f"{found.name} fits better at {value:.4g} {found.unit}, where the search does not converge"
+    verdict = f"{found.name} fits better at {value:.4g} {found.unit}, from where the search finds no better optimum"
     return replace(fit, status=Status(Code.NOT_CONVERGED, (verdict, "try other start values, or fix a parameter")))

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from pneuopt.identification import identify as identification
+from pneuopt.identification import profiled_optimum
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.profiled_optimum import fit_from_profiles
 from pneuopt.identification.profiles import Profile
@@ -14,7 +15,7 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.review import review_fit
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
-from pneuopt.quantities.status import Code
+from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.least_squares import solve_least_squares
 from pneuopt.shooting.solution import Fit
 from tests.identification.test_multistart import TRUTH, VELOCITY, posed
@@ -61,9 +62,21 @@ def test_a_fit_that_is_bettered_by_its_profile_alone_has_not_converged() -> None
     assert found.status.code is Code.NOT_CONVERGED
     assert (
         found.status.verdict
-        == "friction.stribeck_velocity fits better at 0.012 m/s, where the search does not converge"
+        == "friction.stribeck_velocity fits better at 0.012 m/s, from where the search finds no better optimum"
     )
     assert found.parameters == lucky.parameters
+
+
+@pytest.mark.parametrize("excess", [-10.0, 1e6])
+def test_an_interrupted_search_leaves_the_better_of_both(excess: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, done = optimum()
+    beside = replace(done, stats={**done.stats, "cost": done.stats["cost"] + excess})
+    stopped = replace(done, status=Status(Code.INTERRUPTED, ("the best iterate so far",)))
+    monkeypatch.setattr(profiled_optimum, "solve_least_squares", lambda *_: stopped)
+    found = fit_from_profiles(problem, beside, [profile(0.05, TRUTH)])
+    assert found is not None
+    assert found.status == stopped.status
+    assert found.stats["cost"] == min(beside.stats["cost"], done.stats["cost"])
 
 
 def test_identify_reviews_the_better_fit(monkeypatch: pytest.MonkeyPatch) -> None:
