@@ -227,3 +227,21 @@ def test_longer_windows_are_chosen_only_if_shorter_ones_agree(
     assert found is not None
     assert found[2].duration == chosen
     assert tried == [0.4, 0.2, 0.1]  # each begins with the answer of the one before
+
+
+def test_a_budget_that_ends_in_one_length_leaves_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = list[float]()
+
+    def trial(_: EstimationProblem, __: object, length: float, ___: int) -> Mock:
+        tried.append(length)
+        own = Mock(length=length, is_answer=length == 0.4, rank=(0, False, 0.0))
+        own.fit.status.code = Code.CONVERGED if length == 0.4 else Code.INTERRUPTED
+        return own
+
+    monkeypatch.setattr(windows, "_has_failed_by_gaps", lambda *_: True)
+    monkeypatch.setattr(windows, "_lengths", lambda _: [0.1, 0.2, 0.4])
+    monkeypatch.setattr(windows, "_try_length", trial)
+    found = windows.fit_in_windows(Mock(window=math.inf), Mock(stats={"gap_share": 0.5}))
+    assert tried == [0.4, 0.2]
+    assert found is not None
+    assert found[2].duration == 0.4
