@@ -92,6 +92,6 @@ def plants(given: po.ParameterSet) -> dict[str, dict[str, float]]:
     return {"nominal": {}, **po.corners(given, SPREADS)}
 
 
-def fresh_plants(given: po.ParameterSet, count: int, seed: int = 2026) -> Mapping[str, Mapping[str, float]]:
+def fresh_plants(given: po.ParameterSet, count: int, seed: int = 2027) -> Mapping[str, Mapping[str, float]]:
     """Plants drawn from the box of the corners."""
     return po.samples(given, SPREADS, count, seed=seed)

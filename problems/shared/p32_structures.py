@@ -127,10 +127,10 @@ EXACT = MOVE | {
 } | OUTER | INVERSE  # fmt: skip
 LEARNS = {"exact_linearisation.adaptation": (100.0, 2e4), "exact_linearisation.mass_adaptation": (10.0, 2e4)}
 PULSES: dict[str, Range] = {"impulsive_control.amplitude": (0.5, 3.5), "impulsive_control.growth": (1.04, 1.2)}
-# No pulse comes within what the encoder can tell of the tolerance; a motion that ends short by twice the tolerance does
+# No pulse comes within what the encoder can tell of the tolerance; a motion that ends short by three tolerances does
 # not pass the end where the piston is slow to brake, and leaves the rest to pulses.
 WITHIN = {"impulsive_control.tolerance": TOLERANCE - 2 * COUNT, "impulsive_control.limit": LIMIT}
-WITHIN |= {"move.short": 2 * TOLERANCE}
+WITHIN |= {"move.short": 3 * TOLERANCE}
 BARE = {"pid.Kp": 0.0}  # what the exact linearisation commands is no part of a PID
 STRUCTURES: Mapping[str, Structure] = {
     "impulsive": Structure(impulsive, EXACT | LEARNS | PULSES, BARE | WITHIN),
