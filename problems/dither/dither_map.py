@@ -5,24 +5,26 @@
 A 32 mm cylinder with low-friction seals (10/14 N) and 5 kg behind a valve of 80 Hz with a dead zone of 5 %, under a PID
 at 1 kHz whose derivative is filtered over 10 ms. The speed is an encoder's difference: a count of 10 um is 10 mm/s, a
 fifth of the set speed, and a filter of 10 ms makes 0.9 mm/s of it. Steps from rest to 50 mm/s, and from there to
--50 mm/s through the dead zone; what is minimised is the longer settling time to 5 %, overshoot at most 5 %.
+-50 mm/s through the dead zone, with 4, 5 and 6 kg; what is minimised is the worst settling time to 5 %, overshoot at
+most 5 %.
 
 Rows with.*: gains, amplitude and frequency of a sine together; triangle.* those of a triangle at the sine's frequency.
-Both are certified. Rows without.*: the gains alone, of which no certified design was found; the rows are those of the
-best that the certificate refused. "gain" is how many times sooner the dithered design settles than the design without,
-for which the horizon stands: a lower bound. Rows light.* and heavy.*: the dithered design with 4 and 6 kg, for which it
-was not tuned. Rows map.* are the settling time over amplitude and frequency, at the gains of either design; a cell is
-useful where it settles at least 5 % sooner than the same gains without dither. Rows verdict.*: what `judge_dither`
-says, 1 useful, .5 useful with these gains, 0 useless, -1 harmful: useful, the gains of each design its own, and at the
-same gains at least with these; its price is air and valve travel.
+Both are certified on all plants. Rows without.*: the gains alone, of which no certified design was found; the rows are
+those of the best that the certificate refused. "gain" is how many times sooner the dithered design settles than the
+design without, for which the horizon stands: a lower bound. Rows quiet.*: the search again with half of the dither's
+extra air allowed; no design that settles was found. Rows map.* are of the nominal plant: the settling time over
+amplitude and frequency, at the gains of either design; a cell is useful where it settles at least 5 % sooner than the
+same gains without dither. Rows verdict.*: what `judge_dither` says, 1 useful, .5 useful with these gains, 0 useless, -1
+harmful: useful, the gains of each design its own, and at the same gains at least with these; its price is air and valve
+travel.
 """
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `problems`
 
@@ -45,7 +47,7 @@ SPEED, HORIZON, BAND = 0.05, 0.8, 0.05  # [m/s], [s], of the step
 UP = po.Step(SPEED, horizon=HORIZON, start={"position": 0.25, "pressure_b": 3.5e5})
 BACK = po.Step(-2 * SPEED, initial=SPEED, horizon=HORIZON, start={"position": 0.25})
 STEPS = [UP, BACK]
-OTHER_LOADS = {"light": {"load.mass": 4.0}, "heavy": {"load.mass": 6.0}}
+PLANTS = {"heavy": {"load.mass": 6.0}, "light": {"load.mass": 4.0}}
 HARDWARE = {"valve.dead_zone": 0.05, "friction.coulomb": 10.0, "friction.static": 14.0}
 RESOLUTION, FILTER, SAMPLE = 1e-5, 0.01, 1e-3  # [m], [s], [s]
 GIVEN = {"pid.Kp": 2.0, "pid.Ki": 20.0, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.upper": 5.0}
@@ -59,22 +61,19 @@ SOONER = 0.95
 BOUNDS = {
     "gain": ">= 2", "with.ripple": "<= 0.005", "verdict.retuned": "1 +- 0", "verdict.same": ">= 0.5",
     "map.with.useful": ">= 0.05", "map.without.useful": ">= 0.05",
-    **{f"{name}.settling_time": "<= 0.36" for name in ("with", "triangle", "light", "heavy")},
+    **{f"{name}.settling_time": "<= 0.36" for name in ("with", "triangle")},
     "with.overshoot": "<= 5", "triangle.overshoot": "<= 5",
-    "with.certified": "1 +- 0", "triangle.certified": "1 +- 0", "without.certified": "0 +- 0",
+    **{f"{name}.certified": "1 +- 0" for name in ("with", "triangle")},
+    **{f"{name}.certified": "0 +- 0" for name in ("without", "quiet")},
 }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Designs, verdicts; settling times [s] and air [l(ANR)] over amplitude and frequency; CPU seconds.
-
-    `loads` are the settling times [s] of the dithered design with other loads, the longer of both steps.
-    """
+    """Designs, verdicts; settling times [s] and air [l(ANR)] over amplitude and frequency; CPU seconds."""
 
     designs: Mapping[str, po.TuningResult]
     verdicts: Mapping[str, po.DitherVerdict]
-    loads: Mapping[str, float]
     maps: Mapping[str, Array]
     air: Mapping[str, Array]
     seconds: float
@@ -92,12 +91,15 @@ def run() -> Job:
     start = {n: found.value(n) for n in (*GAINS, "dither.amplitude", "dither.frequency")}
     amplitude = {"dither.amplitude": DITHER["dither.amplitude"]}
     designs["triangle"] = tuned({**GAINS, **amplitude}, start, shape=po.Waveform.TRIANGLE)
-    loads = {}
-    for name, load in OTHER_LOADS.items():
-        loads[name] = longest(po.evaluate(loop, STEPS, found.with_values(load), band=BAND))
+    designs["quiet"] = tuned({**GAINS, **DITHER}, start, limits=[po.AirUse(air_limit(verdicts["retuned"]))])
     maps = {name: mapped(loop, given) for name, given in {"without": own, "with": found}.items()}
     settled, air = ({name: both[k] for name, both in maps.items()} for k in (0, 1))
-    return Job(designs, verdicts, loads, settled, air, time.process_time() - began)
+    return Job(designs, verdicts, settled, air, time.process_time() - began)
+
+
+def air_limit(verdict: po.DitherVerdict) -> float:
+    """Half-way between the air without and with dither [l(ANR)]."""
+    return float(np.mean([float(verdict.table[n]["AirUse"]) for n in ("without", "with")]))
 
 
 def controlled(shape: po.Waveform = po.Waveform.SINE) -> po.ClosedLoop:
@@ -115,13 +117,16 @@ def tuned(
     ranges: Mapping[str, tuple[float, float]],
     start: Mapping[str, float],
     shape: po.Waveform = po.Waveform.SINE,
+    limits: Sequence[Any] = (),
 ) -> po.TuningResult:
-    """Minimises the longer settling time of both steps."""
+    """Minimises the worst settling time over the steps and plants."""
     loop = controlled(shape)
     given = filled(loop).with_values(start).with_bounds(ranges).freed(*ranges)
     method = SEARCH if "dither.amplitude" in ranges else LONGER
-    limits, asked = [po.Overshoot(0.05)], po.SettlingTime(BAND)
-    return po.tune(loop, STEPS, given, minimise=asked, subject_to=limits, method=method, plants={}, throw=False)
+    limits, asked = [po.Overshoot(0.05), *limits], po.SettlingTime(BAND)
+    return po.tune(
+        loop, STEPS, given, minimise=asked, subject_to=limits, scenarios=PLANTS, method=method, plants={}, throw=False
+    )
 
 
 def best(found: po.TuningResult) -> po.ParameterSet:
@@ -130,10 +135,9 @@ def best(found: po.TuningResult) -> po.ParameterSet:
     return found.parameters.with_values(tried)
 
 
-def longest(certified: "DataFrame") -> float:
-    """The longer settling time of both steps [s]; infinite where one never settles."""
-    steps = certified[[step.label for step in STEPS]]
-    return float(np.max(steps.loc["SettlingTime"].fillna(np.inf).to_numpy(dtype=float)))
+def worst(found: po.TuningResult, metric: str) -> float:
+    """The largest over steps and plants, as certified; infinite where one is never reached."""
+    return float(np.max(found.certified.loc[metric].fillna(np.inf).to_numpy(dtype=float)))
 
 
 def mapped(loop: po.ClosedLoop, gains: po.ParameterSet) -> tuple[Array, Array]:
@@ -160,9 +164,11 @@ def main(job: Job) -> "DataFrame":
         claims += design(name, best(found), certified)
         claims.append(Claim(f"{name}.dither_frequency", best(found).value("dither.frequency"), "Hz"))
         claims.append(Claim(f"{name}.certified", float(found.status.converged)))
-    alone, dithered = (min(longest(job.designs[n].certified), HORIZON) for n in ("without", "with"))
+        if "AirUse" in certified.index:
+            allowed = f"<= {air_limit(job.verdicts['retuned']):.6g}"
+            claims.append(Claim(f"{name}.air", worst(found, "AirUse"), "l", None, allowed if name == "quiet" else ""))
+    alone, dithered = (min(worst(job.designs[n], "SettlingTime"), HORIZON) for n in ("without", "with"))
     claims.append(Claim("gain", alone / dithered))
-    claims += [Claim(f"{name}.settling_time", seconds, "s", dithered) for name, seconds in job.loads.items()]
     for name, verdict in job.verdicts.items():
         claims.append(Claim(f"verdict.{name}", VERDICT_SCORES[verdict.usefulness.name]))
         for row, unit in {"AirUse": "l", "ValveTravel": "1", "Ripple": "m/s"}.items():
