@@ -17,7 +17,7 @@ import numpy as np
 from pneuopt.dynamics.hooks import Log
 from pneuopt.models.pneumatic.following import PRESSURE_NAMES
 from pneuopt.models.pneumatic.starts import PneumaticLog, valve_shapes
-from pneuopt.models.starts.friction import filter_channel
+from pneuopt.models.starts.filters import filter_channel
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.units import ATMOSPHERE
 

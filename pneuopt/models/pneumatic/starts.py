@@ -20,10 +20,10 @@ from pneuopt.dynamics.system import System
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.pneumatic.following import PRESSURE_NAMES, AirSimulator
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
+from pneuopt.models.starts.filters import FILTER_TIMES, filter_channel, filter_motion
 from pneuopt.models.starts.friction import (
     RegressionRows,
-    filter_channel,
-    filter_motion,
+    choose_filter_time,
     force_misfit,
     friction_candidates,
     load_columns,
@@ -77,6 +77,12 @@ class PneumaticStarts:
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates with one valve, and with friction for each scanned Stribeck velocity."""
         runs = self.prepare_logs(logs)
+        if all(set(PRESSURE_NAMES) <= set(run.logged_pressures) for run in runs.values()):
+            filtered = functools.cache(functools.partial(self.prepare_logs, logs))
+            window = choose_filter_time(
+                self.friction, lambda window: {n: run.force_balance({}) for n, run in filtered(window).items()}
+            )
+            runs = filtered(window)
         valve = _estimate_valve(self.friction, runs)
         starts = friction_candidates(self.friction, {name: run.force_balance(valve) for name, run in runs.items()})
         valve_values: dict[str, float] = {}
@@ -84,10 +90,10 @@ class PneumaticStarts:
             valve_values |= per_log_values(name, value, {n: log.parameters for n, log in logs.items()})
         return Starts([functools.partial(_with_valve, starts, i, valve_values) for i in range(len(starts))])
 
-    def prepare_logs(self, logs: Mapping[str, Log]) -> dict[str, "PneumaticLog"]:
-        """Logs with the motion and the air of this drive."""
+    def prepare_logs(self, logs: Mapping[str, Log], window: float = FILTER_TIMES[0]) -> dict[str, "PneumaticLog"]:
+        """Logs with the motion and the air of this drive, filtered with a window [s]."""
         simulator_for = functools.partial(_air_simulator, self.system())
-        return {name: PneumaticLog(log, simulator_for, self.air_force) for name, log in logs.items()}
+        return {name: PneumaticLog(log, simulator_for, self.air_force, window) for name, log in logs.items()}
 
 
 @functools.lru_cache(maxsize=32)
@@ -104,18 +110,20 @@ def _with_valve(starts: Sequence[Start], index: int, valve: ValveValues) -> Star
 class PneumaticLog:
     """A log with its filtered motion and pressures, and the states that follow from them for a given valve."""
 
-    def __init__(self, log: Log, simulator_for: Callable[[tuple[str, ...]], AirSimulator], push: AirForce) -> None:
-        self.measured, self.parameters = log.measured, log.parameters
+    def __init__(
+        self, log: Log, simulator_for: Callable[[tuple[str, ...]], AirSimulator], push: AirForce, window: float
+    ) -> None:
+        self.measured, self.parameters, self._window = log.measured, log.parameters, window
         self._simulator_for, self._air_force = simulator_for, push
         self._air_by_centre: dict[float, dict[str, Array]] = {}
-        position, speed, self._acceleration = filter_motion(self.measured)
+        position, speed, self._acceleration = filter_motion(self.measured, window)
         if "position" not in self.measured:
             position = position + self._start_position(position)
         self.logged_pressures = tuple(n for n in PRESSURE_NAMES if n in self.measured)
         self.known_states = {
             "position": position,
             "speed": speed,
-            **{n: filter_channel(self.measured, n, 0) for n in self.logged_pressures},
+            **{n: filter_channel(self.measured, n, 0, window) for n in self.logged_pressures},
         }
         self._known_signals = self.measured.select(["valve_voltage"]).with_columns(self.known_states)
 
@@ -156,7 +164,8 @@ class PneumaticLog:
         air = self._air_states(shape.get(CENTRE, self.parameters.value(CENTRE)))
         closed, edges, leaking = self._pressure_rates(probes, air)
         columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
-        return columns, np.column_stack([filter_channel(self.measured, n, 1) for n in self.logged_pressures]) - closed
+        rates = [filter_channel(self.measured, n, 1, self._window) for n in self.logged_pressures]
+        return columns, np.column_stack(rates) - closed
 
     def _pressure_rates(self, valves: Sequence[ValveValues], air: Mapping[str, Array]) -> Array:
         """Rates of the logged pressures with each of several valves [Pa/s], shape (len(valves), n, m)."""

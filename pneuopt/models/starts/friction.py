@@ -7,28 +7,24 @@ a few values gives a candidate by one bounded linear least squares, in milliseco
 import functools
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.signal import savgol_filter
 
 from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.models.friction import FrictionModel, law_inputs
 from pneuopt.models.friction_start import FrictionSamples, FrictionStart
 from pneuopt.models.load import GRAVITY
+from pneuopt.models.starts.filters import FILTER_TIMES, filter_motion
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-# Spread of the steps [1], over the usual one, that the filter takes as even: above, derivatives of a log that lacks
-# samples are wrong; below, every log with jitter is resampled.
-MAX_JITTER = 0.5
-# Window of the Savitzky-Golay filter of order 3 [s]: a shorter one leaves noise in the acceleration, a longer one
-# flattens stick and slip.
-FILTER_TIME = 0.031
+# Unexplained share of the force over that with a longer window [1] below which the shorter one is taken: a higher ratio
+# takes chance for a better balance, a lower one keeps slips flattened.
+MIN_BALANCE_GAIN = 0.85
 # Speed above which a sample shows sliding friction [m/s]: below a smaller one the drive sticks, a larger one drops the
 # Stribeck curve.
 SLIDING_SPEED = 4e-3
@@ -46,6 +42,7 @@ PRESLIDING_DEFLECTIONS = 3.0
 SLOW_SPEED = 1e-2  # speed below which friction is near its static level and bristles still bend [m/s]
 STATIC_QUANTILE = 0.995  # quantile of the force in slow samples that counts as static friction; 1 would be an outlier
 STATIC_WEIGHT = 0.003  # squared weight of that sample, in sliding samples; with more it bends the whole curve
+STUCK_WEIGHT = 10.0  # the same where nothing slides: with less, presliding counts as friction that hardly holds
 
 
 def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
@@ -56,12 +53,18 @@ def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[S
     LogError
         If a log has neither position nor speed.
     """
+    filtered = functools.cache(functools.partial(_force_balances, logs))
+    return friction_candidates(friction, filtered(choose_filter_time(friction, filtered)))
+
+
+def _force_balances(logs: Mapping[str, Log], window: float) -> dict[str, "RegressionRows"]:
+    """The rows of logs of a force, filtered with a window [s]."""
     rows = {}
     for name, (measured, parameters, _) in logs.items():
-        position, speed, acceleration = filter_motion(measured)
+        position, speed, acceleration = filter_motion(measured, window)
         columns, states = load_columns(parameters, position, acceleration), {"position": position, "speed": speed}
         rows[name] = RegressionRows(measured, parameters, speed, measured["force"], columns, states)
-    return friction_candidates(friction, rows)
+    return rows
 
 
 def motion_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
@@ -84,34 +87,6 @@ def load_columns(parameters: ParameterSet, position: Array, acceleration: Array)
     if "load.stiffness" in parameters:
         columns["load.stiffness"] = position - parameters.value("load.rest_position")
     return columns
-
-
-def filter_motion(measured: Trajectory) -> tuple[Array, Array, Array]:
-    """Filtered position [m], speed [m/s] and acceleration [m/s^2], from whichever of position and speed is logged."""
-    require(
-        "position" in measured or "speed" in measured,
-        "the log has neither 'position' nor 'speed', without which friction is unidentifiable; log one of them",
-        LogError,
-    )
-    if "position" in measured:
-        speed = filter_channel(measured, "speed", 0) if "speed" in measured else filter_channel(measured, "position", 1)
-        return filter_channel(measured, "position", 0), speed, filter_channel(measured, "position", 2)
-    speed, acceleration = filter_channel(measured, "speed", 0), filter_channel(measured, "speed", 1)
-    return np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(measured.t))]), speed, acceleration
-
-
-def filter_channel(measured: Trajectory, name: str, derivative: int) -> Array:
-    """Channel, or its derivative by time, by a Savitzky-Golay filter; missing and uneven samples are interpolated."""
-    steps = np.diff(measured.t)
-    step = float(np.median(steps))
-    if np.ptp(steps) > MAX_JITTER * step:
-        grid = np.linspace(measured.t[0], measured.t[-1], math.ceil(measured.duration / step) + 1)
-        even = Trajectory(grid, {name: np.interp(grid, measured.t, measured.fill_gaps(name))})
-        return np.interp(measured.t, grid, filter_channel(even, name, derivative))
-    window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
-    window = min(window, (len(measured) - 1) // 2 * 2 + 1)
-    column = measured.fill_gaps(name)
-    return np.asarray(savgol_filter(column, window, min(3, window - 1), deriv=derivative, delta=step))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +115,7 @@ def _candidate(
     tried: Mapping[str, float],
 ) -> Start:
     """The start with these values of the scanned parameters."""
-    values, _ = _regress(friction, logs, parameters, dict(tried))
+    values = _regress(friction, logs, parameters, dict(tried))[0]
     guess: dict[str, float] = {}
     for name, value in tried.items():
         guess |= per_log_values(f"friction.{name}", value, {n: rows.parameters for n, rows in logs.items()})
@@ -159,6 +134,40 @@ def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) ->
         return math.inf
     tried = {name: values[0] for name, values in friction.start.scanned.items()}
     return float(np.mean(np.abs(_regress(friction, thinned, parameters, tried)[1])))
+
+
+def choose_filter_time(friction: FrictionModel, balances: Callable[[float], Mapping[str, RegressionRows]]) -> float:
+    """The window of the filter with which the least share of the force stays unexplained [s].
+
+    Parameters
+    ----------
+    friction : FrictionModel
+    balances : callable
+        Returns the rows of the logs that are filtered with a window [s].
+
+    Returns
+    -------
+    float
+        The longest one, unless a shorter one leaves clearly less; none is tried after one that leaves more.
+    """
+    chosen, left, least = FILTER_TIMES[0], math.inf, math.inf
+    for window in FILTER_TIMES:
+        share = _unexplained_share(friction, balances(window))
+        if share > least:
+            break
+        least = share
+        if share < MIN_BALANCE_GAIN * left:
+            chosen, left = window, share
+    return chosen
+
+
+def _unexplained_share(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:
+    """Mean absolute force that friction does not explain, over that in the same samples [1]; inf if it is unknown."""
+    parameters = next(iter(logs.values())).parameters
+    tried = {name: values[0] for name, values in friction.start.scanned.items()}
+    _, unexplained, force = _regress(friction, logs, parameters, tried)
+    share = float(np.mean(np.abs(unexplained)) / max(float(np.mean(np.abs(force))), np.finfo(float).tiny))
+    return share if math.isfinite(share) else math.inf
 
 
 def _scanned_values(start: FrictionStart, parameters: ParameterSet) -> list[dict[str, float]]:
@@ -190,8 +199,11 @@ def _thin_rows(rows: RegressionRows) -> RegressionRows:
 
 def _regress(
     friction: FrictionModel, logs: Mapping[str, RegressionRows], parameters: ParameterSet, tried: Mapping[str, float]
-) -> tuple[dict[str, float], Array]:
-    """Bounded robust least squares over all logs' sliding samples; returns the values and the residuals [N]."""
+) -> tuple[dict[str, float], Array, Array]:
+    """Bounded robust least squares over all logs' sliding samples: the values, their residuals and forces [N].
+
+    Where nothing slides, friction is its static level, and the samples tell of little else.
+    """
     parts = [_log_columns(friction, name, rows, tried) for name, rows in logs.items()]
     free = list(dict.fromkeys(n for columns, _ in parts for n in columns))
     A = np.vstack(
@@ -206,17 +218,20 @@ def _regress(
         stiffness = np.clip(_presliding_slope(logs, pull, 0.6 * level), *friction.start.bristles.range)
         travelled = np.concatenate([_distance_since_reversal(part) for part in logs.values()])
         sliding &= travelled > PRESLIDING_DEFLECTIONS * level / stiffness
-    rows = sliding if np.count_nonzero(sliding) > 10 * len(free) else known
+    slides = np.count_nonzero(sliding) > 10 * len(free)
+    rows = sliding if slides else known
     if not free:
-        return {}, y[rows]
+        return {}, y[rows], y[rows]
     bases = {n: parameters[n.split("[")[0]] for n in free}
     lower, upper = _regression_bounds(friction.start, bases, float(np.median(np.abs(y[rows]))))
-    weight = math.sqrt(STATIC_WEIGHT * np.count_nonzero(rows))
+    if not slides:  # nothing tells static friction from Coulomb's
+        upper = np.where(np.isin([n.split("[")[0] for n in free], _excesses(friction.start)), lower + 1e-9, upper)
+    weight = math.sqrt((STATIC_WEIGHT if slides else STUCK_WEIGHT) * np.count_nonzero(rows))
     stuck = [(_coefficient_row(columns, free), level) for columns, level in _static_levels(friction, logs, tried)]
     given = np.array([row for row, _ in stuck]).reshape(-1, len(free)), np.array([level for _, level in stuck])
     x = _robust_least_squares(A[rows], y[rows], lower, upper, (weight * given[0], weight * given[1]))
     values = _raise_levels(friction.start, dict(zip(free, x.tolist(), strict=True)), parameters)
-    return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}, y[rows] - A[rows] @ x
+    return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}, y[rows] - A[rows] @ x, y[rows]
 
 
 def _raise_levels(start: FrictionStart, values: dict[str, float], parameters: ParameterSet) -> dict[str, float]:
@@ -240,7 +255,7 @@ def _static_levels(
     friction: FrictionModel, logs: Mapping[str, RegressionRows], tried: Mapping[str, float]
 ) -> list[tuple[dict[str, float], float]]:
     """Regression row and force of a slow sample just before break-away, for each log: friction is static there."""
-    out, levels = [], {f"friction.{n}" for n in friction.start.above}
+    out, levels = [], _excesses(friction.start)
     for name, rows in logs.items():
         _, pull = _log_columns(friction, name, rows, tried)
         slow = np.flatnonzero((np.abs(rows.speed) < SLOW_SPEED) & np.isfinite(pull))
@@ -312,11 +327,16 @@ def _robust_least_squares(
 def _regression_bounds(start: FrictionStart, bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]:
     """Bounds of the regression: those of the parameters, and the law's floors, which keep friction positive."""
     floors = {f"friction.{n}": share * level for n, share in start.floors.items()}
-    excesses, shared = {f"friction.{n}" for n in start.above}, {n: n.split("[")[0] for n in bases}
+    excesses, shared = _excesses(start), {n: n.split("[")[0] for n in bases}
     given = [0.0 if shared[n] in excesses else p.lower for n, p in bases.items()]
     lower = np.array([max(floors.get(shared[n], -np.inf), lo) for n, lo in zip(bases, given, strict=True)])
     upper = np.array([max(p.upper, lo + 1e-9) for p, lo in zip(bases.values(), lower, strict=True)])
     return lower, upper
+
+
+def _excesses(start: FrictionStart) -> list[str]:
+    """The parameters whose columns multiply their excess over another one."""
+    return [f"friction.{n}" for n in start.above]
 
 
 def _bristle_deflections(

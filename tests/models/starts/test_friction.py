@@ -9,7 +9,13 @@ from pneuopt.dynamics.system import DiscreteSystem, discretise, names, parameter
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.load import Load
-from pneuopt.models.starts.friction import RegressionRows, filter_motion, force_misfit, load_columns
+from pneuopt.models.starts.filters import FILTER_TIMES, filter_motion
+from pneuopt.models.starts.friction import (
+    RegressionRows,
+    choose_filter_time,
+    force_misfit,
+    load_columns,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
@@ -225,3 +231,48 @@ def test_bending_bristles_do_not_pass_for_sliding() -> None:
     values = starts(drive, {"run": log}, free)[0].parameters
     assert values["friction.coulomb"] == pytest.approx(30, rel=0.1)
     assert values["friction.bristle_stiffness"] == pytest.approx(6e4, rel=0.2)
+
+
+def slipping(duration: float, mass: float, noise: float) -> Trajectory:
+    """4 s at 1 kHz of a load that slips every tenth of a second, the way it goes by turns, by 30 N; its exact force."""
+    t = np.arange(4000) * 1e-3
+    since, way = t % 0.1, np.where(t % 2 < 1, 1.0, -1.0)
+    slips = since < duration
+    phase = np.pi * np.where(slips, since / duration, 0.0)
+    position = np.cumsum(way * 0.4 * np.sin(phase) ** 2) * 1e-3
+    friction = way * np.where(slips, 30.0, 27.0)
+    force = friction + way * mass * 0.4 * np.pi / duration * np.sin(2 * phase)
+    noisy = position + noise * np.random.default_rng(0).standard_normal(4000)
+    return Trajectory(t, {"force": force, "position": noisy})
+
+
+@pytest.mark.parametrize(
+    ("duration", "mass", "noise", "is_shorter"), [(0.03, 0.2, 2e-6, True), (0.08, 3.0, 5e-5, False)]
+)
+def test_short_slips_take_a_shorter_filter(duration: float, mass: float, noise: float, is_shorter: bool) -> None:
+    """A window that is longer than a slip turns the speed round before and after it, where friction does not."""
+    drive, log = ForceDrive(Coulomb()), slipping(duration, mass, noise)
+    given = true_values(drive.parameters, load__mass=mass, load__force=0.0)
+    given = given.freed("friction.coulomb", "friction.viscous")
+
+    def balances(window: float) -> dict[str, RegressionRows]:
+        position, speed, acceleration = filter_motion(log, window)
+        columns = load_columns(given, position, acceleration)
+        return {"run": RegressionRows(log, given, speed, log["force"], columns, {})}
+
+    assert (choose_filter_time(Coulomb(), balances) < FILTER_TIMES[0]) == is_shorter
+    (start,) = starts(drive, {"run": log}, given)
+    assert start.parameters["friction.coulomb"] == pytest.approx(30, rel=0.1)
+
+
+def test_where_nothing_slides_friction_holds_what_pulls() -> None:
+    """Bristles that only bend show a spring; a start from them alone had a fortieth of the friction."""
+    drive = ForceDrive(LuGre())
+    t, truth = np.linspace(0, 4, 4000, endpoint=False), true_values(drive.parameters, load__force=0.0)
+    pull, system = np.asarray(27 * np.sin(2 * np.pi * 0.7 * t)), drive.system()
+    run = compute(discretise(system), pull[:, None], parameter_vector(system.parameters, truth), t)
+    noisy = run["position"] + 5e-6 * np.random.default_rng(0).standard_normal(len(t))
+    free = truth.freed("friction.coulomb", "friction.static", "friction.viscous", "friction.bristle_stiffness")
+    (start,) = starts(drive, {"run": Trajectory(t, {"force": pull, "position": noisy})}, free)
+    for name in ("friction.coulomb", "friction.static"):
+        assert 24 < start.parameters[name] < 36, name
