@@ -70,7 +70,7 @@ def assess_convergence(
     if alike.size or solved is None:
         verdict = f"the data do not determine {' and '.join(names[np.sort(alike)])}"
         status = Status(Code.NOT_CONVERGED, (verdict, "fix one, or log a run that separates them"))
-        weakest = _least_sensitive(own, space, reduced, noise)
+        weakest = _least_sensitive(own, space, reduced, noise, z)
         return ConvergenceTest(status, weakest if weakest.size else alike[-1:])
     spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
     step = np.abs(solved.parameters[keep]) / spread
@@ -79,10 +79,10 @@ def assess_convergence(
         verdict = f"{names[keep][worst]} would still move by {step[worst] / noise:.2g} standard deviations"
         remedy = "try more iterations, other start values, or fix a parameter"
         status = Status(Code.NOT_CONVERGED, (verdict, remedy))
-        return ConvergenceTest(status, _least_certain(own, noise * spread, space), own[[worst]])
+        return ConvergenceTest(status, _least_certain(own, noise * spread, space, z), own[[worst]])
     bounded = np.flatnonzero(space.at_bound(z) & ~space.held)
     return ConvergenceTest(
-        _optimum_status(equations, message, noisy_gaps=noisy_gaps), _least_sensitive(bounded, space, reduced, noise)
+        _optimum_status(equations, message, noisy_gaps=noisy_gaps), _least_sensitive(bounded, space, reduced, noise, z)
     )
 
 
@@ -108,14 +108,20 @@ def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: boo
     return Status(Code.CONVERGED, (verdict, *misfit_sentences))
 
 
-def _least_sensitive(positions: Indices, space: ParameterScaling, reduced: ReducedEquations, noise: float) -> Indices:
+def _least_sensitive(
+    positions: Indices, space: ParameterScaling, reduced: ReducedEquations, noise: float, z: Array
+) -> Indices:
     """The position of the parameter with the least effect on the data, the others known; none if a prior is vaguer."""
-    return _least_certain(positions, noise / np.sqrt(np.maximum(np.diag(reduced.schur)[positions], 1e-300)), space)
+    return _least_certain(positions, noise / np.sqrt(np.maximum(np.diag(reduced.schur)[positions], 1e-300)), space, z)
 
 
-def _least_certain(positions: Indices, spread: Array, space: ParameterScaling) -> Indices:
-    """The position of the least certain parameter, if a weak prior about its start would be more certain; or none."""
-    share = spread / space.weak_prior(space.start)[positions]
+def _least_certain(positions: Indices, spread: Array, space: ParameterScaling, z: Array) -> Indices:
+    """The position of the least certain parameter, if a weak prior would be more certain; or none.
+
+    A linear parameter is as large as the larger of its start and its value here: a start near zero tells no size.
+    """
+    larger = np.where(np.abs(z) > np.abs(space.start), z, space.start)
+    share = spread / space.weak_prior(larger)[positions]
     if not share.size or not share.max() > UNIDENTIFIABLE_PRIOR_RATIO:
         return NO_POSITIONS
     return positions[[int(np.argmax(share))]]
