@@ -15,6 +15,10 @@ from pneuopt.shooting.segments import segment
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
+# gap [1] beyond which log parameters are drawn to their start: lower biases what tight gaps tell, higher lets them
+# drift to where tight gaps cannot tell them any more
+WIDE_GAP = 2e-4
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -33,6 +37,14 @@ class Stage:
     gap: float
     iterations: int
     refine: int = 1
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether log parameters are drawn to their start: wide gaps hide what some of them do.
+
+        Not in a stage that may be the last, which refines its steps.
+        """
+        return self.gap > WIDE_GAP and self.refine == 1
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,8 @@ class Objective:
         Integration steps a sample.
     correction : IntegrationCorrection or None
         The change of outputs and ends by finer steps.
+    has_prior : bool
+        Whether log parameters are drawn to their start (`ParameterScaling.add_start_prior`).
     """
 
     segments: Segments
@@ -65,13 +67,18 @@ class Objective:
     sigma: Array
     substeps: int
     correction: IntegrationCorrection | None = None
+    has_prior: bool = False
 
     def evaluate(self, nodes: Array, z: Array) -> Iterate:
         """The iterate at these nodes, shape (m, n_states), and searched parameters."""
         with np.errstate(all="ignore"):  # a step too far may overflow; its cost is infinite then
             given = (nodes, self.scaling.values(z), self.scaling.chain(z), self.sigma, self.substeps, self.correction)
             equations = normal_equations(self.segments, *given)
-        return Iterate(nodes, z, equations)
+        return self.with_prior(nodes, z, equations)
+
+    def with_prior(self, nodes: Array, z: Array, equations: NormalEquations) -> Iterate:
+        """The iterate with these equations, to which the prior is added where there is one."""
+        return Iterate(nodes, z, self.scaling.add_start_prior(equations, z) if self.has_prior else equations)
 
 
 IsNegligible = Callable[[Iterate, ReducedEquations, GaussNewtonStep], bool]

@@ -1,6 +1,7 @@
 """`ParameterScaling`: the free parameters in the units of a search, logarithms or values, within their bounds."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,9 @@ WEAK_PRIOR_DEVIATION = math.log(10)  # standard deviation of a weak prior, in e-
 # standard deviation over a weak prior's from which a parameter is held: there the prior makes up a tenth of the
 # information of both; smaller holds what the data do determine, larger lets a search crawl along a valley
 UNIDENTIFIABLE_PRIOR_RATIO = 1 / 3
+# standard deviation of the prior about a start, in e-folds: lower holds wrong guesses, higher lets what wide gaps hide
+# drift to where tight ones cannot tell it any more
+START_PRIOR_DEVIATION = 1.0
 # squared residuals that an e-fold change of a log parameter has to move, or it has no effect: smaller searches in
 # rounding, larger holds what good data would show
 MIN_LOG_INFORMATION = 1e-6
@@ -71,6 +75,22 @@ class ParameterScaling:
         size = np.abs(np.where(self.log, 0.0, z))
         sized = size > np.finfo(float).tiny  # a start at a bound of 0 may leave rounding only
         return np.where(self.log, WEAK_PRIOR_DEVIATION, np.where(sized, 10 * size, np.inf))
+
+    def start_prior_cost(self, z: Array) -> float:
+        """What a prior that draws log parameters to their start adds to the cost at z."""
+        return 0.5 * float(self._prior_weight @ (z - self.start) ** 2)
+
+    def add_start_prior(self, equations: NormalEquations, z: Array) -> NormalEquations:
+        """Equations at z that draw log parameters to their start, where the data hardly tell of them."""
+        weight, arrow = self._prior_weight, equations.arrow
+        gradient = arrow.gradient + weight * (z - self.start)
+        drawn = replace(arrow, corner=arrow.corner + np.diag(weight), gradient=gradient)
+        return replace(equations, arrow=drawn, cost=equations.cost + self.start_prior_cost(z))
+
+    @property
+    def _prior_weight(self) -> Array:
+        """One over the prior's variance, shape (k,); zero where it draws nothing."""
+        return np.where(self.log & ~self.held, START_PRIOR_DEVIATION**-2, 0.0)
 
     def has_effect(self, equations: NormalEquations) -> Mask:
         """The mask of parameters that have an effect on the residuals here."""

@@ -35,10 +35,11 @@ from pneuopt.shooting.search_end import (
     Snapshot,
     StageEnd,
     end_search,
+    joins_known_search,
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, start_nodes
 from pneuopt.shooting.solution import Fit
-from pneuopt.shooting.stage_end import creeps, is_negligible_step
+from pneuopt.shooting.stage_end import creeps, describe_iteration, is_negligible_step
 
 if TYPE_CHECKING:
     from pneuopt.shooting.least_squares import LeastSquares, Stage
@@ -61,9 +62,6 @@ MAX_LOOSENED = 2
 # creeping steps in a row after which a search with noise of the states leaps: fewer leave a way that leads on, more
 # take long
 MAX_CREEPING_STEPS = 3
-# difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
-# one
-JOINED_COST_TOLERANCE = 1e-3
 
 
 class Search:
@@ -89,6 +87,11 @@ class Search:
         self.correction, self.integration_change, self.is_coarse = None, math.nan, False
         self.node_damping = np.zeros(segments.count)  # where the stage has ended, of each node alone
         self.current = self.evaluate(nodes, self.scaling.start)
+
+    @property
+    def cost(self) -> float:
+        """Half of the squares of data and gaps, without the prior of a stage."""
+        return self.current.cost - self.stage.has_prior * self.scaling.start_prior_cost(self.current.z)
 
     def solve(self) -> Fit:
         """Run all stages; an interruption (Ctrl-C) ends them with the best iterate so far, marked."""
@@ -117,7 +120,7 @@ class Search:
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
             self.has_stalled = self._finish_stage(stage.iterations)
-            self.stage_ends.append(StageEnd(self.current.nodes, self.current.z, self.current.cost))
+            self.stage_ends.append(StageEnd(self.current.nodes, self.current.z, self.cost))
             if found := self._early_end(stage):
                 return self._refine_steps(found)
         repeat_last_stage(self)
@@ -128,7 +131,7 @@ class Search:
 
     def _early_end(self, stage: "Stage") -> Status | None:
         """The status of a search that ends with a stage before the last; None where it goes on."""
-        if self._joins_known_search():
+        if joins_known_search(self):
             return JOINED_SEARCH
         if stage is not self.method.stages[0]:
             return None
@@ -137,11 +140,6 @@ class Search:
     def _is_hopeless(self) -> bool:
         """Whether this search is to be left for those from other starts."""
         return 2 * self.current.cost > self.method.max_misfit * self.current.equations.count
-
-    def _joins_known_search(self) -> bool:
-        """Whether this search has come to where a known one was after the same stage, and would go on as that one."""
-        known = [cost for gap, cost in self.method.known_costs if gap == self.stage.gap]
-        return any(abs(self.current.cost - cost) <= JOINED_COST_TOLERANCE * cost for cost in known)
 
     def _jump(self) -> Status | None:
         """The status of an optimum that is soon reached after a first stage that explains the log; or None."""
@@ -251,8 +249,8 @@ class Search:
         self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
         self.is_coarse, self.node_damping = stage.refine > 1, np.zeros(len(nodes))
         if is_known:
-            slopes = self.current.equations.linearisation
-            self.current = Iterate(nodes, z, weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales))
+            equations = weigh_gaps(self.segments, self.current.equations.linearisation, stage.gap * self.gap_scales)
+            self.current = self._objective().with_prior(nodes, z, equations)
         else:
             self.current = self.evaluate(nodes, z)
 
@@ -365,7 +363,7 @@ class Search:
 
     def _objective(self) -> Objective:
         sigma = self.stage.gap * self.gap_scales
-        return Objective(self.segments, self.scaling, sigma, self.substeps, self.correction)
+        return Objective(self.segments, self.scaling, sigma, self.substeps, self.correction, self.stage.has_prior)
 
     def evaluate(self, nodes: Array, z: Array) -> Iterate:
         """The iterate at these nodes and searched parameters."""
@@ -392,9 +390,4 @@ class Search:
 
     def _report(self) -> None:
         if self.method.progress is not None:
-            current, gap = self.current, self.current.equations.largest_gap
-            stages = self.method.stages
-            number = "loosened" if self.noisy_gaps else f"stage {stages.index(self.stage) + 1}/{len(stages)}"
-            self.method.progress(
-                f"{number}  iteration {self.iterations}  cost {current.cost:.6g}  largest gap {gap:.1e}"
-            )
+            self.method.progress(describe_iteration(self))

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from pneuopt.shooting.search import Search
 
 FIRST_JOINING_STAGE = 2  # stage from which two searches may join: before it the gaps are so wide that all cost alike
+# difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
+# one
+JOINED_COST_TOLERANCE = 1e-3
 GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
 ABANDONED_START = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
 JOINED_SEARCH = Status(Code.NOT_CONVERGED, ("a start has led to where another one was",))
@@ -37,6 +40,12 @@ class Snapshot(NamedTuple):
     correction: IntegrationCorrection | None
     substeps: int
     output_substeps: int
+
+
+def joins_known_search(search: "Search") -> bool:
+    """Whether a search has come to where a known one was after the same stage, and would go on as that one."""
+    known = [cost for gap, cost in search.method.known_costs if gap == search.stage.gap]
+    return any(abs(search.cost - cost) <= JOINED_COST_TOLERANCE * cost for cost in known)
 
 
 def end_search(search: "Search", status: Status, seconds: float) -> Fit:
@@ -100,7 +109,7 @@ def _stats(search: "Search", status: Status, run: RolloutResult, seconds: float)
     return {
         "iterations": float(search.iterations),
         "seconds": seconds,
-        "cost": search.current.equations.cost,
+        "cost": search.cost,
         "substeps": float(search.output_substeps),
         "largest_gap": search.current.equations.largest_gap,
         "gap_share": search.current.equations.gap_share,
@@ -112,7 +121,7 @@ def _stats(search: "Search", status: Status, run: RolloutResult, seconds: float)
 def _stage_costs(search: "Search") -> tuple[tuple[float, float], ...]:
     """The gap and the cost of stages at their ends, and those of the search's end."""
     ended = [(stage.gap, end.cost) for stage, end in zip(search.method.stages, search.stage_ends, strict=False)]
-    return (*ended[FIRST_JOINING_STAGE:], (search.stage.gap, search.current.cost))
+    return (*ended[FIRST_JOINING_STAGE:], (search.stage.gap, search.cost))
 
 
 def _doubtful_parameters(search: "Search") -> tuple[tuple[str, ...], tuple[str, ...]]:

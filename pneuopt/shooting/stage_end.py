@@ -1,4 +1,7 @@
-"""`is_negligible_step`: whether a step of a search is not worth a try, which ends its stage; `creeps`: after one."""
+"""`is_negligible_step`: whether a step of a search is not worth a try, which ends its stage; `creeps`: after one.
+
+`describe_iteration` tells of one.
+"""
 
 import math
 from typing import TYPE_CHECKING
@@ -91,4 +94,14 @@ def creeps(search: "Search", before: float, promised: float) -> bool:
     """
     return search.noisy_gaps and before - search.current.cost < min(
         CREEPING_SHARE * promised, STAGE_COST_TOLERANCE * before
+    )
+
+
+def describe_iteration(search: "Search") -> str:
+    """A line of progress: the stage, the iteration, the cost and the largest gap."""
+    stages = search.method.stages
+    number = "loosened" if search.noisy_gaps else f"stage {stages.index(search.stage) + 1}/{len(stages)}"
+    return (
+        f"{number}  iteration {search.iterations}  cost {search.cost:.6g}  "
+        f"largest gap {search.current.equations.largest_gap:.1e}"
     )

@@ -14,7 +14,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.budget import CpuBudget
-from pneuopt.shooting.equations import correct_residuals, normal_equations
+from pneuopt.shooting.equations import correct_residuals, normal_equations, weigh_gaps
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.scaling import ParameterScaling
@@ -280,3 +280,16 @@ def test_a_search_that_is_cut_names_the_parameter_that_would_still_move() -> Non
     assert len(fit.unsettled) == 1
     assert fit.unsettled[0] in fit.status.verdict
     assert solve_least_squares(two_logs()).unsettled == ()
+
+
+def test_log_parameters_are_drawn_to_their_start_by_wide_gaps_alone() -> None:
+    """Where gaps hide a parameter it drifted to its bound, and tight gaps could not tell it any more."""
+    search = Search(segment(two_logs()), LeastSquares())
+    z, drawn = search.current.z + 0.3, []
+    for stage in LeastSquares().stages:
+        search._enter_stage(stage, search.current.nodes.copy(), z)
+        alone = weigh_gaps(search.segments, search.current.equations.linearisation, stage.gap * search.gap_scales)
+        assert search.cost == pytest.approx(alone.cost)
+        drawn.append(search.current.cost > alone.cost)
+    assert drawn == [True, True, True, True, False, False]
+    assert not replace(FIRST, refine=2).has_prior  # as noise of the states, whose stage decides
