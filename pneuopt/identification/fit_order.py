@@ -1,5 +1,6 @@
 """`rank`: which of several fits of the same logs is the best; `are_alike`: whether two have found one optimum."""
 
+from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
 from pneuopt.shooting.search_end import ABANDONED_START
@@ -14,6 +15,13 @@ def is_optimum(fit: Fit) -> bool:
     is_missed = fit.status.code is Code.NOT_CONVERGED and is_settled and fit.stats["gap_share"] > MAX_GAP_SHARE
     is_missed &= fit.status is not ABANDONED_START
     return fit.status.converged or is_missed
+
+
+def is_in_order(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether no free parameter is below another one that bounds it, as static friction below Coulomb friction."""
+    order, found = problem.system.plant.excitation.at_least, fit.parameters
+    free = [n for n in found.free_names if n not in problem.held]
+    return all(found.value(n) >= found.value(order[n]) for n in free if order.get(n) in found)
 
 
 def rank(fit: Fit, tightest: float) -> tuple[int, float]:

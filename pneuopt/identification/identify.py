@@ -27,9 +27,10 @@ from pneuopt.identification.closed_gaps import fit_with_closed_gaps
 from pneuopt.identification.command_centre import find_centre
 from pneuopt.identification.examination import check_content
 from pneuopt.identification.identifiability import foresee_unidentifiable, leans_on_prior, rests_on_prior
+from pneuopt.identification.long_logs import fit_logs
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
-from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
+from pneuopt.identification.multistart import fit_holding_unidentifiable
 from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
 from pneuopt.identification.profiled_optimum import fit_from_profiles
@@ -172,7 +173,7 @@ def _fit_and_review(
     doubts = FixedValueTest()
     if start is None:
         gives_up = doubts.explains
-        held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise, gives_up=gives_up)
+        held, fit, label = fit_logs(problem, loss, estimate_noise=estimate_noise, gives_up=gives_up)
     else:
         began = fit_holding_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"

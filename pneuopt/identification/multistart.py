@@ -16,13 +16,11 @@ from dataclasses import replace
 import numpy as np
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.excerpts import cut_excerpts, filter_states
-from pneuopt.identification.fit_order import are_alike, is_optimum, rank
+from pneuopt.identification.fit_order import are_alike, is_in_order, is_optimum, rank
 from pneuopt.identification.identifiability import rejects_held_values, rests_on_prior
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
 from pneuopt.shooting.solution import Fit
@@ -37,9 +35,6 @@ GUESS_BOUND_WIDTH = 1e-9
 # squared residuals a sample, in noise variances, up to which no other start is tried: below 1 every start would be
 # tried, while a wrong basin of soft bristles has left 1.1
 ACCEPTED_CHI_SQUARE_RATIO = 1.05
-# iterations with tight gaps that long logs get before a part of them is tried: more cost time, fewer leave easy logs
-SHORT_ITERATIONS = 10
-
 # cost of a settled start over that of the first one after as many stages [1] up to which the guess is not what is
 # wrong: lower settles all starts of a wrong model, higher takes another basin for the same
 SAME_MISFIT_RATIO = 1.02
@@ -72,8 +67,9 @@ def fit_from_starts(
         With the values held, the weights and the noise levels that the fit ended with.
     fit : Fit
         A wrong basin can converge, too, but leaves residuals above the noise; so more starts are tried until two of
-        them agree on the least cost. Where a search explains the logs but for a parameter that does not settle, that
-        one is held and one more start is tried.
+        them agree on the least cost; so is one more where a parameter came below another that bounds it, as no plant
+        has it. Where a search explains the logs but for a parameter that does not settle, that one is held and one more
+        start is tried.
     label : str
         The label of its start.
 
@@ -82,8 +78,6 @@ def fit_from_starts(
     KeyboardInterrupt
         If it comes before the first fit; after that the best fit so far is returned, marked.
     """
-    if loss is None and not estimate_noise and (found := _fit_long_logs(problem)):
-        return found
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
     try:
@@ -98,10 +92,10 @@ def fit_from_starts(
             if fit.status is JOINED_SEARCH:
                 break
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
-            if _explains_to_noise(held, fit) and not held.held:
+            if explains_to_noise(held, fit) and not held.held and is_in_order(held, fit):
                 return held, fit, start.label
             interrupted = fit.status.code is Code.INTERRUPTED
-            if not interrupted and _is_at_noise(held, fit):
+            if not interrupted and is_at_noise(held, fit):
                 held, fit = fit_a_part(held, fit, start.label)
             fits.append((held, fit, start.label))
             fits.sort(key=lambda each: rank(each[1], tightest))
@@ -116,46 +110,6 @@ def fit_from_starts(
     if not interrupted:
         held, fit = fit_a_part(held, fit, label)
     return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
-
-
-def _fit_long_logs(problem: EstimationProblem) -> Candidate | None:
-    """A fit that explains long logs to their noise, or was interrupted; None if they need a longer search."""
-    for held, fit, label in _tries_of_long_logs(problem):
-        is_answer = _explains_to_noise(held, fit) and not (held.held or fit.unidentifiable)
-        if is_answer or fit.status.code is Code.INTERRUPTED:
-            return held, fit, label
-    return None
-
-
-def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
-    """What is tried before a long search of long logs; nothing where they are short.
-
-    First a short search: most logs need no more, and one that is cut near the noise goes on. Then the fit that begins
-    with the parameters of a part of each log. The states of the whole logs are filtered by these parameters first:
-    rough states would spoil what the parts have found.
-    """
-    parts = cut_excerpts(problem)
-    if parts is None:
-        return
-    rough, stages = problem.candidates()[0], problem.method.stages
-    few = stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)
-    method = replace(problem.method, stages=few, max_misfit=HOPELESS_MISFIT, allows_state_noise=False)
-    short = solve_least_squares(problem.transcription(rough), method)
-    yield problem, short, rough.label
-    is_near = short.jumps is None and 2 * short.stats["cost"] <= MAX_CHI_SQUARE_RATIO * short.count
-    if is_near and not short.status.converged:
-        last = replace(problem.method, stages=stages[-1:])
-        longer = solve_least_squares(problem.transcription(problem.start_from(short)), last)
-        yield problem, longer.with_effort_of(short), rough.label
-    held, fit, label = fit_from_starts(parts)
-    if fit.status.code is Code.INTERRUPTED:
-        yield problem, replace(short, status=fit.status), rough.label
-    if not _explains_to_noise(held, fit):
-        return
-    warm = replace(problem, method=replace(problem.method, stages=stages[-REFIT_STAGES:]))
-    start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters))
-    whole, fit = fit_holding_unidentifiable(warm, start, HOPELESS_MISFIT)
-    yield replace(whole, method=problem.method), fit, f"{label}, of a part"
 
 
 def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: bool) -> Status:
@@ -329,7 +283,10 @@ def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
         tells of it.
     """
     held, part = problem, fit
-    warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
+    last = problem.method.stages[-REFIT_STAGES:]
+    warm = replace(
+        problem.method, stages=last, allows_state_noise=problem.method.allows_state_noise and fit.jumps is not None
+    )
     while not part.status.converged:
         names = part.unidentifiable or part.unsettled
         if not names or len(held.held) + len(names) >= len(part.parameters.free_names):
@@ -352,15 +309,15 @@ def _rests_on_held(problem: EstimationProblem, fit: Fit) -> bool:
     return bool(rests_on_prior(covariance, fit.prior_covariance, values, problem.held.values())[free].all())
 
 
-def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
+def explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
     """Whether a fit explains the logs to their noise, so that no other start can do better.
 
     Where a log declares too little noise, the white part of the residuals counts in its place.
     """
-    return fit.status.converged and _is_at_noise(problem, fit)
+    return fit.status.converged and is_at_noise(problem, fit)
 
 
-def _is_at_noise(problem: EstimationProblem, fit: Fit) -> bool:
+def is_at_noise(problem: EstimationProblem, fit: Fit) -> bool:
     """Whether the residuals of a fit, converged or not, are those of the noise."""
     return fit.jumps is None and (
         fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
@@ -396,4 +353,4 @@ def _are_enough(fits: Sequence[Candidate]) -> bool:
     (held, best, _), (_, second, _) = fits[:2]
     # with noise of the states every estimate may be biased, and another optimum of it would not change that
     is_wrong = best.jumps is not None and best.status.converged and is_optimum(second)
-    return is_wrong or are_alike(best, second) or _explains_to_noise(held, best)
+    return is_wrong or are_alike(best, second) or explains_to_noise(held, best)

@@ -152,7 +152,7 @@ def test_an_interruption_keeps_an_earlier_and_better_start(monkeypatch: pytest.M
         yield Start(good.states, {**good.parameters, "friction.coulomb": 3.0}, "far off")
 
     monkeypatch.setattr(starting, "starts_by_cost", two)
-    monkeypatch.setattr(starting, "_explains_to_noise", lambda *_: False)
+    monkeypatch.setattr(starting, "explains_to_noise", lambda *_: False)
     problem, method = posed(Coulomb()), LeastSquares(progress=progress)
     system = ForceDrive(Coulomb()).system()
     result = identify(system, problem.experiments, problem.parameters, method=method, throw=False)
@@ -215,7 +215,7 @@ def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatc
         labels.append(start.label)
         return fit_holding_unidentifiable(problem, start, most, known)
 
-    monkeypatch.setattr(starting, "_explains_to_noise", lambda *_: False)
+    monkeypatch.setattr(starting, "explains_to_noise", lambda *_: False)
     monkeypatch.setattr(starting, "fit_holding_unidentifiable", noted)
     monkeypatch.setattr(starting, "_settle_start", lambda *_: pytest.fail("settled"))
     assert starting.fit_from_starts(problem)[1].status.converged
@@ -310,7 +310,7 @@ def test_a_start_that_joins_the_best_confirms_it(monkeypatch: pytest.MonkeyPatch
         held, fit = fit_holding_unidentifiable(problem, start, most)
         return held, replace(fit, status=JOINED_SEARCH) if costs else fit
 
-    monkeypatch.setattr(starting, "_explains_to_noise", lambda *_: False)
+    monkeypatch.setattr(starting, "explains_to_noise", lambda *_: False)
     monkeypatch.setattr(starting, "fit_holding_unidentifiable", joined)
     monkeypatch.setattr(starting, "_settle_start", lambda *_: pytest.fail("settled"))
     _, fit, label = starting.fit_from_starts(problem)
@@ -332,8 +332,8 @@ def test_a_confirming_start_looks_for_no_noise_of_the_states_where_the_best_foun
         held, fit = fit_holding_unidentifiable(problem, start)
         return held, fit if settled else replace(fit, status=missed, stats={**fit.stats, "gap_share": 0.12})
 
-    monkeypatch.setattr(starting, "_explains_to_noise", lambda *_: False)
-    monkeypatch.setattr(starting, "_is_at_noise", lambda *_: False)
+    monkeypatch.setattr(starting, "explains_to_noise", lambda *_: False)
+    monkeypatch.setattr(starting, "is_at_noise", lambda *_: False)
     monkeypatch.setattr(starting, "fit_holding_unidentifiable", fitted)
     held, *_ = starting.fit_from_starts(problem)
     assert allowed == [True, settled]
