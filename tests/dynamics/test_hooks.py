@@ -215,5 +215,5 @@ def test_a_drive_regresses_the_candidates_of_friction_one_by_one(monkeypatch: py
     drive = ForceDrive(Stribeck())
     starts = drive.system().starts({"run": Log(log, drive.parameters.freed("friction.*"))})
     assert "stribeck velocity 0.025 m/s" in starts[0].label
-    assert tried == [0.025]
+    assert set(tried) == {0.025}  # also where the window of the filter was chosen
     assert len(starts) > 1
