@@ -74,8 +74,8 @@ def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candid
     """A fit that explains long logs to their noise, or was interrupted; None if they need a longer search.
 
     What was tried is appended to `tried`.
-    With a parameter held, or one that does not settle, one more start has been tried before; an answer that no plant
-    has is no answer.
+    With a parameter held, or one that does not settle, one more start has been tried before. One that is not clearly
+    above another that bounds it asks for another start.
     """
     for found in _tries_of_long_logs(problem):
         held, fit, label = _settle(*found) if tried else found

@@ -67,8 +67,8 @@ def fit_from_starts(
         With the values held, the weights and the noise levels that the fit ended with.
     fit : Fit
         A wrong basin can converge, too, but leaves residuals above the noise; so more starts are tried until two of
-        them agree on the least cost; so is one more where a parameter came below another that bounds it, as no plant
-        has it. Where a search explains the logs but for a parameter that does not settle, that one is held and one more
+        them agree on the least cost; so is one more where a parameter is not clearly above another that bounds
+        it. Where a search explains the logs but for a parameter that does not settle, that one is held and one more
         start is tried.
     label : str
         The label of its start.
