@@ -80,7 +80,7 @@ class PneumaticStarts:
         if all(set(PRESSURE_NAMES) <= set(run.logged_pressures) for run in runs.values()):
             filtered = functools.cache(functools.partial(self.prepare_logs, logs))
             window = choose_filter_time(
-                self.friction, lambda window: {n: run.force_balance({}) for n, run in filtered(window).items()}
+                self.friction, lambda window: {n: run.balance_of_pressures() for n, run in filtered(window).items()}
             )
             runs = filtered(window)
         valve = _estimate_valve(self.friction, runs)
@@ -139,16 +139,18 @@ class PneumaticLog:
 
     def force_balances(self, valves: Sequence[ValveValues]) -> list[RegressionRows]:
         """Rows for the regression of friction, with each of several valves."""
-        columns = load_columns(self.parameters, self.known_states["position"], self._acceleration)
-        out = []
-        for air in self._simulate_air(valves):
-            states = {**self.known_states, **air}
-            measured = self.measured.with_columns({n: states[n] for n in PRESSURE_NAMES})
-            force = self._air_force(
-                {n: q.value for n, q in self.parameters.items()}, *(states[n] for n in PRESSURE_NAMES)
-            )
-            out.append(RegressionRows(measured, self.parameters, states["speed"], force, columns, states))
-        return out
+        return [self._rows({**self.known_states, **air}) for air in self._simulate_air(valves)]
+
+    def balance_of_pressures(self) -> RegressionRows:
+        """Rows of a log of both pressures, in which no valve counts; without the states that are not logged."""
+        return self._rows(self.known_states)
+
+    def _rows(self, states: dict[str, Array]) -> RegressionRows:
+        columns = load_columns(self.parameters, states["position"], self._acceleration)
+        pressures = {n: states[n] for n in PRESSURE_NAMES}
+        force = self._air_force({n: q.value for n, q in self.parameters.items()}, *pressures.values())
+        measured = self.measured.with_columns(pressures)
+        return RegressionRows(measured, self.parameters, states["speed"], force, columns, states)
 
     def valve_columns(self, shape: ValveValues) -> tuple[Array, Array]:
         """Regression of the m logged pressures' rates on conductance, and conductance times leak.
