@@ -76,9 +76,9 @@ class PneumaticStarts:
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates with one valve, and with friction for each scanned Stribeck velocity."""
-        runs = self.prepare_logs(logs)
+        filtered = functools.cache(functools.partial(self.prepare_logs, logs))
+        runs = filtered(FILTER_TIMES[0])
         if all(set(PRESSURE_NAMES) <= set(run.logged_pressures) for run in runs.values()):
-            filtered = functools.cache(functools.partial(self.prepare_logs, logs))
             window = choose_filter_time(
                 self.friction, lambda window: {n: run.balance_of_pressures() for n, run in filtered(window).items()}
             )

@@ -129,11 +129,9 @@ def _candidate(
 def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:
     """Mean absolute force in sliding samples that friction does not explain [N]."""
     thinned = {name: _thin_rows(rows) for name, rows in logs.items()}
-    parameters = next(iter(logs.values())).parameters
     if not all(np.isfinite(rows.force).all() for rows in thinned.values()):
         return math.inf
-    tried = {name: values[0] for name, values in friction.start.scanned.items()}
-    return float(np.mean(np.abs(_regress(friction, thinned, parameters, tried)[1])))
+    return _unexplained_force(friction, thinned)[0]
 
 
 def choose_filter_time(friction: FrictionModel, balances: Callable[[float], Mapping[str, RegressionRows]]) -> float:
@@ -148,12 +146,13 @@ def choose_filter_time(friction: FrictionModel, balances: Callable[[float], Mapp
     Returns
     -------
     float
-        The longest one, unless a shorter one leaves clearly less; none is tried after one that leaves more.
+        The longest one, unless a shorter one leaves clearly less; none is tried after one that leaves no less.
     """
     chosen, left, least = FILTER_TIMES[0], math.inf, math.inf
     for window in FILTER_TIMES:
-        share = _unexplained_share(friction, balances(window))
-        if share > least:
+        unexplained, force = _unexplained_force(friction, balances(window))
+        share = unexplained / max(force, np.finfo(float).tiny)
+        if not share < least:
             break
         least = share
         if share < MIN_BALANCE_GAIN * left:
@@ -161,13 +160,12 @@ def choose_filter_time(friction: FrictionModel, balances: Callable[[float], Mapp
     return chosen
 
 
-def _unexplained_share(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:
-    """Mean absolute force that friction does not explain, over that in the same samples [1]; inf if it is unknown."""
+def _unexplained_force(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> tuple[float, float]:
+    """Mean absolute force that friction does not explain by the first values that are tried, and that of all [N]."""
     parameters = next(iter(logs.values())).parameters
     tried = {name: values[0] for name, values in friction.start.scanned.items()}
     _, unexplained, force = _regress(friction, logs, parameters, tried)
-    share = float(np.mean(np.abs(unexplained)) / max(float(np.mean(np.abs(force))), np.finfo(float).tiny))
-    return share if math.isfinite(share) else math.inf
+    return float(np.mean(np.abs(unexplained))), float(np.mean(np.abs(force)))
 
 
 def _scanned_values(start: FrictionStart, parameters: ParameterSet) -> list[dict[str, float]]:
