@@ -7,6 +7,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,7 +31,7 @@ from pneuopt.identification.identifiability import foresee_unidentifiable, leans
 from pneuopt.identification.long_logs import fit_logs
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
-from pneuopt.identification.multistart import fit_holding_unidentifiable
+from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
 from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
 from pneuopt.identification.profiled_optimum import fit_from_profiles
@@ -172,8 +173,9 @@ def _fit_and_review(
     problem, widths = choose_widths(problem)
     doubts = FixedValueTest()
     if start is None:
-        gives_up = doubts.explains
-        held, fit, label = fit_logs(problem, loss, estimate_noise=estimate_noise, gives_up=gives_up)
+        search = partial(fit_from_starts, loss=loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
+        is_plain = loss is None and not estimate_noise
+        held, fit, label = fit_logs(problem, search) if is_plain else search(problem)
     else:
         began = fit_holding_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"

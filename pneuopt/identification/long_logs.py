@@ -9,8 +9,7 @@ from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.excerpts import cut_excerpts, filter_states
-from pneuopt.identification.fit_order import is_in_order, rank
-from pneuopt.identification.losses import Loss
+from pneuopt.identification.fit_order import are_alike, is_in_order, rank
 from pneuopt.identification.multistart import (
     GUESS_STAGES,
     HOPELESS_MISFIT,
@@ -25,45 +24,35 @@ from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START
+from pneuopt.shooting.search_end import ABANDONED_START, INTERRUPTED_SEARCH
 from pneuopt.shooting.solution import Fit
 
 # iterations with tight gaps that long logs get before a part of them is tried: more cost time, fewer leave easy logs
 SHORT_ITERATIONS = 10
 
 
-def fit_logs(
-    problem: EstimationProblem,
-    loss: Loss | None = None,
-    *,
-    estimate_noise: bool = False,
-    gives_up: Callable[[EstimationProblem, Fit], bool] = lambda *_: False,
-) -> Candidate:
-    """Fit long logs by the short ways where these lead to the noise, and else from all starts (`fit_from_starts`).
+def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], Candidate]) -> Candidate:
+    """Fit long logs by the short ways where these lead to the noise, and else by a search from all starts.
 
     Parameters
     ----------
     problem : EstimationProblem
-    loss : Loss, optional
-    estimate_noise : bool
-    gives_up : callable
-        As of `fit_from_starts`.
-
-    Returns
-    -------
-    problem : EstimationProblem
-    fit : Fit
-    label : str
-        As of `fit_from_starts`.
+    search : callable
+        `fit_from_starts`, which states what is returned.
 
     Raises
     ------
     KeyboardInterrupt
-        If it comes before the first fit.
+        If it comes before the first fit; after that the best fit so far is returned, marked.
     """
     tried = list[Candidate]()
-    found = _fit_long_logs(problem, tried) if loss is None and not estimate_noise else None
-    found = found or fit_from_starts(problem, loss, estimate_noise=estimate_noise, gives_up=gives_up)
+    try:
+        found = _fit_long_logs(problem, tried) or search(problem)
+    except KeyboardInterrupt:
+        if not tried:
+            raise
+        held, fit, label = tried[0]
+        found = held, replace(fit, status=INTERRUPTED_SEARCH), label
     if found[1].status.code is not Code.INTERRUPTED:
         return found
     held, fit, label = min([found, *tried], key=lambda each: rank(each[1], problem.method.stages[-1].gap))
@@ -73,17 +62,22 @@ def fit_logs(
 def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candidate | None:
     """A fit that explains long logs to their noise, or was interrupted; None if they need a longer search.
 
-    What was tried is appended to `tried`.
-    With a parameter held, or one that does not settle, one more start has been tried before. One that is not clearly
-    above another that bounds it asks for another start.
+    What was tried is appended to `tried`. With a parameter held, or one that does not settle, one more start has been
+    tried before; with one that is not clearly above another that bounds it, one that has led to the same.
     """
     for found in _tries_of_long_logs(problem):
         held, fit, label = _settle(*found) if tried else found
         is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.held or bool(tried))
+        is_sure = is_in_order(held, fit) or any(_is_confirmed(fit, other) for _, other, _ in tried)
         tried.append((held, fit, label))
-        if (is_answer and is_in_order(held, fit)) or fit.status.code is Code.INTERRUPTED:
+        if (is_answer and is_sure) or fit.status.code is Code.INTERRUPTED:
             return held, fit, label
     return None
+
+
+def _is_confirmed(fit: Fit, other: Fit) -> bool:
+    """Whether both ended at one optimum, whichever of them is the better."""
+    return are_alike(*sorted((fit, other), key=lambda each: each.stats["cost"]))
 
 
 def _settle(problem: EstimationProblem, fit: Fit, label: str) -> Candidate:
@@ -112,7 +106,7 @@ def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
         last = replace(problem.method, stages=stages[-1:])
         longer = solve_least_squares(problem.transcription(problem.start_from(short)), last)
         yield problem, longer.with_effort_of(short), rough.label
-    elif found := _fit_filtered(problem, rough, is_far=short.status is ABANDONED_START):
+    elif not is_near and (found := _fit_filtered(problem, rough, is_far=short.status is ABANDONED_START)):
         yield found
     held, fit, label = fit_from_starts(parts)
     if fit.status.code is Code.INTERRUPTED:
@@ -132,9 +126,12 @@ def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> 
     the rough states are far off, wide gaps begin with filtered ones, too. None where they leave more than the noise.
     """
     stages = problem.method.stages
-    wide = replace(problem.method, stages=stages[:GUESS_STAGES:2], allows_state_noise=False)
+    first_and_third = stages[:GUESS_STAGES:2]
+    wide = replace(problem.method, stages=first_and_third, allows_state_noise=False)
     begin = filter_states(problem, rough) if is_far else rough
     settled = solve_least_squares(problem.transcription(begin), wide)
+    if settled.status.code is Code.INTERRUPTED:
+        return problem, settled, rough.label
     if not 2 * settled.stats["cost"] <= MAX_CHI_SQUARE_RATIO * settled.count:
         return None
     tight = replace(problem, method=replace(problem.method, stages=stages[-1:], allows_state_noise=False))

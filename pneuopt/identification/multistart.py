@@ -94,9 +94,9 @@ def fit_from_starts(
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
             if explains_to_noise(held, fit) and not held.held and is_in_order(held, fit):
                 return held, fit, start.label
-            interrupted = fit.status.code is Code.INTERRUPTED
-            if not interrupted and is_at_noise(held, fit):
+            if fit.status.code is not Code.INTERRUPTED and is_at_noise(held, fit):
                 held, fit = fit_a_part(held, fit, start.label)
+            interrupted = fit.status.code is Code.INTERRUPTED
             fits.append((held, fit, start.label))
             fits.sort(key=lambda each: rank(each[1], tightest))
             is_end = interrupted or _are_enough(fits)
@@ -109,6 +109,7 @@ def fit_from_starts(
     held, fit, label = fits[0]
     if not interrupted:
         held, fit = fit_a_part(held, fit, label)
+        interrupted = fit.status.code is Code.INTERRUPTED
     return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
 
 
@@ -280,7 +281,7 @@ def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
         With what is held.
     fit : Fit
         The given one, where nothing was unsettled, the rest does not converge either, or only the prior of what is held
-        tells of it.
+        tells of it; marked, if that was interrupted.
     """
     held, part = problem, fit
     last = problem.method.stages[-REFIT_STAGES:]
@@ -294,7 +295,9 @@ def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
         held = replace(held, held={**held.held, **{n: part.parameters.value(n) for n in names}})
         before, part = part, solve_least_squares(held.transcription(held.start_from(part, label)), warm)
         part = part.with_effort_of(before)
-        if part.status.code in (Code.INTERRUPTED, Code.DIVERGED):
+        if part.status.code is Code.INTERRUPTED:
+            return problem, replace(fit, status=part.status)
+        if part.status.code is Code.DIVERGED:
             return problem, fit
     return (problem, fit) if _rests_on_held(held, part) else (held, part)
 

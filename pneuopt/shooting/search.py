@@ -31,6 +31,7 @@ from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search_end import (
     ABANDONED_START,
     GAPS_ABSORB_MISFIT,
+    INTERRUPTED_SEARCH,
     JOINED_SEARCH,
     Snapshot,
     StageEnd,
@@ -100,7 +101,7 @@ class Search:
             with check_during_runs(self.method.budget.check):
                 status = self._run_stages()
         except KeyboardInterrupt:
-            status = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
+            status = INTERRUPTED_SEARCH
         return end_search(self, status, time.perf_counter() - began)
 
     def _run_stages(self) -> Status:

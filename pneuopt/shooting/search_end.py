@@ -21,6 +21,7 @@ FIRST_JOINING_STAGE = 2  # stage from which two searches may join: before it the
 JOINED_COST_TOLERANCE = 1e-3
 GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
 ABANDONED_START = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
+INTERRUPTED_SEARCH = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
 JOINED_SEARCH = Status(Code.NOT_CONVERGED, ("a start has led to where another one was",))
 
 

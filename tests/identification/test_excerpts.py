@@ -18,7 +18,7 @@ from pneuopt.models.catalog import b32
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START
+from pneuopt.shooting.search_end import ABANDONED_START, INTERRUPTED_SEARCH
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 from problems.shared.b32 import GAINS, run_loop
@@ -83,7 +83,7 @@ def test_a_long_log_begins_with_the_answer_of_its_part(monkeypatch: pytest.Monke
     for module in (long_logs, multistart):
         monkeypatch.setattr(module, "solve_least_squares", spied)
     problem, _ = posed()
-    held, fit, label = long_logs.fit_logs(problem)
+    held, fit, label = long_logs.fit_logs(problem, multistart.fit_from_starts)
     assert label.endswith("of a part")
     assert fit.status.converged
     assert held.method == problem.method
@@ -105,7 +105,7 @@ def test_a_long_log_that_wide_gaps_explain_is_filtered_before_tight_ones(monkeyp
     for module in (long_logs, multistart):
         monkeypatch.setattr(module, "solve_least_squares", spied)
     problem, _ = posed()
-    held, fit, label = long_logs.fit_logs(problem)
+    held, fit, label = long_logs.fit_logs(problem, multistart.fit_from_starts)
     assert gaps == [(1e-2, 1e-5), (1e-2, 1e-3), (1e-5,)]
     assert not label.endswith("of a part")
     assert fit.status.converged
@@ -176,10 +176,20 @@ def test_an_answer_that_has_lost_static_friction_is_no_answer(static: float, mon
     """Another basin, at the noise, too, whose intervals missed the truth by forty deviations."""
     problem, _ = posed()
     below = problem.parameters.with_values({"friction.static": static, "friction.coulomb": 30.0})
-    fit: Fit = Mock(unidentifiable=(), status=Status(Code.CONVERGED, ("",)), parameters=below)
+    fit, *others = (
+        Mock(unidentifiable=(), unsettled=(), jumps=None, status=Status(Code.CONVERGED, ("",)), parameters=below)
+        for _ in range(3)
+    )
+    for cost, each in enumerate((fit, *others), 1):
+        each.stats = {"cost": float(cost)}
     explain_all(monkeypatch)
-    monkeypatch.setattr(long_logs, "_tries_of_long_logs", lambda _: iter(3 * [(problem, fit, "")]))
+    monkeypatch.setattr(long_logs, "_tries_of_long_logs", lambda _: iter([(problem, f, "") for f in (fit, *others)]))
     assert long_logs._fit_long_logs(problem, []) is None
+    same: Fit = Mock(
+        unidentifiable=(), unsettled=(), jumps=None, stats={"cost": 1.0}, status=fit.status, parameters=below
+    )
+    monkeypatch.setattr(long_logs, "_tries_of_long_logs", lambda _: iter(3 * [(problem, same, "")]))
+    assert long_logs._fit_long_logs(problem, []) is not None  # what two starts lead to is what the logs show
     known = replace(problem, held={"friction.static": static})
     assert is_in_order(known, fit)
     assert not is_in_order(problem, fit)
@@ -197,7 +207,7 @@ def test_a_short_search_that_is_cut_near_the_noise_goes_on(monkeypatch: pytest.M
     for module in (long_logs, multistart):
         monkeypatch.setattr(module, "solve_least_squares", cut)
     problem, _ = posed()
-    held, fit, label = long_logs.fit_logs(problem)
+    held, fit, label = long_logs.fit_logs(problem, multistart.fit_from_starts)
     assert lengths == 2 * [len(problem.experiments[0].trajectory)]
     assert fit.status.converged
     assert held.method == problem.method
@@ -242,7 +252,7 @@ def test_ctrl_c_in_the_short_search_ends_all() -> None:
         raise KeyboardInterrupt
 
     problem, _ = posed(method=LeastSquares(progress=interrupt))
-    held, fit, _ = long_logs.fit_logs(problem)
+    held, fit, _ = long_logs.fit_logs(problem, multistart.fit_from_starts)
     assert fit.status.code is Code.INTERRUPTED
     assert not held.held
     assert math.isfinite(fit.stats["cost"])
@@ -261,5 +271,31 @@ def test_an_interruption_hands_back_the_best_of_all_tries(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(long_logs, "_fit_long_logs", tries)
     monkeypatch.setattr(long_logs, "replace", lambda fit, **_: fit)
-    monkeypatch.setattr(long_logs, "fit_from_starts", lambda *_, **__: (problem, rough, "rough"))
-    assert long_logs.fit_logs(problem) == (problem, near, "near")
+    assert long_logs.fit_logs(problem, lambda _: (problem, rough, "rough")) == (problem, near, "near")
+
+    def interrupt(problem: EstimationProblem) -> multistart.Candidate:
+        raise KeyboardInterrupt
+
+    assert long_logs.fit_logs(problem, interrupt) == (problem, near, "near")
+    monkeypatch.setattr(long_logs, "_fit_long_logs", lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        long_logs.fit_logs(problem, interrupt)
+
+
+@pytest.mark.parametrize("stage", [0, 1])
+def test_ctrl_c_between_the_tries_ends_all(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the search with wide gaps, or in the tight one after it, for which the next try was taken up."""
+    problem, _ = posed()
+    rough, runs = problem.candidates()[0], list[int]()
+
+    def cut(transcription: Transcription, method: LeastSquares) -> Fit:
+        fit = solve_least_squares(transcription, method)
+        runs.append(len(runs))
+        return replace(fit, status=INTERRUPTED_SEARCH) if runs[-1] == stage else fit
+
+    for module in (long_logs, multistart):
+        monkeypatch.setattr(module, "solve_least_squares", cut)
+    found = long_logs._fit_filtered(problem, rough, is_far=False)
+    assert found is not None
+    assert found[1].status.code is Code.INTERRUPTED
+    assert runs == list(range(stage + 1))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from pneuopt.dynamics.hooks import Start
 from pneuopt.identification import multistart
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.models.friction import Stribeck
@@ -43,3 +44,26 @@ def test_a_part_that_is_known_by_what_is_held_alone_is_none() -> None:
     held, part = multistart.fit_a_part(problem, given, "start")
     assert part is given
     assert held is problem
+
+
+def test_ctrl_c_in_the_fit_of_a_part_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was taken for a part that does not settle, and the search went on with the next start."""
+    problem, done = optimum()
+    given = unsettled(done, VELOCITY, 1.05 * done.parameters.value(VELOCITY))
+    monkeypatch.setattr(
+        multistart, "solve_least_squares", lambda *_: replace(done, status=Status(Code.INTERRUPTED, ("cut",)))
+    )
+    held, part = multistart.fit_a_part(problem, given, "start")
+    assert held is problem
+    assert part.status.code is Code.INTERRUPTED
+    assert part.parameters == given.parameters
+    starts = list[str]()
+
+    def search(problem: EstimationProblem, start: Start, *_: object) -> tuple[EstimationProblem, Fit]:
+        starts.append(start.label)
+        return problem, given
+
+    monkeypatch.setattr(multistart, "fit_holding_unidentifiable", search)
+    monkeypatch.setattr(multistart, "is_at_noise", lambda *_: True)
+    assert multistart.fit_from_starts(problem)[1].status.code is Code.INTERRUPTED
+    assert len(starts) == 1
