@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_REFITS_A_SIDE = 14  # refits on one side of the estimate: more cost time, fewer leave an end open that is not
-ROOT_TOLERANCE = (
-    0.003  # relative error of the deviance's root at an end: smaller takes more refits, larger blurs the end
-)
+# error of an end, and of the deviance's root there, relative to that end's distance from the estimate and to the root:
+# smaller takes more refits, larger blurs the end
+END_TOLERANCE = 0.01
 MAX_LOG_STEP = 1.5  # e-folds of a log parameter between two refits: larger steps lose the optimum of the others
 MAX_LOG_PROBE = 0.3  # e-folds over which the curvature at the estimate is measured: farther away it differs
 REFIT_ITERATIONS = 40  # iterations of a refit, at most: fewer leave its cost too high, and the interval too narrow
@@ -286,13 +286,18 @@ def _first_step(refits: _Refits, target: float) -> float:
 
 
 def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePoint, target: float) -> None:
-    """Locate a crossing of the level by false position on the root of the deviance, which is nearly linear."""
+    """Locate a crossing of the level by false position on the root of the deviance, which is nearly linear.
+
+    Where refits end at two optima, it may jump over the level; the place of the jump is all that is to be found there.
+    """
     for _ in range(MAX_REFITS_A_SIDE):
+        if abs(outside.z - inside.z) <= END_TOLERANCE * abs(outside.z - refits.centre):
+            return
         a, b = refits.deviance_root(inside), refits.deviance_root(outside)
         if not a < target <= b:  # a refit has found a better fit, from which all are counted now
             return
         share = (target - a) / (b - a) if math.isfinite(b) else 0.5
         point = refits.refit_at(inside.z + min(max(share, 0.05), 0.95) * (outside.z - inside.z))
-        if abs(refits.deviance_root(point) - target) < ROOT_TOLERANCE * target:
+        if abs(refits.deviance_root(point) - target) < END_TOLERANCE * target:
             return
         inside, outside = (point, outside) if refits.deviance_root(point) < target else (inside, point)

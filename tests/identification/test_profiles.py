@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -165,3 +166,22 @@ def test_with_noise_of_the_states_no_interval_is_profiled(monkeypatch: pytest.Mo
     noisy = replace(doubtful, stats={**doubtful.stats, "gap_deviation": 1e-3})
     assert review._profiles(problem, noisy) == ({}, [])
     assert len(traced) == 1
+
+
+def test_a_profile_that_jumps_over_its_level_is_not_followed_into_the_jump() -> None:
+    """Refits of a log of 60 s ended at two optima; 20 of 26 refits, 50 CPU s, halved a jump down to rounding."""
+    tried = list[float]()
+
+    class Jump:
+        centre = 0.0
+
+        def refit_at(self, z: float) -> SimpleNamespace:
+            tried.append(z)
+            return SimpleNamespace(z=z)
+
+        def deviance_root(self, point: SimpleNamespace) -> float:
+            return 1.0 if point.z < math.pi / 4 else 3.0
+
+    profiles._locate_crossing(Jump(), SimpleNamespace(z=0.0), SimpleNamespace(z=1.0), 2.0)  # type: ignore[arg-type]
+    assert len(tried) <= 8
+    assert abs(tried[-1] - math.pi / 4) < 2 * profiles.END_TOLERANCE
