@@ -7,7 +7,7 @@ import numpy as np
 
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations, positive_definite_inverse
+from pneuopt.shooting.arrow import ReducedEquations, positive_definite_inverse
 from pneuopt.shooting.equations import NormalEquations, describe_misfit
 from pneuopt.shooting.scaling import UNIDENTIFIABLE_PRIOR_RATIO, ParameterScaling
 
@@ -22,12 +22,14 @@ NO_POSITIONS = np.zeros(0, dtype=np.intp)
 class ConvergenceTest(NamedTuple):
     """The status of an iterate, and the positions of free parameters that the data do not determine there.
 
-    `unsettled` is the one that would still move most where nothing else is wrong.
+    `unsettled` is the one that would still move most where nothing else is wrong; `largest_step` is that of a converged
+    iterate, in standard deviations.
     """
 
     status: Status
     unidentifiable: Indices = NO_POSITIONS
     unsettled: Indices = NO_POSITIONS
+    largest_step: float = 0.0
 
 
 def assess_convergence(
@@ -73,27 +75,30 @@ def assess_convergence(
         weakest = _least_sensitive(own, space, reduced, noise, z)
         return ConvergenceTest(status, weakest if weakest.size else alike[-1:])
     spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
-    step = np.abs(solved.parameters[keep]) / spread
-    if np.max(step, initial=0.0) > tolerance * noise:
+    step = np.abs(solved.parameters[keep]) / (noise * spread)
+    if np.max(step, initial=0.0) > tolerance:
         worst = int(np.argmax(step))
-        verdict = f"{names[keep][worst]} would still move by {step[worst] / noise:.2g} standard deviations"
+        verdict = f"{names[keep][worst]} would still move by {step[worst]:.2g} standard deviations"
         remedy = "try more iterations, other start values, or fix a parameter"
         status = Status(Code.NOT_CONVERGED, (verdict, remedy))
         return ConvergenceTest(status, _least_certain(own, noise * spread, space, z), own[[worst]])
     bounded = np.flatnonzero(space.at_bound(z) & ~space.held)
     return ConvergenceTest(
-        _optimum_status(equations, message, noisy_gaps=noisy_gaps), _least_sensitive(bounded, space, reduced, noise, z)
+        _optimum_status(equations, message, noisy_gaps=noisy_gaps),
+        _least_sensitive(bounded, space, reduced, noise, z),
+        largest_step=float(np.max(step, initial=0.0)),
     )
 
 
-def largest_parameter_step(
-    equations: NormalEquations, keep: Mask, reduced: ReducedEquations, step: GaussNewtonStep
-) -> float:
-    """The largest step of a kept parameter in its standard deviations; infinite where the data do not determine all."""
+def largest_parameter_step(equations: NormalEquations, keep: Mask, reduced: ReducedEquations, step: Array) -> float:
+    """The largest step of a kept parameter, of shape (k,) in all, in its standard deviations.
+
+    It is infinite where the data do not determine all of them.
+    """
     if equations.unidentifiable_parameters(reduced, keep).size:
         return math.inf
     spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
-    return float(np.max(np.abs(step.parameters[keep]) / spread, initial=0.0))
+    return float(np.max(np.abs(step[keep]) / spread, initial=0.0))
 
 
 def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: bool) -> Status:

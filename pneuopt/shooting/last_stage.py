@@ -4,18 +4,24 @@ Friction at rest has a kink in the speed, over which Gauss-Newton steps overshoo
 one that ends where its equations no longer move it is trapped, and keeps the rest of the log from its optimum.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.quantities.arrays import Indices
+from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.shooting.convergence import largest_parameter_step
 
 if TYPE_CHECKING:
     from pneuopt.shooting.search import Search
 
-# times that the last stage is repeated near the noise [1]: fewer leave a search over kinks (bristles at rest) before
-# its end, for other starts that take longer; more follow one that does not end
-MAX_REPEATS = 3
+# times that the last stage is repeated near the noise [1], and iterations of each time: fewer leave a search over kinks
+# (bristles at rest) before its end, for other starts that take longer; more follow one that does not end
+MAX_REPEATS, REPEAT_ITERATIONS = 9, 10
+# step [standard deviations] up to which a search has settled where a repeat has moved no estimate: lower follows what
+# kinks ask for in vain (100 iterations of bristles at rest for .1 deviations), higher takes a slow search for one that
+# has settled
+MAX_SETTLED_STEP = 0.5
 # damping of a node alone, over its diagonal [1], beyond which a kink traps it, for it moves less than half as far as
 # its equations ask: lower moves nodes that are only slow, higher leaves some behind
 TRAPPING_DAMPING = 1.0
@@ -37,19 +43,42 @@ def repeat_last_stage(search: "Search") -> None:
     ----------
     search : Search
         Moves to where it has come by then. Parameters that the data do not determine end this, for a caller holds them.
+        Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
     """
     least_decrease = 0.5 * search.method.tolerance**2  # that of a step of so many deviations
     for _ in range(MAX_REPEATS):
-        found, before = search.assess(search.current), search.current.cost
+        found, before = search.assess(search.current), search.current
         if found.status.converged or found.unidentifiable.size or not is_near_end(search):
             return
         trapped = np.flatnonzero(search.node_damping > TRAPPING_DAMPING)
         if trapped.size:
             free_nodes(search, trapped)
         else:
-            search.run_stage(search.stage.iterations)
-        if before - search.current.cost < least_decrease:
+            search.run_stage(REPEAT_ITERATIONS)
+        if moved_deviations(search, before.z) <= search.method.tolerance:
+            search.tolerance = max(search.tolerance, MAX_SETTLED_STEP)
+        if before.cost - search.current.cost < least_decrease:
             return
+
+
+def moved_deviations(search: "Search", z: Array) -> float:
+    """How far the parameters have moved from z, at most [standard deviations]; infinite where one has none."""
+    equations, current = search.current.equations, search.current.z
+    reduced = equations.arrow.eliminate(0.0)
+    if reduced is None:
+        return math.inf
+    keep = search.scaling.movable(current, equations, reduced)
+    return largest_parameter_step(equations, keep, reduced, current - z)
+
+
+def unsettled_covariance(search: "Search") -> Array:
+    """The covariance (own units) of the step that kinks still ask for. Shape (k, k)."""
+    equations, z = search.current.equations, search.current.z
+    asked, reduced = np.zeros(len(z)), equations.arrow.eliminate(0.0)
+    solved = None if reduced is None else reduced.step(search.scaling.movable(z, equations, reduced))
+    if solved is not None:
+        asked = equations.linearisation.chain * solved.parameters
+    return np.outer(asked, asked)
 
 
 def free_nodes(search: "Search", trapped: Indices) -> None:

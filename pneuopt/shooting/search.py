@@ -82,6 +82,7 @@ class Search:
         self.segments = segments = self.steps.segments
         self.gap_scales = gap_scales(segments, method.kinematic)
         self.iterations, self.stage_began, self.noisy_gaps, self.has_stalled = 0, 0, False, False
+        self.tolerance = method.tolerance  # wider where kinks hold up a search that has settled
         self.stage, self.stage_ends, self.unsettled_gaps = method.stages[0], list[StageEnd](), set[float]()
         self.correction: IntegrationCorrection | None
         self.substeps = self.output_substeps = self.steps.start
@@ -247,7 +248,8 @@ class Search:
         self.segments, steps = self.steps.renew(self.segments, nodes, self.scaling.values(z), self.substeps)
         is_same = self.segments is self.current.equations.segments and nodes is self.current.nodes
         is_known = is_same and steps == self.substeps and self.correction is None
-        self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
+        self.stage, self.tolerance = stage, self.method.tolerance
+        self.substeps, self.output_substeps, self.correction = steps, steps, None
         self.is_coarse, self.node_damping = stage.refine > 1, np.zeros(len(nodes))
         if is_known:
             equations = weigh_gaps(self.segments, self.current.equations.linearisation, stage.gap * self.gap_scales)
@@ -375,10 +377,14 @@ class Search:
 
     def assess(self, current: Iterate) -> ConvergenceTest:
         """The convergence test of an iterate."""
-        message, tolerance = f"{self.iterations} iterations", self.method.tolerance
-        return assess_convergence(
-            current.equations, self.scaling, current.z, tolerance, message, noisy_gaps=self.noisy_gaps
+        message = f"{self.iterations} iterations"
+        found = assess_convergence(
+            current.equations, self.scaling, current.z, self.tolerance, message, noisy_gaps=self.noisy_gaps
         )
+        if not (found.status.converged and found.largest_step > self.method.tolerance):
+            return found
+        asked = f"kinks of the model ask for {found.largest_step:.2g} standard deviations, which the intervals hold"
+        return found._replace(status=found.status.with_details(f"the estimates have settled; {asked}"))
 
     def largest_change(self, change: Array) -> float:
         """The largest change of a measured output [noise standard deviations], of all that are given."""

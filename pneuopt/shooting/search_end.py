@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting.last_stage import unsettled_covariance
 from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.segments import IntegrationCorrection
 from pneuopt.shooting.solution import Fit, Optimum
@@ -73,6 +74,8 @@ def end_search(search: "Search", status: Status, seconds: float) -> Fit:
     covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
     if math.isfinite(equations.cost):
         covariance = equations.covariance(keep, noisy_gaps=search.noisy_gaps)
+        if covariance is not None and search.tolerance > search.method.tolerance:
+            covariance = covariance + unsettled_covariance(search)
         prior = equations.prior_covariance(keep, held, search.scaling.weak_prior(current.z)) if held.any() else None
         names = names if status in (ABANDONED_START, JOINED_SEARCH) else _doubtful_parameters(search)
     if covariance is not None:

@@ -70,7 +70,7 @@ def is_negligible_step(search: "Search", current: Iterate, reduced: ReducedEquat
     if not ((is_settled or search.noisy_gaps) and promised < STAGE_COST_TOLERANCE * current.cost):
         return False
     keep = search.scaling.movable(current.z, equations, reduced)
-    largest = largest_parameter_step(equations, keep, reduced, step) / search.method.tolerance
+    largest = largest_parameter_step(equations, keep, reduced, step.parameters) / search.method.tolerance
     if is_wrong:
         return largest < MISFIT_TOLERANCE * math.sqrt(max(1.0, equations.chi_square / max(1, equations.count)))
     return largest < (COARSE_TOLERANCE if search.is_coarse else FINE_TOLERANCE)

@@ -22,6 +22,7 @@ from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squa
 from pneuopt.shooting.levenberg_marquardt import Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search import Search
+from pneuopt.shooting.search_end import end_search
 from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
@@ -242,3 +243,70 @@ def test_a_budget_ends_a_step_between_its_tries() -> None:
         with pytest.raises(BudgetSpentError), check_during_runs(budget.check):
             descent.step(current)
     assert len(tried) == 1
+
+
+def variance(search: Search) -> float:
+    covariance = search.current.equations.covariance(np.array([True]))
+    assert covariance is not None
+    return float(covariance[0, 0])
+
+
+def near_optimum(deviations: float, monkeypatch: pytest.MonkeyPatch, *, follows: float) -> Search:
+    """A search so many deviations beside its optimum, which an iteration follows by a share of that."""
+    method = LeastSquares(stages=(Stage(1e-3, 30, refine=2),), substeps=1, tolerance=0.1)
+    search = Search(segment(right_squares()), method)
+    search.solve()
+    search.tolerance = method.tolerance
+    optimum = search.current
+    deviation, t = math.sqrt(variance(search)), search.segments.t[:, :1]
+
+    def beside(away: Array) -> Iterate:
+        return search.evaluate(optimum.nodes + away * (t - t.mean()), optimum.z + away)
+
+    def follow(*_: object) -> bool:
+        search.current = beside((1 - follows) * (search.current.z - optimum.z))
+        return False
+
+    search.current = beside(np.array([deviations * deviation]))
+    monkeypatch.setattr(search, "run_stage", follow)
+    return search
+
+
+@pytest.mark.parametrize(
+    ("deviations", "follows", "converges"), [(0.35, 0.02, True), (1.5, 0.02, False), (0.02, 0.0, True)]
+)
+def test_a_search_whose_estimates_move_no_more_has_settled(
+    deviations: float, follows: float, converges: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bristles at rest asked for .3 deviations for 200 iterations that moved no estimate by .1: refused after 60 CPU s.
+
+    What is asked for widens the interval, and the status says so; a search that would go farther has not converged.
+    """
+    search = near_optimum(deviations, monkeypatch, follows=follows)
+    last_stage.repeat_last_stage(search)
+    found = search.assess(search.current)
+    assert found.status.converged == converges
+    says = "the estimates have settled; kinks of the model ask for 0.3"
+    assert (says in found.status.message) == (converges and deviations > search.method.tolerance)
+
+
+def test_what_kinks_ask_for_widens_the_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = near_optimum(0.4, monkeypatch, follows=0.0)
+    last_stage.repeat_last_stage(search)
+    step, fit = (
+        search.assess(search.current).largest_step,
+        end_search(search, search.assess(search.current).status, 0.0),
+    )
+    assert 0.3 < step < 0.5
+    assert fit.covariance is not None
+    assert fit.covariance[0, 0] / variance(search) == pytest.approx(1 + step**2, rel=0.05)
+    search._enter_stage(search.stage, search.current.nodes, search.current.z)
+    assert not search.assess(search.current).status.converged
+
+
+def test_an_estimate_that_moves_has_not_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = near_optimum(3.0, monkeypatch, follows=0.3)
+    monkeypatch.setattr(last_stage, "MAX_REPEATS", 5)
+    last_stage.repeat_last_stage(search)
+    assert search.tolerance == search.method.tolerance
+    assert not search.assess(search.current).status.converged

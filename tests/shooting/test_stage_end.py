@@ -37,7 +37,7 @@ def negligible(
         is_noise=lambda _: False,
     )
     current: Any = SimpleNamespace(equations=equations, cost=500 * misfit, z=np.zeros(1))
-    nothing: Any = None
+    nothing: Any = SimpleNamespace(parameters=None)
     return is_negligible_step(search, current, nothing, nothing)
 
 
