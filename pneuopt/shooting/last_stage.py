@@ -15,9 +15,10 @@ from pneuopt.shooting.convergence import largest_parameter_step
 if TYPE_CHECKING:
     from pneuopt.shooting.search import Search
 
-# times that the last stage is repeated near the noise [1], and iterations of each time: fewer leave a search over kinks
-# (bristles at rest) before its end, for other starts that take longer; more follow one that does not end
-MAX_REPEATS, REPEAT_ITERATIONS = 9, 10
+# times that the iterations of the last stage are repeated near the noise [1]: fewer leave a search over kinks (bristles
+# at rest) before its end, for other starts that take longer; more follow one that does not end
+MAX_REPEATS = 3
+REPEAT_ITERATIONS = 10  # of a repeat, at most: fewer take a slow search for settled, more go on after it has
 # step [standard deviations] up to which a search has settled where a repeat has moved no estimate: lower follows what
 # kinks ask for in vain (100 iterations of bristles at rest for .1 deviations), higher takes a slow search for one that
 # has settled
@@ -46,7 +47,8 @@ def repeat_last_stage(search: "Search") -> None:
         Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
     """
     least_decrease = 0.5 * search.method.tolerance**2  # that of a step of so many deviations
-    for _ in range(MAX_REPEATS):
+    count = min(REPEAT_ITERATIONS, search.stage.iterations)
+    for _ in range(MAX_REPEATS * search.stage.iterations // max(1, count)):
         found, before = search.assess(search.current), search.current
         if found.status.converged or found.unidentifiable.size or not is_near_end(search):
             return
@@ -54,7 +56,7 @@ def repeat_last_stage(search: "Search") -> None:
         if trapped.size:
             free_nodes(search, trapped)
         else:
-            search.run_stage(REPEAT_ITERATIONS)
+            search.run_stage(count)
         if moved_deviations(search, before.z) <= search.method.tolerance:
             search.tolerance = max(search.tolerance, MAX_SETTLED_STEP)
         if before.cost - search.current.cost < least_decrease:

@@ -306,7 +306,17 @@ def test_what_kinks_ask_for_widens_the_intervals(monkeypatch: pytest.MonkeyPatch
 
 def test_an_estimate_that_moves_has_not_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     search = near_optimum(3.0, monkeypatch, follows=0.3)
-    monkeypatch.setattr(last_stage, "MAX_REPEATS", 5)
+    monkeypatch.setattr(last_stage, "MAX_REPEATS", 1)
     last_stage.repeat_last_stage(search)
     assert search.tolerance == search.method.tolerance
     assert not search.assess(search.current).status.converged
+
+
+def test_a_search_of_no_iterations_only_assesses_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A width was scored by a search that was to stay at the fit; ten iterations more, and none was rejected."""
+    search = near_optimum(0.4, monkeypatch, follows=1.0)
+    search.stage = replace(search.stage, iterations=0)
+    last_stage.repeat_last_stage(search)
+    assert not search.assess(search.current).status.converged
+    fit = solve_least_squares(right_squares(), LeastSquares(stages=(Stage(1e-3, 0, refine=2),), substeps=1))
+    assert fit.stats["iterations"] == 0
