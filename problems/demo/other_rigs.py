@@ -6,10 +6,11 @@ Each rig has a load, a friction, a valve and a valve hysteresis of its own; its 
 logged under the demo's loop that hunts, at the same references. Nothing was chosen on these rigs: the rule of the demo
 stood before the first was drawn, and its search was shortened by what it finds on the demo's own model.
 
-What is claimed is what the demo claims of its own rig: a certified design settles no later than on the model in half of
-the band, with at most 8 % overshoot and 1 % error; promises.kept counts. On rig 3 the last two are missed, by .14 and
-.005 points, so the script exits with 1. For rig 1 no design is certified, after a long search: the certificate finds
-that the step to 0.25 m/s does not settle.
+What is claimed is that the log is identified, and what the demo claims of its own rig: a certified design settles no
+later than on the model in half of the band, with at most 8 % overshoot and 1 % error; promises.kept counts. Two claims
+are missed, so the script exits with 1: on rig 3 the overshoot, by .27 points; and rig 1's log is refused, for a search
+with noise of the states creeps over kinks .8 deviations short of its optimum. It was identified by starts that differed
+by 1 %, and no design was certified then: the step to 0.25 m/s did not settle.
 """
 
 import sys
@@ -41,7 +42,7 @@ from problems.shared.claims import METRICS, Claim, arguments, design, finish, fr
 if TYPE_CHECKING:
     import pandas as pd
 
-SEEDS = (1, 2, 3, 4)  # of the rigs; each takes about 20 CPU s, the first some minutes
+SEEDS = (1, 2, 3, 4)  # of the rigs; each takes 20 to 40 CPU s
 LOGGING = {"pid.Kp": 1.5, "pid.Ki": 25.0, "pid.lower": -5.0, "pid.upper": 5.0}  # the loop that hunts, of generate.py
 COMMAND_STEP = 1e-4  # [V], of the log
 MASS = (3.0, 7.0)  # [kg], as the engineer states it
@@ -71,11 +72,15 @@ def one_rig(seed: int) -> list[Claim]:
     stated, truth, beyond = draw(np.random.default_rng(seed))
     drive, given = po.read_drive(DATA / "drive.toml")
     given = given.with_values({"load.mass": stated})
-    fit = po.identify(drive.system(), [record(given, truth, beyond, seed)], given)
+    fit = po.identify(drive.system(), [record(given, truth, beyond, seed)], given, throw=False)
+    identified = Claim(f"{seed}.identified", float(fit.status.converged), "1", None, ">= 1")
+    if not fit.status.converged:
+        print(f"rig {seed}: {fit.status}")
+        return [identified, Claim(f"{seed}.certified", 0.0)]
     best = tune(*tuning_start(drive.system(), fit.parameters), throw=False)
     print(f"rig {seed}: {best.status}")
     errors = {name: 100 * (fit.parameters.value(name) / truth[name] - 1) for name in fit.estimates.index}
-    claims = [Claim(f"{seed}.{name}.bias", error, "%") for name, error in errors.items()]
+    claims = [identified, *(Claim(f"{seed}.{name}.bias", error, "%") for name, error in errors.items())]
     claims.append(Claim(f"{seed}.seconds", process_time() - began, "s"))
     claims.append(Claim(f"{seed}.certified", float(best.status.converged)))
     if not best.status.converged:
