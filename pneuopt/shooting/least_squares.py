@@ -31,8 +31,8 @@ class Stage:
     iterations : int
         Largest number of iterations.
     refine : int
-        Integration steps at the end of the stage, as a multiple of those before; a method's last stage has more than 1.
-        One of 1 with a gap above `WIDE_GAP` draws log parameters to their start (`has_prior`).
+        Integration steps at the end of the stage, as a multiple of those before. Let the last stage have more than 1:
+        with 1 and a gap above `WIDE_GAP` a stage draws log parameters to their start (`has_prior`).
     """
 
     gap: float
