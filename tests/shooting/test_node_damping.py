@@ -320,3 +320,21 @@ def test_a_search_of_no_iterations_only_assesses_where_it_is(monkeypatch: pytest
     assert not search.assess(search.current).status.converged
     fit = solve_least_squares(right_squares(), LeastSquares(stages=(Stage(1e-3, 0, refine=2),), substeps=1))
     assert fit.stats["iterations"] == 0
+
+
+@pytest.mark.parametrize("iterations", [4, 10, 30])
+def test_a_last_stage_is_repeated_three_times_in_all(iterations: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    search, taken = near_optimum(1e3, monkeypatch, follows=0.01), list[int]()
+    search.stage = replace(search.stage, iterations=iterations)
+    search.method = replace(search.method, stages=(search.stage,))
+    follow = search.run_stage
+
+    def count(steps: int) -> bool:
+        taken.append(steps)
+        return follow(steps)
+
+    monkeypatch.setattr(search, "run_stage", count)
+    monkeypatch.setattr(search, "is_noise", lambda _: True)
+    last_stage.repeat_last_stage(search)
+    assert sum(taken) == last_stage.MAX_REPEATS * iterations
+    assert max(taken) == min(iterations, last_stage.REPEAT_ITERATIONS)
