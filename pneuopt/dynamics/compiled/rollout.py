@@ -29,6 +29,9 @@ from pneuopt.quantities.errors import ModelError, require
 BRIEF_STEPS = 20_000
 """Steps of a lane that run to their end in the main thread [1]: more delay Ctrl-C (at 10 us a step by .2 s); fewer make
 short runs wait for a thread (30 us)."""
+# integration steps of all segments [1] up to which a run is not shared out to threads: lower waits for threads (.3 ms)
+# that save less, higher leaves cores idle
+UNSHARED_STEPS = 1000
 MAX_SUBSTEPS = 2**31 - 1  # integration steps a sample [1]: more do not fit the C int that counts them
 VM_BATCH = 1000  # segments of a batch in the CasADi VM; more take memory for their derivatives, fewer time
 CHECK_SECONDS = 0.1  # between two checks of a long run [s]: longer overruns a CPU budget, shorter takes time itself
@@ -298,8 +301,10 @@ class Rollout:
         arrays = (*given, *others)
         pointers = [a.ctypes.data if a is not None else None for a in arrays]
         stride, at = p.shape[1] if p.ndim == 2 else 0, ctypes.addressof(stop)
-        calls = [(a, b, n, substeps, stride, states or 1, *pointers, at) for a, b in self._parts(m)]
-        self._share_out(function, calls, m * n * substeps, stop, arrays)
+        steps = m * n * substeps
+        parts = self._parts(m) if steps > UNSHARED_STEPS else [(0, m)]
+        calls = [(a, b, n, substeps, stride, states or 1, *pointers, at) for a, b in parts]
+        self._share_out(function, calls, steps, stop, arrays)
 
     def race(self, course: Any, m: int, steps: int, arrays: Sequence[Any]) -> None:
         """Run the race of m candidates that a struct Race of race.c describes, by pointers to `arrays`."""
