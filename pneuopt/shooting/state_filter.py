@@ -11,9 +11,7 @@ from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.shooting.integration_steps import choose_integration
 from pneuopt.shooting.segments import Segments
 
-PIECE_SEGMENTS = (
-    1000  # segments a piece: more take more steps one after the other, fewer waste more of them on the lead
-)
+PIECE_SEGMENTS = 300  # segments a piece: more take more steps one after the other, fewer waste more on the lead
 # segments before a piece from which its states come: fewer leave it the error of its start, more cost time
 LEAD_SEGMENTS = 300
 START_DEVIATION = 0.1  # of the state where a piece or a log begins, in nominal sizes [1]: about that of rough states

@@ -1,17 +1,19 @@
 """The extended Kalman filter of the nodes, against the plain Kalman filter of a linear plant."""
 
 import numpy as np
+import pytest
 
 from pneuopt.models.linear import FirstOrder
+from pneuopt.quantities.arrays import Array
 from pneuopt.shooting import state_filter
-from pneuopt.shooting.segments import segment
+from pneuopt.shooting.segments import Segments, segment
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 N, SAMPLES, SAMPLE, TIME_CONSTANT, NOISE = 60, 3, 0.01, 0.05, 0.02  # samples, samples a segment, [s], [s], [m/s]
 
 
-def test_the_filter_of_a_linear_plant_is_the_kalman_filter() -> None:
-    """By hand: sample by sample through each segment, the state's own deviation added from segment to segment."""
+def problem() -> tuple[tuple[Array, Array, float, float], Segments, Array, Array]:
+    """The input, the output, the gain and the state's size of a linear plant; its segments, rough states and values."""
     system = FirstOrder().system().discrete()
     parameters = FirstOrder().system().parameters.with_values({"plant.time_constant": TIME_CONSTANT})
     parameters = parameters.freed("plant.gain")
@@ -27,7 +29,26 @@ def test_the_filter_of_a_linear_plant_is_the_kalman_filter() -> None:
     residuals = Residuals(0, (system.outputs[0].name,), y[:, None], np.array([NOISE]))
     segments = segment(Transcription(system, parameters, (phase,), (residuals,)))
     q = np.array([p.value for p in parameters.values()])
-    found = state_filter.filter_nodes(segments, rough[::SAMPLES], q)
+    return (u, y, gain, scale), segments, rough[::SAMPLES], q
+
+
+def test_pieces_side_by_side_give_the_filter_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lead forgets where a piece starts, here within four time constants; without one it would show."""
+    _, segments, rough, q = problem()
+    whole = state_filter.filter_nodes(segments, rough, q)
+    monkeypatch.setattr(state_filter, "PIECE_SEGMENTS", 4)
+    monkeypatch.setattr(state_filter, "LEAD_SEGMENTS", 8)
+    pieces = state_filter.filter_nodes(segments, rough, q)
+    np.testing.assert_allclose(pieces, whole, atol=1e-4)
+    monkeypatch.setattr(state_filter, "LEAD_SEGMENTS", 0)
+    assert np.abs(state_filter.filter_nodes(segments, rough, q) - whole).max() > 1e-3
+
+
+def test_the_filter_of_a_linear_plant_is_the_kalman_filter() -> None:
+    """By hand: sample by sample through each segment, the state's own deviation added from segment to segment."""
+    (u, y, gain, scale), segments, rough, q = problem()
+    a = np.exp(-SAMPLE / TIME_CONSTANT)
+    found = state_filter.filter_nodes(segments, rough, q)
 
     mean, variance, expected = 0.1, (state_filter.START_DEVIATION * scale) ** 2, []
     for begin in range(0, N, SAMPLES):
