@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_REFITS_A_SIDE = 14  # refits on one side of the estimate: more cost time, fewer leave an end open that is not
-# error of an end, and of the deviance's root there, relative to that end's distance from the estimate and to the root:
-# smaller takes more refits, larger blurs the end
-END_TOLERANCE = 0.01
+# how closely an end is surrounded, relative to its distance from the estimate, or the deviance's root at a refit, to
+# the level's: smaller takes more refits, larger interpolates the end from farther off
+END_TOLERANCE = 0.02
 MAX_LOG_STEP = 1.5  # e-folds of a log parameter between two refits: larger steps lose the optimum of the others
 MAX_LOG_PROBE = 0.3  # e-folds over which the curvature at the estimate is measured: farther away it differs
 REFIT_ITERATIONS = 40  # iterations of a refit, at most: fewer leave its cost too high, and the interval too narrow
@@ -172,7 +172,8 @@ class _Refits:
         self.start = problem.start_from(result)
         self.parameter = replace(problem.unknowns()[name], value=self.start.parameters[name])
         last, steps = Stage(result.stats["gap_deviation"], REFIT_ITERATIONS, refine=4), int(result.stats["substeps"])
-        self.method = replace(problem.method, stages=(last,), substeps=max(1, steps // 4), progress=None)
+        method = replace(problem.method, stages=(last,), substeps=max(1, steps // 4), progress=None)
+        self.method = replace(method, checks_steps=False)
         self.spread = self._search_deviation(float(result.estimates["stderr"][name]))
         self.points: list[_ProfilePoint] = []
         self.refit_at(self.to_search(self.parameter.value))
@@ -250,18 +251,24 @@ def _bracket(refits: _Refits, side: int, target: float) -> None:
     """Refit on one side until the deviance exceeds the level, then closely around that point; or to the bound."""
     p = refits.parameter
     bound = refits.to_search(p.lower if side < 0 else p.upper)
-    inside, step = refits.points[0], _first_step(refits, target)
+    inside, step = refits.points[0], (first := _first_step(refits, target))
+    probes = [point for point in refits.points if side * point.z > side * inside.z]  # of the curvature
     for _ in range(MAX_REFITS_A_SIDE):
         z = side * min(side * inside.z + step, side * bound)
         if z == inside.z:
             return
-        point = refits.refit_at(z)
+        is_probe = bool(probes)
+        point = probes.pop() if is_probe else refits.refit_at(z)
         if refits.deviance_root(point) >= target:
             _locate_crossing(refits, inside, point, target)
             return
+        if _is_at_level(refits, point, target):
+            return
         gained = refits.deviance_root(point) - refits.deviance_root(inside)
-        wanted = (target - refits.deviance_root(point)) * abs(z - inside.z) / gained if gained > 0 else math.inf
-        inside, step = point, min(max(1.05 * wanted, 0.1 * step), 3 * step, MAX_LOG_STEP if p.log else math.inf)
+        away = abs(point.z - inside.z)
+        wanted = (target - refits.deviance_root(point)) * away / gained if gained > 0 else math.inf
+        longest = first - away if is_probe else 3 * step  # a probe says little of what lies far off
+        inside, step = point, max(0.1 * step, min(1.01 * wanted, longest, MAX_LOG_STEP if p.log else math.inf))
 
 
 def _interval_end(refits: _Refits, side: int, target: float) -> float:
@@ -273,8 +280,14 @@ def _interval_end(refits: _Refits, side: int, target: float) -> float:
             share = (target - a) / (b - a) if math.isfinite(b) else 0.5
             return refits.value(inside.z + share * (outside.z - inside.z))
         if b < target:
-            break
+            is_end = _is_at_level(refits, outside, target)
+            return refits.value(refits.centre + target / b * (outside.z - refits.centre)) if is_end else side * math.inf
     return side * math.inf
+
+
+def _is_at_level(refits: _Refits, point: _ProfilePoint, target: float) -> bool:
+    """Whether a refit lies so near the level that no other one is needed."""
+    return abs(refits.deviance_root(point) - target) < END_TOLERANCE * target
 
 
 def _first_step(refits: _Refits, target: float) -> float:
@@ -293,11 +306,11 @@ def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePo
     for _ in range(MAX_REFITS_A_SIDE):
         if abs(outside.z - inside.z) <= END_TOLERANCE * abs(outside.z - refits.centre):
             return
+        if _is_at_level(refits, outside, target) or _is_at_level(refits, inside, target):
+            return
         a, b = refits.deviance_root(inside), refits.deviance_root(outside)
         if not a < target <= b:  # a refit has found a better fit, from which all are counted now
             return
         share = (target - a) / (b - a) if math.isfinite(b) else 0.5
         point = refits.refit_at(inside.z + min(max(share, 0.05), 0.95) * (outside.z - inside.z))
-        if abs(refits.deviance_root(point) - target) < END_TOLERANCE * target:
-            return
         inside, outside = (point, outside) if refits.deviance_root(point) < target else (inside, point)

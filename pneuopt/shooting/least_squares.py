@@ -78,6 +78,8 @@ class LeastSquares:
     known_costs : tuple of (float, float)
         Gaps and costs at which a search from another start has ended its stages, none of which explained the logs to
         their noise; a search that comes to the same ends there (`JOINED_SEARCH`).
+    checks_steps : bool
+        Whether finer integration steps are tried at the end: not where a refit keeps those of a fit that tried them.
     """
 
     stages: tuple[Stage, ...] = (
@@ -97,6 +99,7 @@ class LeastSquares:
     max_misfit: float = math.inf
     allows_state_noise: bool = True
     known_costs: tuple[tuple[float, float], ...] = field(default=(), repr=False, compare=False)
+    checks_steps: bool = field(default=True, repr=False)
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:

@@ -294,7 +294,7 @@ class Search:
     def _refine_steps(self, status: Status) -> Status:
         """Halve the integration steps until no estimate moves; steps that the user gave stay."""
         for _ in range(MAX_STEP_HALVINGS):
-            if not status.converged:
+            if not (status.converged and self.method.checks_steps):
                 break
             before = self.snapshot()
             change = self._apply_finer_steps((1 if self.method.substeps else 2) * self.output_substeps)

@@ -138,6 +138,6 @@ def _doubtful_parameters(search: "Search") -> tuple[tuple[str, ...], tuple[str, 
 
 def _integration_error(search: "Search", status: Status, run: RolloutResult) -> float:
     """Largest change of an output when the steps are halved [noise standard deviations]; NaN without an optimum."""
-    if math.isfinite(search.integration_change) or not status.converged:
+    if math.isfinite(search.integration_change) or not (status.converged and search.method.checks_steps):
         return search.integration_change
     return search.largest_change(search.run(2 * search.output_substeps).y - run.y)

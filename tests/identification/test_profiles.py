@@ -56,6 +56,7 @@ def test_of_a_linear_model_it_is_the_linear_interval() -> None:
         assert found.high - row["value"] == pytest.approx(row["ci_high"] - row["value"], rel=0.01)
         deviance = np.interp(row["value"] + row["stderr"], found.curve["value"], found.curve["deviance"])
         assert deviance < 2.0
+        assert len(found.curve) <= 5  # the estimate, two that show the curvature, and one at each end
 
 
 def test_of_a_drive_with_soft_gaps_it_is_the_linear_interval() -> None:
@@ -111,7 +112,9 @@ def test_a_curve_that_is_not_there_has_open_ends_and_no_interval() -> None:
     said = f"the logs do not identify {name}: anything from 0.0001 to 1 m/s fits as well; log"
     assert said in " ".join(result.verdict.sentences)
     assert np.isnan(result.covariance[name]).all()
-    assert f"the logs do not identify {name}" in result.status.sentences
+    # nor its static friction: what leads to other values of one leads to other values of both
+    assert f"the logs do not identify friction.static and {name}" in result.status.sentences
+    assert result.estimates["ci_low"]["friction.coulomb"] < 30.0 < result.estimates["ci_high"]["friction.coulomb"]
 
 
 @pytest.mark.parametrize("refits", [0, 3])
