@@ -2,6 +2,7 @@
 
 Friction at rest has a kink in the speed, over which Gauss-Newton steps overshoot. Nodes that do so are damped alone;
 one that ends where its equations no longer move it is trapped, and keeps the rest of the log from its optimum.
+A stage whose gaps stand for noise of the states is repeated, too; its gaps are what is estimated, and stay.
 """
 
 import math
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.quantities.status import Status
 from pneuopt.shooting.convergence import largest_parameter_step
 
 if TYPE_CHECKING:
@@ -20,9 +22,8 @@ if TYPE_CHECKING:
 MAX_REPEATS = 3
 REPEAT_ITERATIONS = 10  # of a repeat, at most: fewer take a slow search for settled, more go on after it has
 # step [standard deviations] up to which a search has settled where a repeat has moved no estimate: lower follows what
-# kinks ask for in vain (100 iterations of bristles at rest for .1 deviations), higher takes a slow search for one that
-# has settled
-MAX_SETTLED_STEP = 0.5
+# kinks ask for in vain (100 iterations of bristles at rest for .1 deviations), higher widens intervals by over half
+MAX_SETTLED_STEP = 1.0
 # damping of a node alone, over its diagonal [1], beyond which a kink traps it, for it moves less than half as far as
 # its equations ask: lower moves nodes that are only slow, higher leaves some behind
 TRAPPING_DAMPING = 1.0
@@ -37,7 +38,7 @@ def is_near_end(search: "Search") -> bool:
     return is_last and search.is_noise(search.current.cost)
 
 
-def repeat_last_stage(search: "Search") -> None:
+def repeat_last_stage(search: "Search") -> Status:
     """Run the last stage again while it explains the log to its noise and lowers the cost, but has not converged.
 
     Parameters
@@ -45,22 +46,29 @@ def repeat_last_stage(search: "Search") -> None:
     search : Search
         Moves to where it has come by then. Parameters that the data do not determine end this, for a caller holds them.
         Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
+
+    Returns
+    -------
+    Status
+        Of where it is then.
     """
     least_decrease = 0.5 * search.method.tolerance**2  # that of a step of so many deviations
     count = min(REPEAT_ITERATIONS, search.stage.iterations)
     for _ in range(MAX_REPEATS * search.stage.iterations // max(1, count)):
         found, before = search.assess(search.current), search.current
-        if found.status.converged or found.unidentifiable.size or not is_near_end(search):
-            return
+        is_near = search.noisy_gaps or is_near_end(search)
+        if found.status.converged or found.unidentifiable.size or not is_near:
+            return found.status
         trapped = np.flatnonzero(search.node_damping > TRAPPING_DAMPING)
-        if trapped.size:
+        if trapped.size and not search.noisy_gaps:
             free_nodes(search, trapped)
         else:
             search.run_stage(count)
         if moved_deviations(search, before.z) <= search.method.tolerance:
             search.tolerance = max(search.tolerance, MAX_SETTLED_STEP)
         if before.cost - search.current.cost < least_decrease:
-            return
+            break
+    return search.assess(search.current).status
 
 
 def moved_deviations(search: "Search", z: Array) -> float:

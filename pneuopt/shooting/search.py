@@ -125,8 +125,7 @@ class Search:
             self.stage_ends.append(StageEnd(self.current.nodes, self.current.z, self.cost))
             if found := self._early_end(stage):
                 return self._refine_steps(found)
-        repeat_last_stage(self)
-        status = self._convergence_status(self.current)
+        status = repeat_last_stage(self)
         # gaps that absorb the misfit of the model: the answer depends on their weight
         gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
         return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
@@ -205,7 +204,7 @@ class Search:
         self.noisy_gaps = True
         self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), nodes, z)
         self._finish_stage(last.iterations)
-        found = self._convergence_status(self.current)
+        found = repeat_last_stage(self)
         if found.converged:
             return self._tighten() or found
         self.unsettled_gaps.add(stage.gap)

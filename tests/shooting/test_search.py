@@ -265,7 +265,7 @@ def test_noise_of_the_states_that_has_not_settled_is_not_tried_again(monkeypatch
         tried.append(stage.gap)
         with monkeypatch.context() as patch:
             patch.setattr(Search, "_finish_stage", lambda *_: False)
-            patch.setattr(Search, "_convergence_status", lambda *_: Status(Code.NOT_CONVERGED, ("no",)))
+            patch.setattr("pneuopt.shooting.search.repeat_last_stage", lambda _: Status(Code.NOT_CONVERGED, ("no",)))
             return loosen(search, stage, nodes, z)
 
     monkeypatch.setattr(Search, "_loosen", never)
