@@ -64,9 +64,11 @@ def repeat_last_stage(search: "Search") -> Status:
             free_nodes(search, trapped)
         else:
             search.run_stage(count)
-        if moved_deviations(search, before.z) <= search.method.tolerance:
+        has_settled = moved_deviations(search, before.z) <= search.method.tolerance
+        if has_settled:
             search.tolerance = max(search.tolerance, MAX_SETTLED_STEP)
-        if before.cost - search.current.cost < least_decrease:
+        is_lost = search.noisy_gaps and not has_settled  # a kink that it creeps over would take hundreds of steps
+        if is_lost or before.cost - search.current.cost < least_decrease:
             break
     return search.assess(search.current).status
 

@@ -345,6 +345,20 @@ def test_a_search_of_no_iterations_only_assesses_where_it_is(monkeypatch: pytest
     assert fit.stats["iterations"] == 0
 
 
+def test_a_search_with_noise_of_the_states_that_moves_is_repeated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A log that sticks and slips took 220 iterations, 52 CPU s, before another start was tried."""
+    search, taken = near_optimum(1e3, monkeypatch, follows=0.01), list[int]()
+    search.noisy_gaps, follow = True, search.run_stage
+
+    def count(steps: int) -> bool:
+        taken.append(steps)
+        return follow(steps)
+
+    monkeypatch.setattr(search, "run_stage", count)
+    assert not last_stage.repeat_last_stage(search).converged
+    assert taken == [last_stage.REPEAT_ITERATIONS]
+
+
 @pytest.mark.parametrize("iterations", [4, 10, 30])
 def test_a_last_stage_is_repeated_three_times_in_all(iterations: int, monkeypatch: pytest.MonkeyPatch) -> None:
     search, taken = near_optimum(1e3, monkeypatch, follows=0.01), list[int]()
