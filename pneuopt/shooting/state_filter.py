@@ -5,6 +5,9 @@ all nodes at once frees one such place after the other. The Kalman filter follow
 Cathey, IEEE Transactions on Automatic Control 38(2), 1993, for its iteration), in pieces of the log side by side.
 """
 
+from contextlib import suppress
+from typing import NamedTuple
+
 import numpy as np
 
 from pneuopt.quantities.arrays import Array, Indices
@@ -15,14 +18,16 @@ PIECE_SEGMENTS = 300  # segments a piece: more take more steps one after the oth
 # segments before a piece from which its states come: fewer leave it the error of its start, more cost time
 LEAD_SEGMENTS = 300
 START_DEVIATION = 0.1  # of the state where a piece or a log begins, in nominal sizes [1]: about that of rough states
-# deviation that a state gathers from one node to the next, in nominal sizes [1]: lower follows wrong parameters away
-# from the measurements, higher leaves states that do not fit together
+# deviation that a state gathers from one node to the next, in nominal sizes [1], by parameters that are not known well:
+# lower follows wrong ones away from the measurements, higher leaves states that do not fit together
 GATHERED_DEVIATION = 1e-4
 KNOWN_DEVIATION = 1e-6  # of a state that is given, likewise
 UPDATES = 4  # linearisations a segment: fewer miss a slip, more cost time
+SETTLED_SQUARES = 0.01  # change of the squares [1] by which no state counts: lower takes updates that move none
+STEP_CUT = 0.3  # of a step that has not helped [1]: higher tries it again too far, lower hardly moves
 
 
-def filter_nodes(segments: Segments, nodes: Array, q: Array) -> Array:
+def filter_nodes(segments: Segments, nodes: Array, q: Array, gathered: float = GATHERED_DEVIATION) -> Array:
     """Filter the states at the nodes.
 
     Parameters
@@ -32,6 +37,8 @@ def filter_nodes(segments: Segments, nodes: Array, q: Array) -> Array:
         Rough states, from which the pieces start.
     q : ndarray, shape (k,)
         Values of all parameters of the problem.
+    gathered : float
+        Deviation that a state gathers from one node to the next, in nominal sizes.
 
     Returns
     -------
@@ -49,42 +56,114 @@ def filter_nodes(segments: Segments, nodes: Array, q: Array) -> Array:
         begins = (step == -LEAD_SEGMENTS) | heads[at] | ~np.isfinite(x).all(axis=1) | ~np.isfinite(P).all(axis=(1, 2))
         x = np.where(begins[:, None], rough[at], x)
         P = np.where(begins[:, None, None], start[at][:, None] * np.eye(nodes.shape[1]), P)
-        updated, x, P = _filter_segments(segments, at, x, P, q, substeps)
-        own = np.flatnonzero((step >= 0) & (first + step < segments.count) & np.isfinite(updated).all(axis=1))
-        found[at[own]] = updated[own]
+        updated = update_states(segments, at, x, P, q[segments.parameter_positions[at]], substeps)
+        x, P = updated.end, updated.spread(gathered)
+        own = np.flatnonzero((step >= 0) & (first + step < segments.count) & np.isfinite(updated.state).all(axis=1))
+        found[at[own]] = updated.state[own]
     return np.asarray(found * segments.nominal)
 
 
-def _filter_segments(
-    segments: Segments, at: Indices, before: Array, P: Array, q: Array, substeps: int
-) -> tuple[Array, Array, Array]:
-    """The states of some segments with their data, and those at their ends with the covariance (all scaled)."""
+class StateUpdate(NamedTuple):
+    """The states of g segments by what was known of them before and by their data; n of them, of nominal size 1.
+
+    Attributes
+    ----------
+    state, end : ndarray, shape (g, n)
+        At the node, and at the segment's end; NaN there where the model is not finite.
+    squares : ndarray, shape (g,)
+        Those of the residuals, and of the state's change over what was known of it.
+    residuals : ndarray, shape (g, r)
+        Of all samples and outputs, in noise deviations; 0 where nothing was measured.
+    slopes : ndarray, shape (g, r, n + n_columns)
+        Of what is predicted, likewise, in the states and the parameters.
+    moved : ndarray, shape (g, n, n + n_columns)
+        Of the end, likewise.
+    information : ndarray, shape (g, n, n)
+        The inverse covariance of the states.
+    """
+
+    state: Array
+    end: Array
+    squares: Array
+    residuals: Array
+    slopes: Array
+    moved: Array
+    information: Array
+
+    def spread(self, gathered: float) -> Array:
+        """The covariance at the ends, with a deviation that each state gathers along a segment. Shape (g, n, n)."""
+        n = self.state.shape[1]
+        moved = self.moved[..., :n]
+        kept = solve_each(self.information, moved.transpose(0, 2, 1))
+        return np.asarray(moved @ kept + gathered**2 * np.eye(n))
+
+
+def update_states(
+    segments: Segments, at: Indices, before: Array, P: Array, values: Array, substeps: int
+) -> StateUpdate:
+    """Update the states of some segments by their data: Gauss-Newton, whose steps are cut where they do not help.
+
+    Parameters
+    ----------
+    segments : Segments
+    at : ndarray of int, shape (g,)
+        Positions of the segments, one of which may be there several times.
+    before, P : ndarray, shape (g, n) and (g, n, n)
+        The states and their covariance without these data, of nominal size 1.
+    values : ndarray, shape (g, n_system_parameters)
+        The parameters of each.
+    substeps : int
+        Integration steps a sample.
+
+    Returns
+    -------
+    StateUpdate
+    """
     n, nominal = before.shape[1], segments.nominal
-    prior, measured = np.linalg.inv(P), segments.measured[at]
-    known, weights = np.isfinite(measured), np.where(np.isfinite(measured), segments.weights[at], 0.0)
-    given = segments.inputs[at], q[segments.parameter_positions[at]], segments.t[at], segments.h[at]
-    x, best = before.copy(), np.full(len(at), np.inf)
-    kept = before.copy(), before.copy(), np.zeros_like(P), prior.copy()
+    prior, measured = solve_each(P, np.tile(np.eye(n), (len(at), 1, 1))), segments.measured[at]
+    known = np.isfinite(measured)
+    weights, data = np.where(known, segments.weights[at], 0.0), np.where(known, measured, 0.0)
+    given = segments.inputs[at], values, segments.t[at], segments.h[at]
+    x, step, kept = before.copy(), np.zeros_like(before), None
     for _ in range(UPDATES):
         with np.errstate(all="ignore"):  # a step too far may overflow; it is not kept
             run = segments.sensitivities.run(x * nominal, *given, substeps=substeps)
             assert run.dy is not None
             assert run.dx_end is not None
-            residuals = (weights * (np.where(known, measured, 0.0) - run.y)).reshape(len(at), -1)
-            slopes = (weights[..., None] * run.dy[..., :n] * nominal).reshape(len(at), -1, n)
+            scale = np.append(nominal, np.ones(run.dy.shape[-1] - n))
+            residuals = (weights * (data - run.y)).reshape(len(at), -1)
+            slopes = (weights[..., None] * run.dy * scale).reshape(len(at), -1, len(scale))
             away = x - before
-            cost = np.sum(residuals**2, axis=1) + np.einsum("gi,gij,gj->g", away, prior, away)
-        better = np.flatnonzero(cost < best)
-        if not better.size:
-            break
-        best[better] = cost[better]
-        information = prior + slopes.transpose(0, 2, 1) @ slopes
-        news = (x, run.x_end / nominal, run.dx_end[..., :n] * nominal / nominal[:, None], information)
-        for old, new in zip(kept, news, strict=True):
-            old[better] = new[better]
-        gradient = np.einsum("gri,gr->gi", slopes, residuals) - np.einsum("gij,gj->gi", prior, away)
-        x = x.copy()
-        x[better] += np.linalg.solve(information[better], gradient[better][..., None])[..., 0]
-    state, end, moved, posterior = kept
-    spread = moved @ np.linalg.inv(posterior) @ moved.transpose(0, 2, 1) + GATHERED_DEVIATION**2 * np.eye(n)
-    return state, np.where(np.isfinite(best)[:, None], end, np.nan), spread
+            squares = np.sum(residuals**2, axis=1) + np.einsum("gi,gij,gj->g", away, prior, away)
+            information = prior + slopes[..., :n].transpose(0, 2, 1) @ slopes[..., :n]
+            moved = run.dx_end * (scale / nominal[:, None])
+        trial = StateUpdate(x, run.x_end / nominal, squares, residuals, slopes, moved, information)
+        if kept is None:
+            better = np.arange(len(at))
+            kept = trial._replace(squares=np.where(np.isfinite(squares), squares, np.inf))
+        else:
+            is_settled = bool((np.abs(squares - kept.squares) < SETTLED_SQUARES).all())
+            better = np.flatnonzero(squares < kept.squares)
+            for old, new in zip(kept, trial, strict=True):
+                old[better] = new[better]
+            if is_settled:
+                break
+        gradient = np.einsum("gri,gr->gi", slopes[..., :n], residuals) - np.einsum("gij,gj->gi", prior, away)
+        step *= STEP_CUT
+        step[better] = solve_each(information[better], gradient[better][..., None])[..., 0]
+        x = kept.state + step
+    assert kept is not None
+    kept.end[~np.isfinite(kept.squares)] = np.nan
+    return kept
+
+
+def solve_each(A: Array, b: Array) -> Array:
+    """The solutions of g systems of equations, shapes (g, n, n) and (g, n, k); NaN of those that are singular."""
+    try:
+        return np.asarray(np.linalg.solve(A, b))
+    except np.linalg.LinAlgError:
+        out = np.full(b.shape, np.nan)
+        for i in range(len(A)):
+            with suppress(np.linalg.LinAlgError):
+                out[i] = np.linalg.solve(A[i], b[i])
+        return out
