@@ -17,7 +17,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.shooting.budget import BudgetSpentError
 from pneuopt.shooting.integration_steps import choose_integration
 from pneuopt.shooting.segments import segment, start_nodes
-from pneuopt.shooting.state_filter import filter_nodes
+from pneuopt.shooting.state_filter import GATHERED_DEVIATION, filter_nodes
 
 # segments of an excerpt: fewer may lack motion that a parameter needs, more cost time
 EXCERPT_SEGMENTS = 1000
@@ -49,16 +49,26 @@ def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
     return replace(problem, experiments=parts) if whole >= MIN_LENGTH_RATIO * kept and not is_huge else None
 
 
-def filter_states(problem: EstimationProblem, start: Start) -> Start:
+def filter_states(problem: EstimationProblem, start: Start, gathered: float = GATHERED_DEVIATION) -> Start:
     """The start with states along the logs that fit its parameters (`shooting.state_filter`).
 
-    Where the CPU budget ends before that, the start is as it was.
+    Parameters
+    ----------
+    problem : EstimationProblem
+    start : Start
+    gathered : float
+        As of `filter_nodes`; the better the parameters are known, the less.
+
+    Returns
+    -------
+    Start
+        As it was, where the CPU budget ends before.
     """
     segments = segment(problem.transcription(start))
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     try:
         with check_during_runs(problem.method.budget.check):
-            nodes = filter_nodes(segments, start_nodes(segments), q)
+            nodes = filter_nodes(segments, start_nodes(segments), q, gathered)
             segments, substeps = choose_integration(segments, nodes, q)
             run = segments.run(nodes, q, substeps, states=True)
     except BudgetSpentError:

@@ -114,7 +114,7 @@ def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
     if not explains_to_noise(held, fit):
         return
     warm = replace(problem, method=replace(problem.method, stages=stages[-1:]))
-    start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters))
+    start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters), stages[-1].gap)
     whole, fit = fit_holding_unidentifiable(warm, start, HOPELESS_MISFIT)
     yield replace(whole, method=problem.method), fit, f"{label}, of a part"
 
