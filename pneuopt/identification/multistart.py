@@ -1,6 +1,7 @@
 """`fit_from_starts`: the best fit from the model's own starts, with the parameters held that the logs cannot identify.
 
-The first start is tried alone. Where it fails, the guessed parameters of each other start (`trial_parameters`, as the
+The first start is tried alone. Where it is left, the parameters to which the prediction errors of a filter lead are
+tried (`predicted_fit`). Where these fail, too, the guessed parameters of each other start (`trial_parameters`, as the
 Stribeck velocity) are held for a few iterations, until the states and the other parameters have settled to them; the
 first that explains the logs is tried at once, the others are then tried by the cost they reached.
 
@@ -19,6 +20,7 @@ from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.fit_order import are_alike, is_in_order, is_optimum, rank
 from pneuopt.identification.identifiability import rejects_held_values, rests_on_prior
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
+from pneuopt.identification.predicted_fit import fit_from_predictions
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
@@ -80,12 +82,13 @@ def fit_from_starts(
     """
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
+    known_noise = loss is None and not estimate_noise
     try:
         confirms, left_after = lambda: _only_needs_confirmation(fits), lambda: _stages_before_left(problem, fits[0][1])
         for start in starts_by_cost(problem, confirms, left_after, lambda: _cost_after_guesses(problem, fits)):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
-            known = () if loss is not None or estimate_noise else _joinable_costs(fits)
+            known = _joinable_costs(fits) if known_noise else ()
             tried = replace(problem, method=_method_after(problem, fits)) if known else problem
             held, fit = fit_holding_unidentifiable(tried, start, limit, known)
             held = replace(held, method=problem.method)
@@ -102,6 +105,8 @@ def fit_from_starts(
             is_end = interrupted or _are_enough(fits)
             if is_end or ((is_optimum(fits[0][1]) or len(fits) == MIN_DOUBTED) and gives_up(*fits[0][:2])):
                 break
+            if len(fits) == 1 and known_noise and (predicted := _fit_predicted(problem, fit)):
+                return problem, predicted, f"{start.label}, by prediction errors"
     except KeyboardInterrupt:
         if not fits:
             raise
@@ -111,6 +116,19 @@ def fit_from_starts(
         held, fit = fit_a_part(held, fit, label)
         interrupted = fit.status.code is Code.INTERRUPTED
     return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
+
+
+def _fit_predicted(problem: EstimationProblem, first: Fit) -> Fit | None:
+    """The fit by prediction errors where the first start was left; None where that does not explain the logs.
+
+    Raises `KeyboardInterrupt` if it was interrupted.
+    """
+    found = fit_from_predictions(problem, HOPELESS_MISFIT) if first.status is ABANDONED_START else None
+    if found is not None and found.status.code is Code.INTERRUPTED:
+        raise KeyboardInterrupt
+    if found is None or not explains_to_noise(problem, found) or not is_in_order(problem, found):
+        return None
+    return found.with_effort_of(first)
 
 
 def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: bool) -> Status:

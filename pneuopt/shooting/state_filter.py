@@ -90,6 +90,7 @@ class StateUpdate(NamedTuple):
     moved: Array
     information: Array
 
+    @np.errstate(all="ignore")  # as of what it is made from
     def spread(self, gathered: float) -> Array:
         """The covariance at the ends, with a deviation that each state gathers along a segment. Shape (g, n, n)."""
         n = self.state.shape[1]
@@ -98,6 +99,7 @@ class StateUpdate(NamedTuple):
         return np.asarray(moved @ kept + gathered**2 * np.eye(n))
 
 
+@np.errstate(all="ignore")  # a step too far may overflow; it is not kept
 def update_states(
     segments: Segments, at: Indices, before: Array, P: Array, values: Array, substeps: int
 ) -> StateUpdate:
@@ -126,17 +128,16 @@ def update_states(
     given = segments.inputs[at], values, segments.t[at], segments.h[at]
     x, step, kept = before.copy(), np.zeros_like(before), None
     for _ in range(UPDATES):
-        with np.errstate(all="ignore"):  # a step too far may overflow; it is not kept
-            run = segments.sensitivities.run(x * nominal, *given, substeps=substeps)
-            assert run.dy is not None
-            assert run.dx_end is not None
-            scale = np.append(nominal, np.ones(run.dy.shape[-1] - n))
-            residuals = (weights * (data - run.y)).reshape(len(at), -1)
-            slopes = (weights[..., None] * run.dy * scale).reshape(len(at), -1, len(scale))
-            away = x - before
-            squares = np.sum(residuals**2, axis=1) + np.einsum("gi,gij,gj->g", away, prior, away)
-            information = prior + slopes[..., :n].transpose(0, 2, 1) @ slopes[..., :n]
-            moved = run.dx_end * (scale / nominal[:, None])
+        run = segments.sensitivities.run(x * nominal, *given, substeps=substeps)
+        assert run.dy is not None
+        assert run.dx_end is not None
+        scale = np.append(nominal, np.ones(run.dy.shape[-1] - n))
+        residuals = (weights * (data - run.y)).reshape(len(at), -1)
+        slopes = (weights[..., None] * run.dy * scale).reshape(len(at), -1, len(scale))
+        away = x - before
+        squares = np.sum(residuals**2, axis=1) + np.einsum("gi,gij,gj->g", away, prior, away)
+        information = prior + slopes[..., :n].transpose(0, 2, 1) @ slopes[..., :n]
+        moved = run.dx_end * (scale / nominal[:, None])
         trial = StateUpdate(x, run.x_end / nominal, squares, residuals, slopes, moved, information)
         if kept is None:
             better = np.arange(len(at))
