@@ -3,6 +3,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from pneuopt.dynamics.simulate import simulate
@@ -188,3 +189,34 @@ def test_a_profile_that_jumps_over_its_level_is_not_followed_into_the_jump() -> 
     profiles._locate_crossing(Jump(), SimpleNamespace(z=0.0), SimpleNamespace(z=1.0), 2.0)  # type: ignore[arg-type]
     assert len(tried) <= 8
     assert abs(tried[-1] - math.pi / 4) < 2 * profiles.END_TOLERANCE
+
+
+def test_what_a_closed_profile_drags_has_an_interval_that_holds_where_it_went() -> None:
+    """Static friction had 33 N +- 2 N, 16 deviations off, though the profile of its Stribeck velocity led it to 1e5."""
+    _, result = fitted(Stribeck(), moved(42.0, 0.5), *CURVE)
+    names = ("friction.static", "friction.coulomb")
+    static, coulomb = (result.estimates["value"][n] for n in names)
+    deviation = float(result.estimates["stderr"]["friction.coulomb"])
+    curve = pd.DataFrame(
+        {
+            "value": [0.01, 0.02, 0.03, 0.04],
+            "deviance": [3.0, 0.0, 3.5, 9.0],
+            "friction.stribeck_velocity": [0.01, 0.02, 0.03, 0.04],
+            "friction.static": [50.0, static, 41.0, 900.0],
+            "friction.coulomb": coulomb + deviation * np.array([-1.0, 0.0, 1.0, 0.0]),
+        }
+    )
+    name, unknown = "friction.stribeck_velocity", math.inf
+    closed = Profile(name, "m/s", 0.02, 0.01, 0.03, 0.95, curve, dof=unknown)
+    found = review._widen_dragged(result, {name: closed})
+    before, rows = (each.estimates.to_dict(orient="index") for each in (result, found))
+    row, quantile = rows["friction.static"], t_quantile(unknown, 0.95)
+    assert row["ci_high"] == 50.0
+    assert row["ci_low"] == min(41.0, before["friction.static"]["ci_low"])
+    assert row["stderr"] == pytest.approx((50.0 - static) / quantile)
+    variance = np.diag(found.covariance)[list(found.covariance.index).index("friction.static")]
+    assert math.sqrt(variance) == pytest.approx(row["stderr"])
+    assert rows["friction.coulomb"] == before["friction.coulomb"]
+    own = Profile("friction.static", "N", static, 41.9, 42.1, 0.95, curve, dof=unknown)
+    kept = review._widen_dragged(result, {name: closed, "friction.static": own}).estimates
+    assert kept.to_dict(orient="index")["friction.static"] == before["friction.static"]
