@@ -55,7 +55,7 @@ def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit |
     KeyboardInterrupt
         If it comes, or the CPU budget ends, before the search.
     """
-    bounded, guesses = _bounded(problem), [c for c in problem.candidates() if c.trial_parameters]
+    bounded, guesses = _bounded_parameters(problem), [c for c in problem.candidates() if c.trial_parameters]
     if not bounded or len(guesses) < 2 or not _is_plain(problem):
         return None
     segments = segment(problem.transcription(guesses[0]))
@@ -87,7 +87,7 @@ def _is_plain(problem: EstimationProblem) -> bool:
     return is_whole and bool(problem.system.states) and not problem.weights
 
 
-def _bounded(problem: EstimationProblem) -> dict[str, str]:
+def _bounded_parameters(problem: EstimationProblem) -> dict[str, str]:
     """The free parameters that another one bounds, and that one."""
     free, order = set(problem.parameters.free_names) - set(problem.held), problem.system.plant.excitation.at_least
     return {n: m for n, m in order.items() if n in free and m in free}

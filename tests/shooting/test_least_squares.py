@@ -1,7 +1,6 @@
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import OptimizeResult, least_squares
 
-from pneuopt.dynamics.compiled.rollout import Gram, RolloutResult
+from pneuopt.dynamics.compiled.rollout import Gram
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -331,26 +330,6 @@ def test_explicit_substeps_are_kept_and_their_error_is_reported() -> None:
     assert (coarse.stats["substeps"], fine.stats["substeps"]) == (1, 8)
     errors = [f.stats["integration_error"] for f in (coarse, fine)]
     assert errors[0] == pytest.approx(4096 * errors[1], rel=0.2)  # of order four
-
-
-def test_a_refit_keeps_steps_that_were_tried_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two runs of finer steps were a quarter of a refit of a profile, and all for a figure that nobody reads."""
-    problem, steps, run = two_logs(), list[int](), Segments.run
-
-    def count(segments: Segments, nodes: Array, q: Array, substeps: int, **options: Any) -> RolloutResult:
-        steps.append(substeps)
-        return run(segments, nodes, q, substeps, **options)
-
-    monkeypatch.setattr(Segments, "run", count)
-    stages = (Stage(1e-3, 20), Stage(1e-5, 30, refine=4))
-    checked = solve_least_squares(problem, LeastSquares(substeps=1, stages=stages))
-    assert max(steps) == 8
-    steps.clear()
-    kept = solve_least_squares(problem, LeastSquares(substeps=1, stages=stages, checks_steps=False))
-    assert max(steps) == 4
-    assert kept.status.converged
-    assert math.isnan(kept.stats["integration_error"])
-    assert kept.stats["cost"] == pytest.approx(checked.stats["cost"], rel=1e-6)
 
 
 def held(problem: Transcription, name: str, value: float) -> Fit:

@@ -293,3 +293,23 @@ def test_log_parameters_are_drawn_to_their_start_by_wide_gaps_alone() -> None:
         drawn.append(search.current.cost > alone.cost)
     assert drawn == [True, True, True, True, False, False]
     assert not replace(FIRST, refine=2).has_prior  # as noise of the states, whose stage decides
+
+
+def test_a_refit_keeps_steps_that_were_tried_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two runs of finer steps were a quarter of a refit of a profile, and all for a figure that nobody reads."""
+    problem, steps, run = two_logs(), list[int](), Segments.run
+
+    def count(segments: Segments, nodes: Array, q: Array, substeps: int, **options: Any) -> RolloutResult:
+        steps.append(substeps)
+        return run(segments, nodes, q, substeps, **options)
+
+    monkeypatch.setattr(Segments, "run", count)
+    stages = (Stage(1e-3, 20), Stage(1e-5, 30, refine=4))
+    checked = solve_least_squares(problem, LeastSquares(substeps=1, stages=stages))
+    assert max(steps) == 8
+    steps.clear()
+    kept = solve_least_squares(problem, LeastSquares(substeps=1, stages=stages, checks_steps=False))
+    assert max(steps) == 4
+    assert kept.status.converged
+    assert math.isnan(kept.stats["integration_error"])
+    assert kept.stats["cost"] == pytest.approx(checked.stats["cost"], rel=1e-6)
