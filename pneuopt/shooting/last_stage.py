@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 MAX_REPEATS = 3
 REPEAT_ITERATIONS = 10  # of a repeat, at most: fewer take a slow search for settled, more go on after it has
 # step [standard deviations] up to which a search has settled where a repeat has moved no estimate: lower follows what
-# kinks ask for in vain (100 iterations of bristles at rest for .1 deviations), higher widens intervals by over half
-MAX_SETTLED_STEP = 1.0
+# kinks ask for in vain (100 iterations of bristles at rest for .1 deviations), higher takes a slow search for one that
+# has settled; and where the gaps stand for noise of the states, whose every estimate is marked anyway
+MAX_SETTLED_STEP, MAX_NOISY_STEP = 0.5, 1.0
 # damping of a node alone, over its diagonal [1], beyond which a kink traps it, for it moves less than half as far as
 # its equations ask: lower moves nodes that are only slow, higher leaves some behind
 TRAPPING_DAMPING = 1.0
@@ -66,7 +67,7 @@ def repeat_last_stage(search: "Search") -> Status:
             search.run_stage(count)
         has_settled = moved_deviations(search, before.z) <= search.method.tolerance
         if has_settled:
-            search.tolerance = max(search.tolerance, MAX_SETTLED_STEP)
+            search.tolerance = max(search.tolerance, MAX_NOISY_STEP if search.noisy_gaps else MAX_SETTLED_STEP)
         is_lost = search.noisy_gaps and not has_settled  # a kink that it creeps over would take hundreds of steps
         if is_lost or before.cost - search.current.cost < least_decrease:
             break

@@ -274,11 +274,18 @@ def near_optimum(deviations: float, monkeypatch: pytest.MonkeyPatch, *, follows:
 
 
 @pytest.mark.parametrize(
-    ("deviations", "follows", "asks"), [(0.35, 0.02, "0.34"), (0.85, 0.02, "0.83"), (1.5, 0.02, None), (0.02, 0.0, "")]
+    ("deviations", "follows", "noisy", "asks"),
+    [
+        (0.35, 0.02, False, "0.34"),
+        (0.85, 0.02, False, None),
+        (0.85, 0.02, True, "0.83"),
+        (1.5, 0.02, True, None),
+        (0.02, 0.0, False, ""),
+        (0.02, 0.0, True, ""),
+    ],
 )
-@pytest.mark.parametrize("noisy", [False, True])
 def test_a_search_whose_estimates_move_no_more_has_settled(
-    deviations: float, follows: float, asks: str | None, noisy: bool, monkeypatch: pytest.MonkeyPatch
+    deviations: float, follows: float, noisy: bool, asks: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bristles at rest asked for .3 deviations for 200 iterations that moved no estimate by .1: refused after 60 CPU s.
 
