@@ -137,6 +137,24 @@ def test_the_part_is_the_liveliest() -> None:
     assert len(predicted_fit._liveliest(segments, problem)) == min(before, segments.count)
 
 
+@pytest.mark.parametrize("fault", ["residuals", "order", "status"])
+def test_a_fit_that_is_no_answer_is_left_for_the_other_starts(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ended at the noise with static friction next to Coulomb's, which the logs showed to be far above."""
+    problem, search = posed(Stribeck()), multistart.fit_holding_unidentifiable
+    _, fit = search(problem, problem.candidates()[0])
+    wrong = {
+        "residuals": replace(fit, chi_square=2.0 * fit.count),
+        "order": replace(fit, parameters=fit.parameters.with_values({STATIC: 1.02 * TRUTH["friction.coulomb"]})),
+        "status": replace(fit, status=Status(Code.NOT_CONVERGED)),
+    }[fault]
+    left = replace(fit, status=ABANDONED_START)
+    monkeypatch.setattr(multistart, "fit_from_predictions", lambda *_: fit)
+    assert multistart._fit_predicted(problem, left) is not None
+    assert multistart._fit_predicted(problem, fit) is None
+    monkeypatch.setattr(multistart, "fit_from_predictions", lambda *_: wrong)
+    assert multistart._fit_predicted(problem, left) is None
+
+
 def test_ctrl_c_ends_all_with_the_first_start(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, search = posed(Stribeck()), multistart.fit_holding_unidentifiable
     _, fit = search(problem, problem.candidates()[0])

@@ -20,7 +20,7 @@ from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
@@ -124,6 +124,7 @@ def test_an_interruption_between_or_within_refits_is_told(refits: int, monkeypat
     fits: list[Fit] = []
 
     def interrupted(transcription: Transcription, method: LeastSquares) -> Fit:
+        assert not method.checks_steps  # the fit has tried them
         if not refits:
             raise KeyboardInterrupt
         fits.append(solve_least_squares(transcription, method))
@@ -189,6 +190,49 @@ def test_a_profile_that_jumps_over_its_level_is_not_followed_into_the_jump() -> 
     profiles._locate_crossing(Jump(), SimpleNamespace(z=0.0), SimpleNamespace(z=1.0), 2.0)  # type: ignore[arg-type]
     assert len(tried) <= 8
     assert abs(tried[-1] - math.pi / 4) < 2 * profiles.END_TOLERANCE
+
+
+class LinearRefits:
+    """Refits of which the root of the deviance is a slope times the distance from the estimate."""
+
+    def __init__(self, slope: float, probes: tuple[float, ...] = (), spread: float = 1.0) -> None:
+        self.centre, self.slope, self.spread = 0.0, slope, spread
+        self.parameter = replace(PROBED, log=False)
+        self.points = [SimpleNamespace(z=z) for z in (0.0, *probes)]
+        self.tried = list[float]()
+
+    def refit_at(self, z: float) -> SimpleNamespace:
+        self.tried.append(z)
+        self.points.append(SimpleNamespace(z=z))
+        return self.points[-1]
+
+    def deviance_root(self, point: SimpleNamespace) -> float:
+        return self.slope * abs(float(point.z))
+
+    def to_search(self, value: float) -> float:
+        return value
+
+    value = to_search
+
+
+PROBED = Parameter(0.0, "N", -1e3, 1e3, free=True)
+
+
+def test_refits_begin_behind_a_probe_and_no_farther_than_the_linear_end() -> None:
+    """A probe with next to no deviance led to a value three times as far as the end."""
+    for slope, first in ((1.0, 1.01 * 1.0 + 1.0), (0.01, 1.05 * 2.0)):
+        refits = LinearRefits(slope, probes=(1.0, -1.0))
+        profiles._bracket(refits, 1, 2.0)  # type: ignore[arg-type]
+        assert refits.tried[0] == pytest.approx(first)
+    beyond = LinearRefits(2.5, probes=(1.0, -1.0))
+    profiles._bracket(beyond, -1, 2.0)  # type: ignore[arg-type]
+    assert beyond.tried == [pytest.approx(-0.8)]
+
+
+@pytest.mark.parametrize(("last", "end"), [(0.985, 1.0), (0.9, math.inf), (1.015, 1.0)])
+def test_an_end_is_placed_by_a_refit_close_to_the_level(last: float, end: float) -> None:
+    refits = LinearRefits(2.0, probes=(0.5, last))
+    assert profiles._interval_end(refits, 1, 2.0) == pytest.approx(end)  # type: ignore[arg-type]
 
 
 def test_what_a_closed_profile_drags_has_an_interval_that_holds_where_it_went() -> None:
