@@ -4,33 +4,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.shooting import prediction_errors
 from pneuopt.shooting.prediction_errors import ROBUST_SQUARES, PredictionErrors
 from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.segments import Segments, segment, start_nodes
+from pneuopt.shooting.segments import Segments, start_nodes
 from pneuopt.shooting.state_filter import START_DEVIATION
-from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
+from tests.shooting.first_order import GAIN, NOISE, ROUGH, SAMPLE, SAMPLES, TIME_CONSTANT, first_order_log, forced
 
-N, SAMPLES, SAMPLE, TIME_CONSTANT, NOISE, GAIN = 120, 3, 0.01, 0.05, 0.02, 2.0
+N = 120  # samples
 GATHERED = 1e-3
-
-
-def plant() -> tuple[Segments, Array, Array]:
-    """A first-order plant of known time constant: its segments, and its input and output."""
-    system = FirstOrder().system().discrete()
-    given = FirstOrder().system().parameters.with_values({"plant.time_constant": TIME_CONSTANT, "plant.gain": 1.0})
-    rng = np.random.default_rng(1)
-    t, u, a = np.arange(N) * SAMPLE, rng.standard_normal(N), np.exp(-SAMPLE / TIME_CONSTANT)
-    x = [0.3]
-    for k in range(N - 1):
-        x.append(a * x[-1] + GAIN * (1 - a) * u[k])
-    y = np.array(x) + NOISE * rng.standard_normal(N)
-    rough = np.full((N, 1), 0.1)
-    phase = Phase("run", t.astype(np.float64), np.full(N, SAMPLE), u[:, None], regular_nodes(N, SAMPLES), guess=rough)
-    residuals = Residuals(0, (system.outputs[0].name,), y[:, None], np.array([NOISE]))
-    return segment(Transcription(system, given.freed("plant.gain"), (phase,), (residuals,))), u, y
 
 
 def errors_of(segments: Segments, part: Indices | None = None) -> PredictionErrors:
@@ -45,37 +28,35 @@ def searched(errors: PredictionErrors, *gains: float) -> Array:
 def by_hand(u: Array, y: Array, gain: float, scale: float) -> float:
     """The cost: innovations of each segment over their covariance, the large ones by their logarithm."""
     a, cost = np.exp(-SAMPLE / TIME_CONSTANT), 0.0
-    mean, variance = 0.1, (START_DEVIATION * scale) ** 2
+    mean, variance = ROUGH, (START_DEVIATION * scale) ** 2
     for begin in range(0, N, SAMPLES):
-        decay = a ** np.arange(SAMPLES)
-        forced = np.array(
-            [gain * (1 - a) * sum(a ** (k - 1 - i) * u[begin + i] for i in range(k)) for k in range(SAMPLES)]
-        )
-        innovation = y[begin : begin + SAMPLES] - forced - decay * mean
+        decay, own = a ** np.arange(SAMPLES), u[begin : begin + SAMPLES]
+        driven = np.array([forced(own, gain, k) for k in range(SAMPLES)])
+        innovation = y[begin : begin + SAMPLES] - driven - decay * mean
         covariance = NOISE**2 * np.eye(SAMPLES) + variance * np.outer(decay, decay)
         squares = float(innovation @ np.linalg.solve(covariance, innovation))
         cost += ROBUST_SQUARES * SAMPLES * np.log1p(squares / (ROBUST_SQUARES * SAMPLES))
         filtered = mean + variance * decay @ np.linalg.solve(covariance, innovation)
         left = variance - variance**2 * decay @ np.linalg.solve(covariance, decay)
-        driven = gain * (1 - a) * sum(a ** (SAMPLES - 1 - i) * u[begin + i] for i in range(SAMPLES))
-        mean, variance = a**SAMPLES * filtered + driven, a ** (2 * SAMPLES) * left + (GATHERED * scale) ** 2
+        mean = a**SAMPLES * filtered + forced(own, gain)
+        variance = a ** (2 * SAMPLES) * left + (GATHERED * scale) ** 2
     return cost
 
 
 def test_the_cost_is_that_of_the_innovations_of_a_kalman_filter() -> None:
-    segments, u, y = plant()
-    errors, gains = errors_of(segments), (1.0, 1.9, 2.0)
+    segments, u, y, scale = first_order_log(N)
+    errors, gains = errors_of(segments), (0.5, 0.95, 1.0)
     found = errors.evaluate(searched(errors, *gains), GATHERED).costs
-    expected = [by_hand(u, y, gain, segments.system.states[0].nominal) for gain in gains]
+    expected = [by_hand(u, y, gain, scale) for gain in gains]
     assert_allclose(found, expected, rtol=3e-4)  # the integration of a sample leaves 3e-6 of a state
     assert errors.count == N
 
 
 def test_gradient_and_curvature_are_those_of_half_the_cost() -> None:
     """The gain of this filter depends on no parameter, so that nothing is left out; the curvature is Gauss-Newton's."""
-    segments, _, _ = plant()
+    segments = first_order_log(N).segments
     errors, step = errors_of(segments), 1e-4
-    for gain in (1.2, 2.1, 2.0):
+    for gain in (0.6, 1.05, 1.0):
         (z,) = searched(errors, gain)
         below, at, above = errors.evaluate(np.array([z - step, z, z + step]), GATHERED).costs
         found = errors.evaluate(np.array([z]), GATHERED)
@@ -84,19 +65,19 @@ def test_gradient_and_curvature_are_those_of_half_the_cost() -> None:
 
 
 def test_a_descent_finds_the_gain_from_both_sides_at_once() -> None:
-    segments, _, _ = plant()
+    segments = first_order_log(N).segments
     errors = errors_of(segments)
-    z, costs = errors.descend(searched(errors, 0.3, 8.0), GATHERED, 12)
+    z, costs = errors.descend(searched(errors, 0.15, 4.0), GATHERED, 12)
     found = np.exp(z) if errors.scaling.log[0] else z
     assert_allclose(found, GAIN, rtol=0.02)
     assert costs[0] == pytest.approx(costs[1], rel=1e-4)
-    alone, _ = errors.descend(searched(errors, 8.0), GATHERED, 12)
+    alone, _ = errors.descend(searched(errors, 4.0), GATHERED, 12)
     assert_allclose(alone[0], z[1], rtol=1e-9)
 
 
 def test_the_stiffest_set_counts_for_the_integration_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the steps of a softer start, slips were lost at the right parameters, which cost more than wrong ones."""
-    segments, _, _ = plant()
+    segments = first_order_log(N).segments
     errors = errors_of(segments)
     z, stiff = searched(errors, 1.0, 3.0), segments.with_implicit_state(0)
 
@@ -112,9 +93,9 @@ def test_the_stiffest_set_counts_for_the_integration_steps(monkeypatch: pytest.M
 
 def test_a_part_that_is_interrupted_begins_anew() -> None:
     """The states behind a hole of the part are not those before it, though a filter could run on."""
-    segments, _, _ = plant()
+    segments = first_order_log(N).segments
     first, last = np.arange(8), np.arange(25, 40)
-    z = searched(errors_of(segments), 2.0)
+    z = searched(errors_of(segments), 1.0)
     parts = [errors_of(segments, part).evaluate(z, GATHERED) for part in (first, last, np.concatenate([first, last]))]
     for one, other, both in zip(*parts, strict=True):
         assert_allclose(one + other, both, rtol=1e-12)
@@ -122,9 +103,9 @@ def test_a_part_that_is_interrupted_begins_anew() -> None:
 
 @pytest.mark.filterwarnings("error")  # a user would read an overflow of numbers that are not kept
 def test_a_set_that_is_lost_costs_infinity_and_nothing_to_its_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
-    segments, _, _ = plant()
+    segments = first_order_log(N).segments
     errors = errors_of(segments)
-    z = searched(errors, 2.0, 7.0)
+    z = searched(errors, 1.0, 3.5)
     alone = errors.evaluate(z[:1], GATHERED)
     values = ParameterScaling.values
 
