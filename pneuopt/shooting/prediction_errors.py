@@ -91,7 +91,7 @@ class PredictionErrors:
                 P = np.tile(START_DEVIATION**2 * np.eye(n), (count, 1, 1))
             values = q[:, self.segments.parameter_positions[at]]
             found = update_states(self.segments, np.full(count, at), x, P, values, self.substeps)
-            x, X, P = self._add(sums, at, found, (x, X, P), chain, gathered)
+            x, X, P = self._add(sums, at, found, (x, X), chain, gathered)
             lost = ~(np.isfinite(x).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & np.isfinite(X).all(axis=(1, 2)))
             sums.costs[lost], x[lost], X[lost], P[lost] = np.inf, self._rough[at], 0.0, START_DEVIATION**2 * np.eye(n)
         return sums
@@ -101,15 +101,15 @@ class PredictionErrors:
         sums: Errors,
         at: int,
         found: StateUpdate,
-        before: tuple[Array, Array, Array],
+        before: tuple[Array, Array],
         chain: Array,
         gathered: float,
     ) -> tuple[Array, Array, Array]:
-        """Add a segment's errors; the states, their slopes and covariance at its end from those before it."""
-        (x, X, P), (count, k) = before, sums.gradients.shape
+        """Add a segment's errors; return the states, their slopes and covariance at its end from those before it."""
+        (x, X), (count, k) = before, sums.gradients.shape
         n, unknowns = x.shape[1], self.segments.unknowns[at]
         columns = np.flatnonzero(unknowns >= 0)
-        free, prior, own = unknowns[columns], solve_each(P, np.tile(np.eye(n), (count, 1, 1))), found.slopes[..., :n]
+        free, prior, own = unknowns[columns], found.prior, found.slopes[..., :n]
         direct, ends = np.zeros((count, own.shape[1], k)), np.zeros((count, n, k))
         direct[..., free] = found.slopes[..., n + columns] * chain[..., free]
         ends[..., free] = found.moved[..., n + columns] * chain[..., free]

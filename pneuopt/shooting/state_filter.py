@@ -78,8 +78,8 @@ class StateUpdate(NamedTuple):
         Of what is predicted, likewise, in the states and the parameters.
     moved : ndarray, shape (g, n, n + n_columns)
         Of the end, likewise.
-    information : ndarray, shape (g, n, n)
-        The inverse covariance of the states.
+    prior, information : ndarray, shape (g, n, n)
+        The inverse covariance of the states, without these data and with them.
     """
 
     state: Array
@@ -88,6 +88,7 @@ class StateUpdate(NamedTuple):
     residuals: Array
     slopes: Array
     moved: Array
+    prior: Array
     information: Array
 
     @np.errstate(all="ignore")  # as of what it is made from
@@ -138,7 +139,7 @@ def update_states(
         squares = np.sum(residuals**2, axis=1) + np.einsum("gi,gij,gj->g", away, prior, away)
         information = prior + slopes[..., :n].transpose(0, 2, 1) @ slopes[..., :n]
         moved = run.dx_end * (scale / nominal[:, None])
-        trial = StateUpdate(x, run.x_end / nominal, squares, residuals, slopes, moved, information)
+        trial = StateUpdate(x, run.x_end / nominal, squares, residuals, slopes, moved, prior, information)
         if kept is None:
             better = np.arange(len(at))
             kept = trial._replace(squares=np.where(np.isfinite(squares), squares, np.inf))
