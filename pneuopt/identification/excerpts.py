@@ -14,6 +14,7 @@ from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arrays import Array
 from pneuopt.shooting.budget import BudgetSpentError
 from pneuopt.shooting.integration_steps import choose_integration
 from pneuopt.shooting.segments import segment, start_nodes
@@ -77,21 +78,34 @@ def filter_states(problem: EstimationProblem, start: Start, gathered: float = GA
     return replace(start, states=dict(zip(names, segments.trajectories(run), strict=True)))
 
 
-def _cut(problem: EstimationProblem, experiment: Experiment) -> Experiment:
-    """The part of a log with the largest product of its outputs' variances; the log itself where it is short.
+def liveliest_part(columns: Array, count: int) -> int:
+    """The first row of the part of so many rows with the largest product of the columns' variances.
 
     A product, for a part in which one output hardly moves shows no friction, however much the others do.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (m, ..., k)
+        NaN where nothing was measured.
+    count : int
+
+    Returns
+    -------
+    int
     """
+    first, known = np.arange(0, max(1, len(columns) - count + 1), max(1, count // 10)), np.ma.masked_invalid(columns)
+    over = tuple(range(columns.ndim - 1))
+    variances = [np.maximum(known[i : i + count].var(axis=over), np.finfo(float).tiny) for i in first]
+    return int(first[np.argmax([np.log(each).sum() for each in variances])])
+
+
+def _cut(problem: EstimationProblem, experiment: Experiment) -> Experiment:
+    """The liveliest part of a log; the log itself where it is short."""
     run = experiment.trajectory
     step = float(np.median(np.diff(run.t)))
     count = math.ceil(EXCERPT_SEGMENTS * max(problem.method.segment_time, step) / step)
     if len(run) < MIN_LENGTH_RATIO * count:
         return experiment
-    first = np.arange(0, len(run) - count + 1, max(1, count // 10))
-    liveliness = np.zeros(len(first))
-    for name in outputs_in_log(problem.system, experiment):
-        column = run.fill_gaps(name)
-        variances = np.array([np.var(column[i : i + count]) for i in first])
-        liveliness += np.log(np.maximum(variances, np.finfo(float).tiny))
-    begin = int(first[np.argmax(liveliness)])
+    columns = [run.fill_gaps(name) for name in outputs_in_log(problem.system, experiment)]
+    begin = liveliest_part(np.column_stack(columns), count)
     return replace(experiment, trajectory=run.rows(begin, begin + count), source=None)

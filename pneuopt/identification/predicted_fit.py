@@ -3,7 +3,7 @@
 It is for logs whose first start has failed. Each of the model's guesses is tried with several values of what another
 parameter bounds (static friction, which filtered speeds show too low); the best of them descend side by side
 (`shooting.prediction_errors`), and the search with tight gaps begins with the states that a filter finds by what they
-lead to. Seven of nine logs that stick and slip, and that no other start explained in 60 CPU s, are explained so.
+lead to. Six of nine logs that stick and slip, and that no other start explained in 60 CPU s, are explained so.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,7 +14,7 @@ import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.excerpts import filter_states
+from pneuopt.identification.excerpts import filter_states, liveliest_part
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.shooting.least_squares import solve_least_squares
@@ -115,13 +115,10 @@ def _best_sets(
 
 
 def _liveliest(segments: Segments, problem: EstimationProblem) -> Indices:
-    """The consecutive segments of each log with the largest product of its outputs' variances."""
+    """The liveliest consecutive segments of each log."""
     count, parts = max(1, PART_SEGMENTS // len(problem.experiments)), list[Indices]()
     for phase in range(len(problem.experiments)):
         own = np.flatnonzero(segments.phase == phase)
-        measured = np.ma.masked_invalid(segments.measured[own])
-        first = np.arange(0, max(1, len(own) - count + 1), max(1, count // 10))
-        spreads = [np.log(np.maximum(measured[i : i + count].var(axis=(0, 1)), np.finfo(float).tiny)) for i in first]
-        begin = int(first[np.argmax([spread.sum() for spread in spreads])])
+        begin = liveliest_part(segments.measured[own], count)
         parts.append(own[begin : begin + count])
     return np.concatenate(parts)
