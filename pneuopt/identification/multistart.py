@@ -82,13 +82,13 @@ def fit_from_starts(
     """
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
-    known_noise = loss is None and not estimate_noise
+    is_plain = loss is None and not estimate_noise
     try:
         confirms, left_after = lambda: _only_needs_confirmation(fits), lambda: _stages_before_left(problem, fits[0][1])
         for start in starts_by_cost(problem, confirms, left_after, lambda: _cost_after_guesses(problem, fits)):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
-            known = _joinable_costs(fits) if known_noise else ()
+            known = _joinable_costs(fits) if is_plain else ()
             tried = replace(problem, method=_method_after(problem, fits)) if known else problem
             held, fit = fit_holding_unidentifiable(tried, start, limit, known)
             held = replace(held, method=problem.method)
@@ -105,7 +105,7 @@ def fit_from_starts(
             is_end = interrupted or _are_enough(fits)
             if is_end or ((is_optimum(fits[0][1]) or len(fits) == MIN_DOUBTED) and gives_up(*fits[0][:2])):
                 break
-            if len(fits) == 1 and known_noise and (predicted := _fit_predicted(problem, fit)):
+            if len(fits) == 1 and is_plain and (predicted := _fit_predicted(problem, fit)):
                 return problem, predicted, f"{start.label}, by prediction errors"
     except KeyboardInterrupt:
         if not fits:
