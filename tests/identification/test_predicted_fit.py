@@ -12,6 +12,7 @@ from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification import multistart, predicted_fit
 from pneuopt.identification.checks import check_logs
+from pneuopt.identification.excerpts import filter_states
 from pneuopt.identification.losses import Huber
 from pneuopt.identification.multistart import fit_from_starts
 from pneuopt.identification.predicted_fit import fit_from_predictions
@@ -56,14 +57,21 @@ def spoil(problem: EstimationProblem) -> None:
     problem.__dict__["_candidates"] = spoilt
 
 
-def test_it_finds_what_the_starts_miss() -> None:
-    lines = list[str]()
+def test_it_finds_what_the_starts_miss(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines, deviations = list[str](), list[float]()
+
+    def filtered(problem: EstimationProblem, start: Start, gathered: float) -> Start:
+        deviations.append(gathered)
+        return filter_states(problem, start, gathered)
+
+    monkeypatch.setattr(predicted_fit, "filter_states", filtered)
     problem = replace(posed(Stribeck()), method=LeastSquares(progress=lines.append))
     spoil(problem)
     fit = fit_from_predictions(problem, 3.0)
     assert len([line for line in lines if line.startswith("prediction errors")]) == len(predicted_fit.LEVELS)
     assert fit is not None
     assert fit.status.converged
+    assert deviations == [problem.method.stages[-1].gap]  # with ten times that, a slip was lost, and the search with it
     assert fit.chi_square < 1.05 * fit.count
     for name, value in TRUTH.items():
         assert fit.parameters.value(name) == pytest.approx(value, rel=5e-3)

@@ -235,9 +235,10 @@ def test_an_end_is_placed_by_a_refit_close_to_the_level(last: float, end: float)
     assert profiles._interval_end(refits, 1, 2.0) == pytest.approx(end)  # type: ignore[arg-type]
 
 
-def test_what_a_closed_profile_drags_has_an_interval_that_holds_where_it_went() -> None:
+def test_what_a_closed_profile_drags_has_an_interval_that_holds_where_it_went(monkeypatch: pytest.MonkeyPatch) -> None:
     """Static friction had 33 N +- 2 N, 16 deviations off, though the profile of its Stribeck velocity led it to 1e5."""
-    _, result = fitted(Stribeck(), moved(42.0, 0.5), *CURVE)
+    log = moved(42.0, 0.5)
+    system, result = fitted(Stribeck(), log, *CURVE)
     names = ("friction.static", "friction.coulomb")
     static, coulomb = (result.estimates["value"][n] for n in names)
     deviation = float(result.estimates["stderr"]["friction.coulomb"])
@@ -262,5 +263,10 @@ def test_what_a_closed_profile_drags_has_an_interval_that_holds_where_it_went() 
     assert math.sqrt(variance) == pytest.approx(row["stderr"])
     assert rows["friction.coulomb"] == before["friction.coulomb"]
     own = Profile("friction.static", "N", static, 41.9, 42.1, 0.95, curve, dof=unknown)
+    monkeypatch.setattr(review, "_profiles", lambda *_: ({name: closed}, []))
+    logs = tuple(check_logs(system, [log], result.parameters))
+    problem = EstimationProblem(system, logs, system.parameters | result.parameters, LeastSquares())
+    reviewed, _ = review.review_fit(problem, result)
+    assert reviewed.estimates["ci_high"]["friction.static"] == 50.0
     kept = review._widen_dragged(result, {name: closed, "friction.static": own}).estimates
     assert kept.to_dict(orient="index")["friction.static"] == before["friction.static"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pneuopt.dynamics.compiled.rollout import RolloutResult
+from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
 from pneuopt.quantities.arrays import Array
 from pneuopt.shooting import state_filter
 from pneuopt.shooting.segments import Segments, start_nodes
@@ -76,6 +76,21 @@ def test_a_step_over_a_kink_is_cut() -> None:
     far.weights = np.full((1, 1, 1), np.nan)
     lost = state_filter.update_states(far, *given[1:])  # type: ignore[arg-type]
     assert np.isnan(lost.end).all()
+
+
+def test_updates_end_where_they_move_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a linear plant the second is the optimum, and the third shows it."""
+    segments, taken, run = first_order_log(N).segments, list[int](), Rollout.run
+
+    def count(rollout: Rollout, *given: Array, **options: int) -> RolloutResult:
+        taken.append(len(given[0]))
+        return run(rollout, *given, **options)
+
+    at, before = np.arange(4), np.full((4, 1), ROUGH)
+    monkeypatch.setattr(Rollout, "run", count)
+    given = before, np.ones((4, 1, 1)), values(segments)[segments.parameter_positions[at]], 1
+    state_filter.update_states(segments, at, *given)
+    assert taken == [4, 4, 4]
 
 
 def test_a_singular_system_spoils_no_other() -> None:
