@@ -46,6 +46,7 @@ from pneuopt.identification.wrong_values import FixedValueTest
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array, Mask
+from pneuopt.quantities.blas_threads import one_blas_thread
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
@@ -138,23 +139,24 @@ def identify(
     experiments = tuple(e.accepting(*accept) for e in as_experiments(experiments))
     if estimate_noise:
         experiments = [replace(e, noise={}) for e in experiments]
-    given, experiments = experiments, check_logs(model, experiments, parameters)
-    parameters = find_centre(model, experiments, parameters)
-    check_free(experiments, parameters)
-    accepted = check_content(model, experiments, parameters)
-    log_warnings = accepted + emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
-    stated = all(channel in e.noise for e in given for channel in outputs_in_log(model, e))
-    problem = EstimationProblem(
-        model,
-        tuple(experiments),
-        model.parameters | parameters,
-        method,
-        noise_is_stated=stated,
-        window=math.inf if window is None else window,
-        is_whole=window == math.inf,
-    )
-    check_window(problem)
-    result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise)
+    with one_blas_thread():
+        given, experiments = experiments, check_logs(model, experiments, parameters)
+        parameters = find_centre(model, experiments, parameters)
+        check_free(experiments, parameters)
+        log_warnings = check_content(model, experiments, parameters)
+        log_warnings += emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
+        stated = all(channel in e.noise for e in given for channel in outputs_in_log(model, e))
+        problem = EstimationProblem(
+            model,
+            tuple(experiments),
+            model.parameters | parameters,
+            method,
+            noise_is_stated=stated,
+            window=math.inf if window is None else window,
+            is_whole=window == math.inf,
+        )
+        check_window(problem)
+        result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise)
     if log_warnings:
         result = replace(result, status=result.status.with_remedies(*log_warnings))
     if throw and not result.status.converged:
