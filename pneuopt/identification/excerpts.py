@@ -93,10 +93,19 @@ def liveliest_part(columns: Array, count: int) -> int:
     -------
     int
     """
-    first, known = np.arange(0, max(1, len(columns) - count + 1), max(1, count // 10)), np.ma.masked_invalid(columns)
-    over = tuple(range(columns.ndim - 1))
-    variances = [np.maximum(known[i : i + count].var(axis=over), np.finfo(float).tiny) for i in first]
-    return int(first[np.argmax([np.log(each).sum() for each in variances])])
+    flat = columns.reshape(len(columns), -1, columns.shape[-1])
+    known = np.isfinite(flat)
+    # about the mean of all rows and over their spread, sums of squares lose no digits that count
+    middle = np.where(known, flat, 0.0).sum(axis=(0, 1)) / np.maximum(known.sum(axis=(0, 1)), 1)
+    centred = np.where(known, flat - middle, 0.0)
+    scaled = centred / np.maximum(np.abs(centred).max(axis=(0, 1)), np.finfo(float).tiny)
+    first = np.arange(0, max(1, len(columns) - count + 1), max(1, count // 10))
+    last = np.minimum(first + count, len(columns))
+    sums = [np.cumsum(np.insert(part.sum(axis=1), 0, 0.0, axis=0), axis=0) for part in (known, scaled, scaled**2)]
+    counts, totals, squares = (each[last] - each[first] for each in sums)
+    counts = np.maximum(counts, 1)
+    variances = np.maximum(squares / counts - (totals / counts) ** 2, np.finfo(float).eps)
+    return int(first[np.argmax(np.log(variances).sum(axis=1))])
 
 
 def _cut(problem: EstimationProblem, experiment: Experiment) -> Experiment:

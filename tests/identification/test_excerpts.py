@@ -6,11 +6,13 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification import long_logs, multistart
 from pneuopt.identification.checks import check_logs
-from pneuopt.identification.excerpts import EXCERPT_SEGMENTS, cut_excerpts, filter_states
+from pneuopt.identification.excerpts import EXCERPT_SEGMENTS, cut_excerpts, filter_states, liveliest_part
 from pneuopt.identification.fit_order import is_in_order
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.logs.experiments import Experiment
@@ -50,6 +52,24 @@ def test_the_excerpt_is_the_liveliest_part() -> None:
     t = parts.experiments[0].trajectory.t
     assert len(t) == pytest.approx(EXCERPT_SEGMENTS * 0.01 / SAMPLE, abs=1)
     assert t[0] == pytest.approx(LIVELY[0], abs=1.1)
+
+
+@given(st.integers(0, 999), st.integers(12, 60), st.sampled_from([0.0, 0.3]), st.booleans())
+def test_the_liveliest_part_has_the_largest_product_of_variances(
+    seed: int, count: int, missing: float, is_wide: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    columns = 1e5 + rng.standard_normal((80, 2, 3)) * np.repeat(rng.uniform(0.1, 9, (8, 1, 3)), 10, axis=0)
+    columns[rng.random(columns.shape) < missing] = np.nan
+    columns[..., 2] = np.nan  # an output that is not logged
+    columns = columns if is_wide else columns[:, 0]
+
+    def score(first: int) -> float:
+        part = columns[first : first + count, ..., :2].reshape(-1, 2)
+        return float(np.sum(np.log(np.nanvar(part, axis=0))))
+
+    found = liveliest_part(columns, count)
+    assert score(found) >= max(map(score, range(0, 81 - count, max(1, count // 10)))) - 1e-6
 
 
 def test_short_logs_and_windows_have_no_excerpt() -> None:
