@@ -112,10 +112,10 @@ def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence
         if ignored := [n for n in log.trajectory if n not in named.trajectory]:
             out.append(f"{named.name}: accepted: {', '.join(ignored)}, which the model does not read")
         out += repair_log(system, replace(log.select(named.trajectory), name=named.name))[1]
-        for channel in outputs_in_log(system, named):
-            stated, found = log.noise.get(channel), estimate_noise(named.trajectory[channel], named.trajectory.t)
+        for channel in (n for n in outputs_in_log(system, named) if n in log.noise):
+            stated, found = log.noise[channel], estimate_noise(named.trajectory[channel], named.trajectory.t)
             shown, least = found.level, found.level / MAX_NOISE_FACTOR if found.is_white else 0.0
-            if stated is not None and not least <= stated <= shown * MAX_NOISE_FACTOR:
+            if not least <= stated <= shown * MAX_NOISE_FACTOR:
                 unit = next(q.unit for q in system.outputs if q.name == channel)
                 levels = f"stated as {stated:.2g} {unit}, the log itself shows {shown:.2g} {unit}"
                 out.append(f"{named.name}: the noise of {channel} is {levels}; leave it out to have it estimated")
