@@ -30,6 +30,9 @@ LEADS = (2e-3, 4e-3, 6e-3, 9e-3, 13e-3, 20e-3, 30e-3, 45e-3)
 """Times [s] by which a line's drop leads that are tried: shorter ones are a sensor's, longer ones no hose has."""
 PASSES = 3
 """Times that the flow is found anew from the corrected pressures: with fewer a large drop is half found."""
+MAX_WORSE_LEADS = 2
+"""Leads in a row that are worse than the best at which no longer one is tried: residuals rise from the best lead on (28
+drives of problems/identify/random_plants.py, without a line); fewer trust one residual, more take time."""
 MAX_LINE_RESIDUAL_SHARE = 0.25
 """Share of a pressure's squared rates that a drop may leave [1]: with more, the model does not fit anyhow."""
 
@@ -55,9 +58,7 @@ class LinePressureCheck:
         given = min((self._balance(log, shape) for shape in trial_shapes(log)), key=lambda found: found.residual)
         if given.residual < MAX_UNQUESTIONED_SHARE * given.total:
             return ""
-        tried = {lead: self._behind_line(log, given, lead) for lead in LEADS}
-        lead = min(tried, key=lambda k: tried[k].residual)
-        best = tried[lead]
+        lead, best = self._best_lead(log, given)
         if best.residual > min(given.residual / MIN_RESIDUAL_RATIO**2, MAX_LINE_RESIDUAL_SHARE * best.total):
             return ""
         drop = lead * max(float(np.quantile(np.abs(flow), 0.999)) for flow in best.flows)
@@ -65,6 +66,17 @@ class LinePressureCheck:
         found = f"{name}: the pressures lead the chambers by {1e3 * lead:.2g} ms, as before a line that drops up to "
         found += f"{drop / 1e5:.2g} bar (their mass balance then leaves {ratio:.1f} times smaller residuals)"
         return f"{found}: put the sensors at the cylinder, or leave them out; else raise valve.bandwidth"
+
+    def _best_lead(self, log: Log, given: "Balance") -> tuple[float, "Balance"]:
+        """The lead of least residual, and its balance; 0 and the given one where none is better."""
+        lead, best, worse = 0.0, given, 0
+        for tried in LEADS:
+            found = self._behind_line(log, given, tried)
+            is_better = found.residual < best.residual
+            lead, best, worse = (tried, found, 0) if is_better else (lead, best, worse + 1)
+            if worse == MAX_WORSE_LEADS:
+                break
+        return lead, best
 
     def _behind_line(self, log: Log, given: "Balance", lead: float) -> "Balance":
         """The balance of the pressures behind a line that leads so much, with its own flow."""

@@ -11,6 +11,7 @@ import pneuopt as po
 from pneuopt.dynamics.hooks import Log
 from pneuopt.models.catalog import b32, s32, t32
 from pneuopt.models.pneumatic.cylinder import volumes
+from pneuopt.models.pneumatic.line_pressure import LEADS, Balance, LinePressureCheck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import without_prefix
 from pneuopt.quantities.trajectories import Trajectory
@@ -67,3 +68,21 @@ def test_the_example_rig_is_not_doubted(run: str) -> None:
     drive, given = po.read_drive(DATA / "pneumatic_rig" / "drive.toml")
     system, log = drive.system(), po.read_log(DATA / "pneumatic_rig" / f"{run}.csv")
     assert system.log_warnings({run: Log(log.trajectory, system.parameters | given)}) == []
+
+
+def test_longer_leads_are_not_tried_once_two_are_worse(
+    swing: tuple[po.System, po.ParameterSet, Trajectory, dict[str, Array]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system, truth, log, flows = swing
+    tried, behind = list[float](), LinePressureCheck._behind_line
+
+    def counted(self: LinePressureCheck, log: Log, given: Balance, lead: float) -> Balance:
+        tried.append(lead)
+        return behind(self, log, given, lead)
+
+    monkeypatch.setattr(LinePressureCheck, "_behind_line", counted)
+    most = max(float(np.quantile(np.abs(flow), 0.999)) for flow in flows.values())
+    before = log.with_columns({n: log[n] + 0.8e5 * flows[n] / most for n in BOTH})
+    (said,) = system.log_warnings({"run": Log(before, truth)})
+    lead = next(each for each in LEADS if f"lead the chambers by {1e3 * each:.2g} ms" in said)
+    assert tuple(tried) == LEADS[: LEADS.index(lead) + 3]
