@@ -52,7 +52,8 @@ class PredictionErrors:
     def __init__(self, segments: Segments, nodes: Array, scaling: ParameterScaling, part: Indices) -> None:
         self.segments, self.scaling, self.part, self._rough = segments, scaling, part, nodes / segments.nominal
         self._begins = np.append(True, (np.diff(part) > 1) | ~segments.linked[part[:-1]])
-        self.count = int(np.isfinite(segments.measured[part]).sum())
+        self._counts = np.isfinite(segments.measured).sum(axis=(1, 2))
+        self.count = int(self._counts[part].sum())
         self.adapt_steps(scaling.start[None])
 
     def adapt_steps(self, z: Array) -> None:
@@ -106,23 +107,28 @@ class PredictionErrors:
         gathered: float,
     ) -> tuple[Array, Array, Array]:
         """Add a segment's errors; return the states, their slopes and covariance at its end from those before it."""
-        (x, X), (count, k) = before, sums.gradients.shape
-        n, unknowns = x.shape[1], self.segments.unknowns[at]
-        columns = np.flatnonzero(unknowns >= 0)
-        free, prior, own = unknowns[columns], found.prior, found.slopes[..., :n]
-        direct, ends = np.zeros((count, own.shape[1], k)), np.zeros((count, n, k))
-        direct[..., free] = found.slopes[..., n + columns] * chain[..., free]
-        ends[..., free] = found.moved[..., n + columns] * chain[..., free]
-        moved = solve_each(found.information, prior @ X - own.transpose(0, 2, 1) @ direct)
-        slopes, away = own @ moved + direct, prior @ (moved - X)
-        limit = ROBUST_SQUARES * np.isfinite(self.segments.measured[at]).sum()
+        (x, X), n, prior = before, before[0].shape[1], found.prior
+        gram, errors = found.gram[:, :-1, :-1], found.gram[:, :-1, -1:]
+        direct = self._parameter_moves(at, chain)
+        moved = solve_each(found.information, prior @ X - gram[:, :n, n:] @ direct)
+        moves, away = np.concatenate([moved, direct], axis=1), moved - X
+        turned, pull = moves.transpose(0, 2, 1), prior @ away
+        limit = ROBUST_SQUARES * self._counts[at]
         weights = 1 / (1 + found.squares / limit)
-        downhill = np.einsum("srk,sr->sk", slopes, found.residuals) - np.einsum("snk,sn->sk", away, found.state - x)
-        squares = slopes.transpose(0, 2, 1) @ slopes + (moved - X).transpose(0, 2, 1) @ away
+        uphill = turned @ errors + pull.transpose(0, 2, 1) @ (found.state - x)[..., None]
+        squares = turned @ (gram @ moves) + away.transpose(0, 2, 1) @ pull
         sums.costs[:] += limit * np.log1p(found.squares / limit)
-        sums.gradients[:] -= weights[:, None] * downhill
+        sums.gradients[:] += weights[:, None] * uphill[..., 0]
         sums.curvatures[:] += weights[:, None, None] * squares
-        return found.end, found.moved[..., :n] @ moved + ends, found.spread(gathered)
+        return found.end, found.moved @ moves, found.spread(gathered)
+
+    def _parameter_moves(self, at: int, chain: Array) -> Array:
+        """How a segment's own parameters move with those searched, of sets with these chains. Shape (s, n_own, k)."""
+        unknowns = self.segments.unknowns[at]
+        own = np.flatnonzero(unknowns >= 0)
+        moves = np.zeros((len(chain), len(unknowns), chain.shape[2]))
+        moves[:, own, unknowns[own]] = chain[:, 0, unknowns[own]]
+        return moves
 
     def descend(self, z: Array, gathered: float, steps: int) -> tuple[Array, Array]:
         """Levenberg-Marquardt steps from several sets of searched parameters, side by side.

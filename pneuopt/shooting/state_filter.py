@@ -72,12 +72,10 @@ class StateUpdate(NamedTuple):
         At the node, and at the segment's end; NaN there where the model is not finite.
     squares : ndarray, shape (g,)
         Those of the residuals, and of the state's change over what was known of it.
-    residuals : ndarray, shape (g, r)
-        Of all samples and outputs, in noise deviations; 0 where nothing was measured.
-    slopes : ndarray, shape (g, r, n + n_columns)
-        Of what is predicted, likewise, in the states and the parameters.
+    gram : ndarray, shape (g, n + n_columns + 1, n + n_columns + 1)
+        Of the slopes of what is predicted, in the states and the parameters, and of its errors, in noise deviations.
     moved : ndarray, shape (g, n, n + n_columns)
-        Of the end, likewise.
+        Slopes of the end.
     prior, information : ndarray, shape (g, n, n)
         The inverse covariance of the states, without these data and with them.
     """
@@ -85,8 +83,7 @@ class StateUpdate(NamedTuple):
     state: Array
     end: Array
     squares: Array
-    residuals: Array
-    slopes: Array
+    gram: Array
     moved: Array
     prior: Array
     information: Array
@@ -123,23 +120,18 @@ def update_states(
     StateUpdate
     """
     n, nominal = before.shape[1], segments.nominal
-    prior, measured = solve_each(P, np.tile(np.eye(n), (len(at), 1, 1))), segments.measured[at]
-    known = np.isfinite(measured)
-    weights, data = np.where(known, segments.weights[at], 0.0), np.where(known, measured, 0.0)
-    given = segments.inputs[at], values, segments.t[at], segments.h[at]
+    prior = solve_each(P, np.tile(np.eye(n), (len(at), 1, 1)))
+    given = segments.inputs[at], values, segments.t[at], segments.h[at], segments.measured[at], segments.weights[at]
+    scale = np.append(nominal, np.ones(segments.sensitivities.n_columns - n + 1))
+    both = np.outer(scale, scale)
     x, step, kept = before.copy(), np.zeros_like(before), None
     for _ in range(UPDATES):
-        run = segments.sensitivities.run(x * nominal, *given, substeps=substeps)
-        assert run.dy is not None
-        assert run.dx_end is not None
-        scale = np.append(nominal, np.ones(run.dy.shape[-1] - n))
-        residuals = (weights * (data - run.y)).reshape(len(at), -1)
-        slopes = (weights[..., None] * run.dy * scale).reshape(len(at), -1, len(scale))
-        away = x - before
-        squares = np.sum(residuals**2, axis=1) + np.einsum("gi,gij,gj->g", away, prior, away)
-        information = prior + slopes[..., :n].transpose(0, 2, 1) @ slopes[..., :n]
-        moved = run.dx_end * (scale / nominal[:, None])
-        trial = StateUpdate(x, run.x_end / nominal, squares, residuals, slopes, moved, prior, information)
+        run = segments.sensitivities.gram(x * nominal, *given, substeps=substeps)
+        gram, away = run.grams * both, x - before
+        pull = (prior @ away[..., None])[..., 0]
+        squares = gram[:, -1, -1] + np.sum(away * pull, axis=1)
+        moved = run.dx_end * (scale[:-1] / nominal[:, None])
+        trial = StateUpdate(x, run.x_end / nominal, squares, gram, moved, prior, prior + gram[:, :n, :n])
         if kept is None:
             better = np.arange(len(at))
             kept = trial._replace(squares=np.where(np.isfinite(squares), squares, np.inf))
@@ -150,9 +142,9 @@ def update_states(
                 old[better] = new[better]
             if is_settled:
                 break
-        gradient = np.einsum("gri,gr->gi", slopes[..., :n], residuals) - np.einsum("gij,gj->gi", prior, away)
+        downhill = -gram[:, :n, -1] - pull
         step *= STEP_CUT
-        step[better] = solve_each(information[better], gradient[better][..., None])[..., 0]
+        step[better] = solve_each(trial.information[better], downhill[better][..., None])[..., 0]
         x = kept.state + step
     assert kept is not None
     kept.end[~np.isfinite(kept.squares)] = np.nan

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
+from pneuopt.dynamics.compiled.rollout import Gram, Rollout
 from pneuopt.quantities.arrays import Array
 from pneuopt.shooting import state_filter
 from pneuopt.shooting.segments import Segments, start_nodes
@@ -53,15 +53,18 @@ class Kink:
     nominal = np.ones(1)
     weights, measured = np.full((1, 1, 1), 1e3), np.full((1, 1, 1), 0.1)
     inputs, t, h = np.zeros((1, 1, 1)), np.zeros((1, 1)), np.ones((1, 1))
+    n_columns = 1
 
     @property
     def sensitivities(self) -> "Kink":
         return self
 
-    def run(self, x: Array, *_: Array, **__: int) -> RolloutResult:
+    def gram(self, x: Array, *_: Array, **__: int) -> Gram:
         slope = np.where(x > 0, 0.8, 0.05)
-        dy = slope[:, None, :, None]
-        return RolloutResult((slope * x)[:, None, :], x.copy(), None, dy, np.ones((len(x), 1, 1)))
+        y, weight = slope * x, self.weights[:, 0]
+        e = np.stack([slope, y - self.measured[:, 0]], axis=2) * weight[..., None]
+        grams = e.transpose(0, 2, 1) @ e
+        return Gram(grams, grams[:, -1:, -1], e[..., :-1], y[:, None], x.copy(), np.ones((len(x), 1, 1)))
 
 
 def test_a_step_over_a_kink_is_cut() -> None:
@@ -80,14 +83,14 @@ def test_a_step_over_a_kink_is_cut() -> None:
 
 def test_updates_end_where_they_move_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a linear plant the second is the optimum, and the third shows it."""
-    segments, taken, run = first_order_log(N).segments, list[int](), Rollout.run
+    segments, taken, gram = first_order_log(N).segments, list[int](), Rollout.gram
 
-    def count(rollout: Rollout, *given: Array, **options: int) -> RolloutResult:
+    def count(rollout: Rollout, *given: Array, **options: int) -> Gram:
         taken.append(len(given[0]))
-        return run(rollout, *given, **options)
+        return gram(rollout, *given, **options)
 
     at, before = np.arange(4), np.full((4, 1), ROUGH)
-    monkeypatch.setattr(Rollout, "run", count)
+    monkeypatch.setattr(Rollout, "gram", count)
     given = before, np.ones((4, 1, 1)), values(segments)[segments.parameter_positions[at]], 1
     state_filter.update_states(segments, at, *given)
     assert taken == [4, 4, 4]
