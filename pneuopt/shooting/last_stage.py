@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 # at rest) before its end, for other starts that take longer; more follow one that does not end
 MAX_REPEATS = 3
 REPEAT_ITERATIONS = 10  # of a repeat, at most: fewer take a slow search for settled, more go on after it has
+# decrease of the cost by an iteration, over itself [1], with which a search goes on that is not near the noise yet:
+# lower follows one that creeps, higher ends one that is about to come there
+STEEP_DECREASE = 0.1
 # step [standard deviations] up to which a search has settled where a repeat has moved no estimate: lower follows what
 # kinks ask for in vain (100 iterations of bristles at rest for .1 deviations), higher takes a slow search for one that
 # has settled; and where the gaps stand for noise of the states, whose every estimate is marked anyway
@@ -40,7 +43,7 @@ def is_near_end(search: "Search") -> bool:
 
 
 def repeat_last_stage(search: "Search") -> Status:
-    """Run the last stage again while it explains the log to its noise and lowers the cost, but has not converged.
+    """Run the last stage again while it lowers the cost steeply, or at the noise at all, but has not converged.
 
     Parameters
     ----------
@@ -57,8 +60,9 @@ def repeat_last_stage(search: "Search") -> Status:
     count = min(REPEAT_ITERATIONS, search.stage.iterations)
     for _ in range(MAX_REPEATS * search.stage.iterations // max(1, count)):
         found, before = search.assess(search.current), search.current
-        is_near = search.noisy_gaps or is_near_end(search)
-        if found.status.converged or found.unidentifiable.size or not is_near:
+        falls = search.last_decrease > STEEP_DECREASE and search.stage.iterations > count  # a short one is but a trial
+        goes_on = search.noisy_gaps or is_near_end(search) or falls
+        if found.status.converged or found.unidentifiable.size or not goes_on:
             return found.status
         trapped = np.flatnonzero(search.node_damping > TRAPPING_DAMPING)
         if trapped.size and not search.noisy_gaps:

@@ -82,11 +82,12 @@ class Search:
         self.segments = segments = self.steps.segments
         self.gap_scales = gap_scales(segments, method.kinematic)
         self.iterations, self.stage_began, self.noisy_gaps, self.has_stalled = 0, 0, False, False
+        self.last_decrease = 0.0  # of a stage's cost by its last iteration, over itself
         self.tolerance = method.tolerance  # wider where kinks hold up a search that has settled
         self.stage, self.stage_ends, self.unsettled_gaps = method.stages[0], list[StageEnd](), set[float]()
-        self.correction: IntegrationCorrection | None
         self.substeps = self.output_substeps = self.steps.start
-        self.correction, self.integration_change, self.is_coarse = None, math.nan, False
+        self.correction: IntegrationCorrection | None = None
+        self.integration_change, self.is_coarse = math.nan, False
         self.node_damping = np.zeros(segments.count)  # where the stage has ended, of each node alone
         self.current = self.evaluate(nodes, self.scaling.start)
 
@@ -200,8 +201,7 @@ class Search:
 
         Where there is none, nothing moves.
         """
-        before, last = self.snapshot(), self.method.stages[-1]
-        self.noisy_gaps = True
+        before, last, self.noisy_gaps = self.snapshot(), self.method.stages[-1], True
         self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), nodes, z)
         self._finish_stage(last.iterations)
         found = repeat_last_stage(self)
@@ -332,7 +332,7 @@ class Search:
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         descent = Descent(self._objective(), damping, self._is_negligible_step)
         descent.node_damping = np.zeros(len(self.node_damping)) if self.noisy_gaps else self.node_damping
-        hopeless, self.stage_began = 0, self.iterations
+        hopeless, self.stage_began, self.last_decrease = 0, self.iterations, 0.0
         for _ in range(iterations):
             if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
                 self._correct_residuals(fine_steps(self.segments, self.substeps, self.stage.refine))
@@ -350,7 +350,8 @@ class Search:
                 if not self._leap(descent):
                     return True
                 hopeless = 0
-        return before - self.current.cost < STALL_COST_DECREASE * before
+        self.last_decrease = 1 - self.current.cost / before
+        return self.last_decrease < STALL_COST_DECREASE
 
     def _leap(self, descent: Descent) -> bool:
         """Leap over a kink at which a descent with noise of the states creeps; return whether that helps."""
