@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import binom
-from threadpoolctl import threadpool_info, threadpool_limits
 
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector
@@ -387,21 +386,3 @@ def test_validation_reads_conditions_and_defaults() -> None:
     good = validate(system, [log.with_conditions({"load.mass": 7.0})], partly)["rmse"].iloc[0]
     assert good < 1.5 * NOISE["position"]
     assert validate(system, [log], partly)["rmse"].iloc[0] > 10 * good
-
-
-def test_linear_algebra_has_one_thread_during_a_fit_and_its_own_again_after_it() -> None:
-    def threads() -> list[int]:
-        return [int(library["num_threads"]) for library in threadpool_info() if library["user_api"] == "blas"]
-
-    friction, used = Coulomb(), list[int]()
-    with threadpool_limits(3, user_api="blas"):
-        before = threads()
-        identify(
-            ForceDrive(friction).system(),
-            [pushed(friction, seconds=0.5)],
-            known(friction).freed(*FREE),
-            progress=lambda _: used.extend(threads()),
-        )
-        assert set(used) == {1}
-        assert threads() == before
-        assert 1 not in before
