@@ -4,9 +4,10 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from pneuopt.dynamics.compiled.rollout import RolloutResult
+from pneuopt.dynamics.compiled.rollout import RolloutResult, check_during_runs
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting.budget import BudgetSpentError
 from pneuopt.shooting.last_stage import unsettled_covariance
 from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.segments import IntegrationCorrection
@@ -137,7 +138,14 @@ def _doubtful_parameters(search: "Search") -> tuple[tuple[str, ...], tuple[str, 
 
 
 def _integration_error(search: "Search", status: Status, run: RolloutResult) -> float:
-    """Largest change of an output when the steps are halved [noise standard deviations]; NaN without an optimum."""
+    """Largest change of an output when the steps are halved [noise standard deviations].
+
+    NaN without an optimum, and where the budget ends before it is measured: the answer is known by then.
+    """
     if math.isfinite(search.integration_change) or not (status.converged and search.method.checks_steps):
         return search.integration_change
-    return search.largest_change(search.run(2 * search.output_substeps).y - run.y)
+    try:
+        with check_during_runs(search.method.budget.check):
+            return search.largest_change(search.run(2 * search.output_substeps).y - run.y)
+    except BudgetSpentError:
+        return math.nan

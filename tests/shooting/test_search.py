@@ -19,7 +19,7 @@ from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squa
 from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search import Search
-from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH, StageEnd
+from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH, StageEnd, end_search
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, segment, start_nodes
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.stage_end import FINE_TOLERANCE
@@ -83,6 +83,21 @@ def test_a_budget_that_ends_in_refinement_leaves_coarse_runs_only(monkeypatch: p
     assert math.isnan(fit.stats["integration_error"])
     assert fit.optimum is not None
     assert search.largest_change(fit.optimum.run.y - refined[0].y) < 0.1
+
+
+def test_an_answer_does_not_overrun_its_budget_for_its_integration_error() -> None:
+    """A fit of a minute's log took 8 s more than its 60 s, for the run that halves the steps of the answer."""
+    budget = CpuBudget(1e9)
+    search = Search(segment(two_logs()), LeastSquares(budget=budget))
+    status = search._run_stages()
+    assert status.converged
+    search.integration_change = math.nan
+    assert math.isfinite(end_search(search, status, 0.0).stats["integration_error"])
+    budget._end = 0.0
+    fit = end_search(search, status, 0.0)
+    assert fit.status.converged
+    assert fit.covariance is not None
+    assert math.isnan(fit.stats["integration_error"])
 
 
 def test_corrected_residuals_have_the_cost_of_a_run_with_the_correction() -> None:
