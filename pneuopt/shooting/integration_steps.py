@@ -1,15 +1,23 @@
-"""How a search integrates, and in how many steps a sample, from the stiffness where it is."""
+"""How a search integrates, and in how many steps a sample: by the stiffness where it is, then finer ones at its end."""
+
+import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pneuopt.dynamics.partitioned_step import PARTITIONED_MAX_H_GROWTH, PARTITIONED_MAX_H_LAMBDA
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.status import Status
 from pneuopt.shooting.segments import Segments, count_steps, largest_rate, stiffness_jacobians
+
+if TYPE_CHECKING:
+    from pneuopt.shooting.search import Search
 
 # relative change of a parameter [1] after which the stiffness is computed anew: higher risks unstable steps
 STIFFNESS_UPDATE_CHANGE = 0.03
 MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample: a search with more would take hours, fewer refuse stiff models
+MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
 MAX_STAGE_REFINEMENT = 8  # factor on the start's integration steps in a stage: higher takes long, lower may be unstable
 # RK4 steps over steps that are implicit in a state, at least [1]: such a step takes as long as one and a half of RK4's
 # and is of lower order; higher leaves stiff plants slow, lower gives exactness away
@@ -122,3 +130,35 @@ class IntegrationSteps:
             segments, needed = choose_integration(segments, nodes, values)
             return segments, min(needed, MAX_STAGE_REFINEMENT * max(self.start, MIN_IMPLICIT_SUBSTEPS))
         return segments, current
+
+
+def refine_steps(search: "Search", status: Status) -> Status:
+    """Halve the integration steps until no estimate moves; steps that the user gave stay.
+
+    Parameters
+    ----------
+    search : Search
+        Of this status; moves to the optimum by the finer steps.
+    status : Status
+
+    Returns
+    -------
+    Status
+        Of where it is then.
+    """
+    for _ in range(MAX_STEP_HALVINGS):
+        if not (status.converged and search.method.checks_steps):
+            break
+        before = search.snapshot()
+        change = search.apply_finer_steps((1 if search.method.substeps else 2) * search.output_substeps)
+        if not math.isfinite(search.current.cost):
+            search.restore(before)
+            break
+        if search.assess(search.current).status.converged:
+            search.integration_change = math.nan if search.method.substeps else change
+            if search.noisy_gaps:
+                search.run_stage(search.stage.iterations)  # the finer steps have moved its optimum a little
+            break
+        search.run_stage(search.stage.iterations)
+        status = search.assess(search.current).status
+    return status

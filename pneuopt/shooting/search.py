@@ -24,7 +24,7 @@ from pneuopt.shooting.convergence import (
     assess_convergence,
 )
 from pneuopt.shooting.equations import correct_residuals, weigh_gaps
-from pneuopt.shooting.integration_steps import IntegrationSteps, fine_steps
+from pneuopt.shooting.integration_steps import IntegrationSteps, fine_steps, refine_steps
 from pneuopt.shooting.last_stage import is_near_end, repeat_last_stage
 from pneuopt.shooting.levenberg_marquardt import INITIAL_DAMPING, Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
@@ -45,7 +45,6 @@ from pneuopt.shooting.stage_end import creeps, describe_iteration, is_negligible
 if TYPE_CHECKING:
     from pneuopt.shooting.least_squares import LeastSquares, Stage
 
-MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
 # error of the parameters [standard deviations] by derivatives from before the integration was refined: higher shifts
@@ -116,7 +115,7 @@ class Search:
             if stage is last and self._gaps_absorb_misfit() and self.method.allows_state_noise:
                 allowed = self._allow_state_noise()
                 if allowed.converged:
-                    return self._refine_steps(allowed)
+                    return refine_steps(self, allowed)
             elif stage is last and self.stage_ends and self._is_hopeless():
                 return ABANDONED_START
             self._enter_stage(stage, self.current.nodes, self.current.z)
@@ -125,11 +124,11 @@ class Search:
             self.has_stalled = self._finish_stage(stage.iterations)
             self.stage_ends.append(StageEnd(self.current.nodes, self.current.z, self.cost))
             if found := self._early_end(stage):
-                return self._refine_steps(found)
+                return refine_steps(self, found)
         status = repeat_last_stage(self)
         # gaps that absorb the misfit of the model: the answer depends on their weight
         gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
-        return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
+        return refine_steps(self, self._allow_state_noise(status) if gaps_absorb else status)
 
     def _early_end(self, stage: "Stage") -> Status | None:
         """The status of a search that ends with a stage before the last; None where it goes on."""
@@ -256,7 +255,7 @@ class Search:
         else:
             self.current = self.evaluate(nodes, z)
 
-    def _apply_finer_steps(self, steps: int) -> float:
+    def apply_finer_steps(self, steps: int) -> float:
         """Integrate the current iterate by finer steps; return the largest change of y [standard deviations]."""
         nodes, z, before = self.current.nodes, self.current.z, self._outputs()
         self.is_coarse = False
@@ -290,25 +289,6 @@ class Search:
         y = self.current.equations.linearisation.y
         return y if self.correction is None else y + self.correction.y
 
-    def _refine_steps(self, status: Status) -> Status:
-        """Halve the integration steps until no estimate moves; steps that the user gave stay."""
-        for _ in range(MAX_STEP_HALVINGS):
-            if not (status.converged and self.method.checks_steps):
-                break
-            before = self.snapshot()
-            change = self._apply_finer_steps((1 if self.method.substeps else 2) * self.output_substeps)
-            if not math.isfinite(self.current.cost):
-                self.restore(before)
-                break
-            if self._convergence_status(self.current).converged:
-                self.integration_change = math.nan if self.method.substeps else change
-                if self.noisy_gaps:
-                    self.run_stage(self.stage.iterations)  # the finer steps have moved its optimum a little
-                break
-            self.run_stage(self.stage.iterations)
-            status = self._convergence_status(self.current)
-        return status
-
     def _finish_stage(self, iterations: int) -> bool:
         """Run a stage, then again with the finer steps that it asks for; return as `run_stage` does.
 
@@ -317,7 +297,7 @@ class Search:
         has_ended = self.run_stage(iterations)
         if self.stage.refine > 1 and self.correction is None and not self._is_hopeless():
             before = self.snapshot()
-            self._apply_finer_steps(fine_steps(self.segments, self.substeps, self.stage.refine))
+            self.apply_finer_steps(fine_steps(self.segments, self.substeps, self.stage.refine))
             if math.isfinite(self.current.cost):
                 return self.run_stage(iterations)
             self.restore(before)

@@ -15,6 +15,7 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.budget import CpuBudget
 from pneuopt.shooting.equations import correct_residuals, normal_equations, weigh_gaps
+from pneuopt.shooting.integration_steps import refine_steps
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.scaling import ParameterScaling
@@ -59,7 +60,7 @@ def test_a_last_stage_that_does_not_soon_converge_is_left_for_the_stages_between
 
 def test_a_budget_that_ends_in_refinement_leaves_coarse_runs_only(monkeypatch: pytest.MonkeyPatch) -> None:
     budget, steps, refined = CpuBudget(1e9), list[int](), list[RolloutResult]()
-    run, refine = Segments.run, Search._refine_steps
+    run = Segments.run
 
     def spend(search: Search, status: Status) -> Status:
         assert status.converged
@@ -67,13 +68,13 @@ def test_a_budget_that_ends_in_refinement_leaves_coarse_runs_only(monkeypatch: p
         refined.append(search.run(search.output_substeps))
         budget._end = 0.0
         steps.clear()
-        return refine(search, status)
+        return refine_steps(search, status)
 
     def count(segments: Segments, nodes: Array, q: Array, substeps: int, **options: Any) -> RolloutResult:
         steps.append(substeps)
         return run(segments, nodes, q, substeps, **options)
 
-    monkeypatch.setattr(Search, "_refine_steps", spend)
+    monkeypatch.setattr("pneuopt.shooting.search.refine_steps", spend)
     monkeypatch.setattr(Segments, "run", count)
     search = Search(segment(two_logs()), LeastSquares(budget=budget))
     fit = search.solve()
@@ -142,7 +143,7 @@ def test_a_last_stage_that_stays_above_the_noise_is_not_integrated_by_finer_step
     def jumped(search: Search) -> None:
         with monkeypatch.context() as patch:
             patch.setattr(Search, "is_noise", only_loose)
-            patch.setattr(Search, "_apply_finer_steps", lambda *_: pytest.fail("finer steps"))
+            patch.setattr(Search, "apply_finer_steps", lambda *_: pytest.fail("finer steps"))
             jumps.append(jump(search) is None)
 
     jump = Search._jump_to_last_stage
@@ -206,13 +207,13 @@ def test_a_search_that_is_far_off_takes_no_finer_steps(
     limit: float, is_refined: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The short search of a minute's log went on in finer steps at 160 times the noise, for half of a CPU budget."""
-    steps, refine = list[int](), Search._apply_finer_steps
+    steps, refine = list[int](), Search.apply_finer_steps
 
     def record(search: Search, fine: int) -> float:
         steps.append(fine)
         return refine(search, fine)
 
-    monkeypatch.setattr(Search, "_apply_finer_steps", record)
+    monkeypatch.setattr(Search, "apply_finer_steps", record)
     stages = FIRST, OTHERS[-1]
     method = LeastSquares(stages=stages, allows_state_noise=False, max_misfit=limit)
     fit = solve_least_squares(shaken(2e-3), method)
