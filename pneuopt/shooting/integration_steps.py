@@ -135,6 +135,9 @@ class IntegrationSteps:
 def refine_steps(search: "Search", status: Status) -> Status:
     """Halve the integration steps until no estimate moves; steps that the user gave stay.
 
+    Where the finer steps of the last stage have moved none, still finer ones would move it less: these are run once
+    more where the search has ended.
+
     Parameters
     ----------
     search : Search
@@ -149,8 +152,11 @@ def refine_steps(search: "Search", status: Status) -> Status:
     for _ in range(MAX_STEP_HALVINGS):
         if not (status.converged and search.method.checks_steps):
             break
-        before = search.snapshot()
-        change = search.apply_finer_steps((1 if search.method.substeps else 2) * search.output_substeps)
+        before, correction = search.snapshot(), search.correction
+        are_fine = correction is not None and search.moves_no_estimate(correction.y)
+        change = search.apply_finer_steps((1 if search.method.substeps or are_fine else 2) * search.output_substeps)
+        if are_fine and search.correction is not None:
+            change = search.largest_change(search.correction.y)
         if not math.isfinite(search.current.cost):
             search.restore(before)
             break

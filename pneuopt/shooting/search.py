@@ -277,12 +277,16 @@ class Search:
         slopes = current.equations.linearisation
         self.correction = IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
         self.output_substeps, sigma = steps, self.stage.gap * self.gap_scales
-        change = np.nansum(((fine.y - before) * self.segments.weights)[np.isfinite(self.segments.measured)] ** 2)
-        if change <= MAX_GRADIENT_ERROR**2:
+        if self.moves_no_estimate(fine.y - before):
             equations = correct_residuals(current.equations, current.nodes, self.correction, sigma)
             self.current = Iterate(current.nodes, current.z, equations)
         else:
             self.current = self.evaluate(current.nodes, current.z)
+
+    def moves_no_estimate(self, change: Array) -> bool:
+        """Whether a change of the outputs moves no estimate: none moves by more deviations than the norm of it."""
+        weighted = (change * self.segments.weights)[np.isfinite(self.segments.measured)]
+        return float(np.nansum(weighted**2)) <= MAX_GRADIENT_ERROR**2
 
     def _outputs(self) -> Array:
         """The model's outputs with the correction of finer steps, shape (m, n, n_outputs)."""

@@ -311,6 +311,23 @@ def test_log_parameters_are_drawn_to_their_start_by_wide_gaps_alone() -> None:
     assert not replace(FIRST, refine=2).has_prior  # as noise of the states, whose stage decides
 
 
+def test_finer_steps_that_move_no_estimate_are_not_halved_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, steps, run = two_logs(), list[int](), Segments.run
+
+    def count(segments: Segments, nodes: Array, q: Array, substeps: int, **options: Any) -> RolloutResult:
+        steps.append(substeps)
+        return run(segments, nodes, q, substeps, **options)
+
+    monkeypatch.setattr(Segments, "run", count)
+    fit = solve_least_squares(problem, LeastSquares())
+    assert set(steps) == {fit.stats["substeps"]}  # no run by still finer ones
+    assert 0 < fit.stats["integration_error"] < 0.01
+    exact = solve_least_squares(problem, LeastSquares(substeps=16))
+    assert fit.covariance is not None
+    moved = [fit.parameters.value(n) - exact.parameters.value(n) for n in fit.parameters.free_names]
+    assert (np.abs(moved) < 0.01 * np.sqrt(np.diag(fit.covariance))).all()
+
+
 def test_a_refit_keeps_steps_that_were_tried_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two runs of finer steps were a quarter of a refit of a profile, and all for a figure that nobody reads."""
     problem, steps, run = two_logs(), list[int](), Segments.run
