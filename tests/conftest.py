@@ -1,6 +1,7 @@
 """What several tests share."""
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,10 @@ from pneuopt.tuning.linearised import LinearisedProblem
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.register_profile("desk", deadline=None)  # no wall-clock assertion: machines are noisy
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "desk")
+
+# a shell has Ctrl-C ignored by what it starts in the background; tests of Ctrl-C would then wait for minutes
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 CACHES = (
     compiler.compile_library,
