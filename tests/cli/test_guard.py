@@ -15,6 +15,8 @@ posix = pytest.mark.skipif(os.name == "nt", reason="signals, /dev/full and close
 START = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits it as ignored
+if hasattr(signal, "SIGHUP"):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as does one under nohup
 from pneuopt.cli.guard import run_guarded
 from pneuopt.cli.interruption import without_interruption
 def say_ready():
