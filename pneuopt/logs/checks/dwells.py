@@ -53,10 +53,6 @@ def _find_moves(t: Array, size: Array) -> list[tuple[int, int]]:
         return []
     breaks = np.flatnonzero(np.diff(t[moving]) > SHORTEST_DWELL)
     spans = list(zip(moving[np.r_[0, breaks + 1]], moving[np.r_[breaks, moving.size - 1]] + 1, strict=True))
-    ways = [_way(t, size, span) for span in spans]
+    travelled = size * np.gradient(t)  # in the time of each sample
+    ways = [float(travelled[first:last].sum()) for first, last in spans]
     return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > LEAST_WAY * max(ways)]
-
-
-def _way(t: Array, size: Array, span: tuple[int, int]) -> float:
-    first, last = span
-    return float(size[first:last] @ np.gradient(t)[first:last])
