@@ -5,7 +5,7 @@ import casadi as ca
 from pneuopt.export.expression_writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix, unary_calls
 from pneuopt.export.header import Header, comment_text
 from pneuopt.export.page import Page, Places, write_page
-from pneuopt.export.program import ControllerProgram, Variable
+from pneuopt.export.program import CENTRE, ControllerProgram, Variable
 from pneuopt.export.reference_run import RUN_TOLERANCE, ReferenceRun
 
 C99 = Syntax(
@@ -35,7 +35,7 @@ _HELPERS = {
 
 def write_c99(program: ControllerProgram, header: Header, run: ReferenceRun) -> dict[str, str]:
     """Header, source and test; their texts by the files' names."""
-    name, page = header.name, write_page(program, C99, Places("c->p.{}", "c->{}", "c->{}"))
+    name, page = header.name, write_page(program, C99, Places("c->p.{}", "c->{}", "c->{}"), header.own_names)
     return {
         f"{name}.h": _header(program, header, page),
         f"{name}.c": _source(program, header, page),
@@ -89,7 +89,7 @@ def _source(program: ControllerProgram, header: Header, page: Page) -> str:
     texts = [a.text for a in (*page.coefficients, *page.start_locals, *page.start, *page.locals)]
     lines = [*_comment(header), f'#include "{name}.h"', "", "#include <math.h>", ""]
     if any("SAMPLE_TIME" in text for text in texts):
-        lines += [f"#define SAMPLE_TIME {program.sample_time!r} /* s */", ""]
+        lines += [f"#define SAMPLE_TIME {C99.literal(program.sample_time)} /* s */", ""]
     lines += [text for operation, text in _HELPERS.items() if operation in page.operations]
     values = [f"    {C99.literal(v.value)}, /* {v.name} [{comment_text(v.unit)}] */" for v in program.parameters]
     lines += [f"const {name}_parameters {name}_tuned = {{", *values, "};", "", prepare, "{", "    c->p = *p;"]
@@ -98,7 +98,9 @@ def _source(program: ControllerProgram, header: Header, page: Page) -> str:
     lines += ["}", "", start, "{", *(f"    (void)({n});" for n in unread)]
     lines += [f"    const double {a.name} = {a.text};" for a in page.start_locals]
     lines += [f"    c->{a.name} = {a.text};" for a in page.start]
-    lines += ["}", "", step, "{", *(f"    const double {a.name} = {a.text};" for a in page.locals), ""]
+    unused = [v.name for v in program.inputs if not _reads(page.locals, v.name)]
+    lines += ["}", "", step, "{", *(f"    (void)({n});" for n in unused)]
+    lines += [*(f"    const double {a.name} = {a.text};" for a in page.locals), ""]
     lines += [f"    c->{n} = {text};" for n, text in {**page.outputs, **page.states}.items()]
     return "\n".join([*lines, f"    return c->{program.outputs[0].name};", "}"]) + "\n"
 
@@ -113,12 +115,12 @@ def _reads(assignments: tuple[tuple[str, str], ...], name: str) -> bool:
 def _test(program: ControllerProgram, header: Header, run: ReferenceRun) -> str:
     name, columns = header.name, len(program.inputs) + 1
     rows = [
-        "    {" + ", ".join(repr(float(v)) for v in (*given, out)) + "},"
+        "    {" + ", ".join(C99.literal(v) for v in (*given, out)) + "},"
         for given, out in zip(run.inputs, run.outputs, strict=True)
     ]
     read = ", ".join(f"run[k][{i}]" for i in range(columns - 1))
     begin = ", ".join(f"run[0][{i}]" for i in range(columns - 1))
-    centre = f"{name}_tuned.centre" if any(v.name == "centre" for v in program.parameters) else "0.0"
+    centre = f"{name}_tuned.{program.originals[CENTRE].name}" if CENTRE in program.originals else "0.0"
     told = ", ".join([*(v.name for v in program.inputs), program.outputs[0].name])
     lines = [f"/* Compares {name} with the library, sample by sample; status 1 if they differ. */"]
     lines += [f'#include "{name}.h"', "", "#include <math.h>", "#include <stdio.h>", ""]
@@ -131,5 +133,5 @@ def _test(program: ControllerProgram, header: Header, run: ReferenceRun) -> str:
     lines += ["        worst = off > worst ? off : worst;"]
     lines += ["        largest = fabs(wanted) > largest ? fabs(wanted) : largest;", "    }"]
     lines += ['    printf("largest difference %.3g of %.3g\\n", worst, largest);']
-    lines += [f"    return worst <= {RUN_TOLERANCE!r} * largest ? 0 : 1;", "}"]
+    lines += [f"    return worst <= {C99.literal(RUN_TOLERANCE)} * largest ? 0 : 1;", "}"]
     return "\n".join(lines) + "\n"

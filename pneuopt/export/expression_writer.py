@@ -16,6 +16,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from pneuopt.dynamics.compiled.c_writer import DIVISIONS, Instruction, read_instructions
+from pneuopt.export.identifiers import Identifiers
 
 MAX_INLINE = 70
 """Length of an expression that stands within another [character]: a longer one gets a name of its own; below some 40
@@ -152,6 +153,8 @@ class Names(NamedTuple):
         Names of constants.
     coefficient : str
         How a value that depends on the parameters alone is reached, {} being its name.
+    taken : frozenset of str
+        Names besides that no value on the way may have.
     """
 
     inputs: Sequence[Sequence[str]]
@@ -160,6 +163,7 @@ class Names(NamedTuple):
     parameters: frozenset[str] = frozenset()
     constants: Mapping[float, str] = {}
     coefficient: str = "{}"
+    taken: frozenset[str] = frozenset()
 
 
 def write_expressions(function: ca.Function, names: Names, syntax: Syntax) -> Written:
@@ -213,6 +217,8 @@ class _Writer:
         self.labels = {i.sources[0]: names.results[i.target[1]] for i in reversed(results)}
         self.labels |= {i.sources[0]: names.labels[i.target[1]] for i in reversed(labelled)}
         self.exact = _before_jumps(instructions)
+        given = (n for entries in (*names.inputs, names.results, names.labels) for n in entries)
+        self.identifiers = Identifiers([*given, *names.constants.values(), *names.taken])
 
     def write(self) -> Written:
         for i in self.instructions:
@@ -285,8 +291,7 @@ class _Writer:
         own = self.labels.get(place)
         taken = {a.name for a in (*written.coefficients, *written.statements)}
         if own is None or own in taken:
-            kind, so_far = ("v", written.statements) if value.varies else ("k", written.coefficients)
-            own = f"{kind}{1 + sum(a.name[0] == kind and a.name[1:].isdigit() for a in so_far)}"
+            own = self.identifiers.claim_next("v" if value.varies else "k")
         (written.statements if value.varies else written.coefficients).append(Assignment(own, value.text))
         text = own if value.varies else self.names.coefficient.format(own)
         return replace(value, text=text, binding=Binding.ATOM, is_atom=True)

@@ -36,6 +36,12 @@ class Header:
     name: str
     lines: tuple[str, ...] = field(default=())
 
+    @property
+    def own_names(self) -> tuple[str, ...]:
+        """What the files call the block and what belongs to it."""
+        parts = ("parameters", "tuned", "prepare", "start", "step", "test", "h")
+        return (self.name, *(f"{self.name}_{part}" for part in parts))
+
 
 def comment_text(text: str) -> str:
     r"""A text that cannot end a comment: one line of printable ASCII, without the marks of comments.

@@ -1,10 +1,11 @@
 """`Page`: a program worded in one language, between the walk over its graph and the layout of a file."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from pneuopt.export.expression_writer import Assignment, Names, Syntax, write_expressions
-from pneuopt.export.program import ControllerProgram
+from pneuopt.export.identifiers import Identifiers
+from pneuopt.export.program import C_NAMES, ControllerProgram
 
 
 @dataclass(frozen=True)
@@ -48,23 +49,30 @@ class Page:
     operations: frozenset[int]
 
 
-def write_page(program: ControllerProgram, syntax: Syntax, places: Places) -> Page:
-    """Word a program in a language."""
+def write_page(program: ControllerProgram, syntax: Syntax, places: Places, taken: Iterable[str] = ()) -> Page:
+    """Word a program in a language; no value on the way has a name of the program or one that is `taken`."""
     parameters = [places.parameter.format(v.name) for v in program.parameters]
     inputs, states = [v.name for v in program.inputs], [v.name for v in program.states]
-    outputs, after = [v.name for v in program.outputs], [f"{n}_next" for n in states]
-    known = frozenset(parameters)
-    first = [f"{n}_first" for n in states]
-    begin = Names([[v.name for v in program.start_inputs], parameters], first, (), frozenset(), program.constants)
+    outputs, known = [v.name for v in program.outputs], frozenset(parameters)
+    used = [*program.names, *C_NAMES, *taken]
+    free = Identifiers(used)
+    first, after = ([free.claim(f"{n}_{what}") for n in states] for what in ("first", "next"))
+    now = [free.claim(f"{n}_now") for n in outputs]
+    used += [*first, *after, *now]
+    given = [[v.name for v in program.start_inputs], parameters]
+    begin = Names(given, first, (), frozenset(), program.constants, taken=frozenset(used))
+    started = write_expressions(program.start, begin, syntax)
+    used += [a.name for a in (*started.coefficients, *started.statements)]
     names = Names(
         [inputs, [places.state.format(n) for n in states], parameters],
-        [*(f"{n}_now" for n in outputs), *after],
+        [*now, *after],
         program.terms,
         known,
         program.constants,
         places.coefficient,
+        frozenset(used),
     )
-    started, step = write_expressions(program.start, begin, syntax), write_expressions(program.step, names, syntax)
+    step = write_expressions(program.step, names, syntax)
     own = [*step.statements]
     found: dict[str, str] = {}
     local = {a.name for a in own} | set(inputs)
@@ -75,9 +83,9 @@ def write_page(program: ControllerProgram, syntax: Syntax, places: Places) -> Pa
     return Page(
         tuple(step.coefficients),
         (*started.coefficients, *started.statements),
-        tuple(Assignment(n, started.results[f"{n}_first"]) for n in states),
+        tuple(Assignment(n, started.results[begun]) for n, begun in zip(states, first, strict=True)),
         tuple(own),
-        {n: found[f"{n}_now"] for n in outputs},
-        {n: found[f"{n}_next"] for n in states},
+        {n: found[made] for n, made in zip(outputs, now, strict=True)},
+        {n: found[made] for n, made in zip(states, after, strict=True)},
         frozenset(started.operations | step.operations),
     )

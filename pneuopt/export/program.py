@@ -18,12 +18,18 @@ from pneuopt.control.sampled import controller_update
 from pneuopt.control.sensor import Encoder, SensedSignal
 from pneuopt.control.wiring import Signals
 from pneuopt.dynamics.system import Symbols, symbols
+from pneuopt.export.identifiers import Identifiers
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
 
 SAMPLE, CENTRE = "sample", "centre"  # the state that counts samples; the parameter of the valve's centre
 ADDED_TERMS = ("integral", "derivative", "proportional", "feedforward", "compensation", "dither")
-"""Terms of the command, whose names end in _term: the states of some have the name itself."""
+"""Terms of the command, whose names end in _term: each is one summand, no state."""
+FIXED_NAMES = ("setpoint", "measured", "start_output")  # signals of every block
+C_NAMES = (
+    "c",
+    "p",
+)  # by which C reaches what is kept: a parameter, which is kept in a structure of its own, may have them
 STATE_MEANINGS: Mapping[str, str] = {
     SAMPLE: "samples since the start",
     "sensor.reading": "filtered speed",
@@ -60,12 +66,15 @@ class Variable:
     name, unit, meaning : str
     value : float
         Of a parameter; of another 0.
+    origin : str
+        What the loop calls it ("pid.Kp"), where it has it; `name` is an identifier in every language.
     """
 
     name: str
     unit: str
     meaning: str
     value: float = 0.0
+    origin: str = ""
 
 
 @dataclass(frozen=True)
@@ -101,6 +110,17 @@ class ControllerProgram:
     def values(self) -> list[float]:
         """Of the parameters."""
         return [v.value for v in self.parameters]
+
+    @property
+    def originals(self) -> Mapping[str, Variable]:
+        """The parameters and states by what the loop calls them."""
+        return {v.origin: v for v in (*self.parameters, *self.states)}
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Those of all its numbers."""
+        variables = (*self.parameters, *self.states, *self.start_inputs, *self.outputs)
+        return frozenset((*(v.name for v in variables), *self.terms))
 
     @property
     def constants(self) -> Mapping[float, str]:
@@ -244,31 +264,54 @@ def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: flo
     value[CENTRE] = centre
     unit, wanted = loop.command.unit, Variable("setpoint", loop.feedback.unit, f"the {loop.feedback.name} wanted")
     measured = Variable("measured", law.measured.unit, f"the {law.measured.name}, as the controller's input shows it")
-    inputs = (wanted, measured, *_more_inputs(loop))
+    names, readings = _claim_names(loop, [*outputs], given, states, [*terms])
+    inputs = (wanted, measured, *_more_inputs(loop, readings))
     declared = {n: (q.unit, q.meaning) for n, q in loop.parameters.items()}
     declared[CENTRE] = (unit, "output while the command is zero, as a valve's centre")
     units = {q.name: q.unit for q in loop.states} | {SAMPLE: "1"}
     return ControllerProgram(
         loop.pid.sample_time or 0.0,
-        tuple(Variable(short_name(n), *declared[n], value[n]) for n in given),
+        tuple(Variable(names[n], *declared[n], value[n], n) for n in given),
         inputs,
-        tuple(Variable(short_name(n), units[n], STATE_MEANINGS.get(n, "")) for n in states),
+        tuple(Variable(names[n], units[n], STATE_MEANINGS.get(n, n), 0.0, n) for n in states),
         tuple(Variable(n, unit, what) for n, (_, what) in outputs.items()),
         (*inputs, Variable("start_output", unit, "what the actuator has got so far, from which it goes on")),
         ca.Function("start", [begin, p], [first]),
         ca.Function("step", [signals, x, p], [ca.densify(results), ca.densify(ca.vertcat(*terms.values()))]),
-        tuple(terms),
+        tuple(names[n] for n in terms),
     )
 
 
-def _more_inputs(loop: ClosedLoop) -> tuple[Variable, ...]:
+def _claim_names(
+    loop: ClosedLoop, outputs: list[str], given: list[str], states: list[str], terms: list[str]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """What parameters, states and terms are called, and readings: the shortest name of each that is free.
+
+    The signals of the block come first, so that they are called alike in every program.
+    """
+    taken = Identifiers([*FIXED_NAMES, *outputs, *(_rate_name(q.name) for q in loop.motion_inputs)])
+    found = {CENTRE: taken.claim(CENTRE)} if CENTRE in given else {}
+    found |= {n: taken.claim(_short_name(n), n) for n in given if n != CENTRE}
+    taken.take(*C_NAMES)
+    found |= {n: taken.claim(_short_name(n), n) for n in states}
+    readings = {n: taken.claim(n, f"{n}_reading") for n in loop.readings}
+    return found | {n: taken.claim(n, f"{n}_term") for n in terms}, readings
+
+
+def _rate_name(name: str) -> str:
+    return name.replace("reference", "setpoint")
+
+
+def _more_inputs(loop: ClosedLoop, names: Mapping[str, str]) -> tuple[Variable, ...]:
     """The rates of the reference and the readings that compensators use, as their parts name them."""
     units = {q.name: q.unit for q in (*loop.motion_inputs, *loop.plant.outputs)}
     rates = (
-        Variable(q.name.replace("reference", "setpoint"), q.unit, f"the {q.name.partition('_')[2]} of the setpoint")
+        Variable(_rate_name(q.name), q.unit, f"the {q.name.partition('_')[2]} of the setpoint")
         for q in loop.motion_inputs
     )
-    return (*rates, *(Variable(n, units[n], f"{n.replace('_', ' ')}, as its sensor shows it") for n in loop.readings))
+    shown = (n.replace("_", " ") for n in loop.readings)
+    read = zip(loop.readings, shown, strict=True)
+    return (*rates, *(Variable(names[n], units[n], f"{told}, as its sensor shows it") for n, told in read))
 
 
 def _outputs(law: _Law, loop: ClosedLoop, centre: float) -> dict[str, tuple[ca.SX, str]]:
@@ -296,6 +339,6 @@ def _needed_states(results: ca.SX, states: Signals, after: Signals) -> list[str]
         needed = found
 
 
-def short_name(name: str) -> str:
-    """A parameter's or state's name in a program: "pid.Kp" is Kp, "dither.offset" is dither_offset."""
+def _short_name(name: str) -> str:
+    """A parameter's or state's name in a program where it is free: "pid.Kp" is Kp, "dither.offset" dither_offset."""
     return name.removeprefix("pid.").replace(".", "_")

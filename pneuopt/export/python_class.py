@@ -7,7 +7,7 @@ import casadi as ca
 from pneuopt.export.expression_writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix, unary_calls
 from pneuopt.export.header import Header, comment_text
 from pneuopt.export.page import Places, write_page
-from pneuopt.export.program import ControllerProgram, Variable
+from pneuopt.export.program import CENTRE, ControllerProgram, Variable
 
 PYTHON = Syntax(
     {
@@ -32,11 +32,20 @@ PYTHON = Syntax(
 
 def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     """One module with one class; its text by the file's name."""
-    page = write_page(program, PYTHON, Places("self.{}", "self.{}", "self.{}"))
+    page = write_page(program, PYTHON, Places("self.{}", "self.{}", "self.{}"), header.own_names)
     name = "".join(part[:1].upper() + part[1:] for part in header.name.split("_"))
     signature = ", ".join(f"{v.name}: float" for v in program.inputs)
     begin = ", ".join(f"{v.name}: float" for v in program.start_inputs[:-1])
-    lines = ['"""', *header.lines, '"""', "", "import math", "", f"SAMPLE_TIME = {program.sample_time!r}  # s", ""]
+    lines = [
+        '"""',
+        *header.lines,
+        '"""',
+        "",
+        "import math",
+        "",
+        f"SAMPLE_TIME = {PYTHON.literal(program.sample_time)}  # s",
+        "",
+    ]
     lines += [
         "",
         f"class {name}:",
@@ -56,7 +65,7 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     lines += ["    def prepare(self) -> None:", '        """Take over parameters that were changed."""']
     lines += [f"        self.{a.name} = {a.text}" for a in page.coefficients]
     last = program.start_inputs[-1]
-    usual = "self.centre" if any(v.name == "centre" for v in program.parameters) else "0.0"
+    usual = f"self.{program.originals[CENTRE].name}" if CENTRE in program.originals else "0.0"
     lines += ["", f"    def start(self, {begin}, {last.name}: float | None = None) -> None:"]
     lines += [f'        """Begin, or go on without a bump from {last.name}: {last.meaning}."""']
     lines += [f"        {last.name} = {usual} if {last.name} is None else {last.name}"]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pneuopt.export.program import ControllerProgram
+from pneuopt.export.program import CENTRE, ControllerProgram
 from pneuopt.quantities.arrays import Array
 
 RUN_SAMPLES = 200
@@ -56,7 +56,7 @@ def run_program(program: ControllerProgram, inputs: Array) -> Array:
     ndarray, shape (n_samples, n_outputs)
     """
     p, count, found = program.values, len(program.outputs), []
-    centre = {v.name: v.value for v in program.parameters}.get("centre", 0.0)
+    centre = program.originals[CENTRE].value if CENTRE in program.originals else 0.0
     x = program.start([*inputs[0], centre], p)
     for row in inputs:
         results = program.step(row, x, p)[0].full().ravel()
@@ -67,6 +67,6 @@ def run_program(program: ControllerProgram, inputs: Array) -> Array:
 
 def _step_size(program: ControllerProgram) -> float:
     """A step that drives the output beyond its limits for a while; 1 where it has none."""
-    value = {v.name: v.value for v in program.parameters}
-    gain, upper = abs(value.get("Kp", value.get("K", 1.0))), value.get("upper", np.inf)
+    value = {n: v.value for n, v in program.originals.items()}
+    gain, upper = abs(value.get("pid.Kp", value.get("pid.K", 1.0))), value.get("pid.upper", np.inf)
     return float(1.5 * upper / gain) if np.isfinite(upper) and upper > 0 and gain > 0 else 1.0

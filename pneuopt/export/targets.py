@@ -6,10 +6,12 @@ from enum import Enum
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import Header, make_header
+from pneuopt.export.identifiers import RESERVED_FILES, Identifiers, reserved_as
 from pneuopt.export.program import ControllerProgram, controller_program
 from pneuopt.export.python_class import write_python
 from pneuopt.export.reference_run import make_reference_run
 from pneuopt.export.structured_text import write_structured_text
+from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
 
@@ -62,7 +64,8 @@ def export_controller(
     Raises
     ------
     InputError
-        If the name is no identifier, or the parameters cannot run; `ModelError` if the controller is continuous.
+        If the name is no identifier, is reserved in a language, or is that of a number in the block; if the parameters
+        cannot run; `ModelError` if the controller is continuous.
 
     Examples
     --------
@@ -74,4 +77,16 @@ def export_controller(
     """
     check_closed_loop(loop)
     program = controller_program(loop, parameters, centre)
-    return _WRITERS[language](program, make_header(name, loop, parameters, centre, origin))
+    header = make_header(name, loop, parameters, centre, origin)
+    _check_block_name(header, program)
+    return _WRITERS[language](program, header)
+
+
+def _check_block_name(header: Header, program: ControllerProgram) -> None:
+    """Refuse a name that a language, the file system or a number of the block has."""
+    within = {n.casefold() for n in program.names}
+    taken = [n for n in header.own_names if n.casefold() in within]
+    reserved = "a file that compilers or Windows have" if header.name.casefold() in RESERVED_FILES else None
+    what = reserved_as(header.name) or reserved or (f"{taken[0]}, a number of the block" if taken else None)
+    free = Identifiers([*program.names, *RESERVED_FILES]).claim(f"{header.name}_control", f"{header.name}_block")
+    require(what is None, f"--name {header.name}: is {what}; take another, as --name {free}")

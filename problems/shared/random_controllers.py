@@ -14,7 +14,7 @@ from pneuopt.control.pid import PID, AntiWindup
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
-from pneuopt.export.program import controller_program, short_name
+from pneuopt.export.program import controller_program
 from pneuopt.models.friction import Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
@@ -116,8 +116,8 @@ def run_library(seed: int) -> Run:
     shown = np.array([_shown(loop, row) for row in motion])
     inputs, outputs = np.column_stack([reference, shown, more, air]), np.empty(SAMPLES)
     begun = program.start([*inputs[0], centre], program.values).full().ravel()
-    first = dict(zip((v.name for v in program.states), begun, strict=True))
-    x = np.array([first.get(short_name(n), 0.0) for n in order])
+    first = dict(zip((v.origin for v in program.states), begun, strict=True))
+    x = np.array([first.get(n, 0.0) for n in order])
     for k in range(SAMPLES):
         x[[plant.index("position"), plant.index("speed")]] = motion[k]
         if isinstance(loop.sensor, SensorLag):
