@@ -1,7 +1,8 @@
 """`ControllerProgram`: a loop's sampled controller as named numbers and two symbolic functions."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import casadi as ca
 
@@ -113,8 +114,8 @@ class ControllerProgram:
 
     @property
     def originals(self) -> Mapping[str, Variable]:
-        """The parameters and states by what the loop calls them."""
-        return {v.origin: v for v in (*self.parameters, *self.states)}
+        """The parameters by what the loop calls them."""
+        return {v.origin: v for v in self.parameters}
 
     @property
     def names(self) -> frozenset[str]:
@@ -188,7 +189,7 @@ class _Law:
     Attributes
     ----------
     inputs, states, parameters : dict of str to casadi.SX
-        By the loop's names, and "sample", "centre".
+        By the loop's names, and "sample", "centre", "measured", "output" and "reading NAME".
     measured : Quantity
         What the controller's input shows.
     after, start, terms : dict of str to casadi.SX
@@ -216,10 +217,10 @@ def _law(loop: ClosedLoop) -> _Law:
     known = loop.states[len(loop.plant.states) :]
     x = symbols([q for q in known if encoder or not q.name.startswith("sensor.")]) | {SAMPLE: ca.SX.sym(SAMPLE)}
     p: Signals = {n: ca.SX.sym(n) for n in (*loop.parameters, CENTRE)}
-    more = (*(q.name for q in loop.motion_inputs), *loop.readings)
-    u: Signals = {n: ca.SX.sym(n) for n in ("reference", "measured", *more, "output")}
+    rates = [q.name for q in loop.motion_inputs]
+    u: Signals = {n: ca.SX.sym(n) for n in ("reference", "measured", *rates, *map(_reading, loop.readings), "output")}
     t = (loop.pid.sample_time or 0.0) * x[SAMPLE]
-    shown = {n: u[n] for n in loop.readings} | {measured.name: u["measured"]}
+    shown = {n: u[_reading(n)] for n in loop.readings} | {measured.name: u["measured"]}
     found = controller_update(parts, t, x, u, shown, p)
     given: Signals = {"count": u["measured"]} if encoder else {}
     frozen = schedule_gains(parts, p, u["measured"], given, shown)
@@ -231,6 +232,11 @@ def _law(loop: ClosedLoop) -> _Law:
     inner = pid_reference(parts, u, shown[loop.feedback.name], frozen) if loop.outer else u
     begun = _start(parts, inner, shown, {**own, "Kp": gains["Kp"]}, p[CENTRE])
     return _Law(u, x, p, measured, after, begun, terms)
+
+
+def _reading(name: str) -> str:
+    """The key of one among a law's inputs, whose other keys no plant knows to avoid."""
+    return f"reading {name}"
 
 
 def _start(parts: _ComputedParts, u: Signals, shown: Signals, p: Symbols, centre: ca.SX) -> Signals:
@@ -264,38 +270,49 @@ def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: flo
     value[CENTRE] = centre
     unit, wanted = loop.command.unit, Variable("setpoint", loop.feedback.unit, f"the {loop.feedback.name} wanted")
     measured = Variable("measured", law.measured.unit, f"the {law.measured.name}, as the controller's input shows it")
-    names, readings = _claim_names(loop, [*outputs], given, states, [*terms])
-    inputs = (wanted, measured, *_more_inputs(loop, readings))
-    declared = {n: (q.unit, q.meaning) for n, q in loop.parameters.items()}
+    names = _claim_names(loop, outputs, given, states, terms)
+    inputs = (wanted, measured, *_more_inputs(loop, names.readings))
+    declared = {n: (q.unit, q.meaning or n) for n, q in loop.parameters.items()}
     declared[CENTRE] = (unit, "output while the command is zero, as a valve's centre")
     units = {q.name: q.unit for q in loop.states} | {SAMPLE: "1"}
     return ControllerProgram(
         loop.pid.sample_time or 0.0,
-        tuple(Variable(names[n], *declared[n], value[n], n) for n in given),
+        tuple(Variable(names.parameters[n], *declared[n], value[n], n) for n in given),
         inputs,
-        tuple(Variable(names[n], units[n], STATE_MEANINGS.get(n, n), 0.0, n) for n in states),
+        tuple(Variable(names.states[n], units[n], STATE_MEANINGS.get(n, n), 0.0, n) for n in states),
         tuple(Variable(n, unit, what) for n, (_, what) in outputs.items()),
         (*inputs, Variable("start_output", unit, "what the actuator has got so far, from which it goes on")),
         ca.Function("start", [begin, p], [first]),
         ca.Function("step", [signals, x, p], [ca.densify(results), ca.densify(ca.vertcat(*terms.values()))]),
-        tuple(names[n] for n in terms),
+        tuple(names.terms.values()),
     )
 
 
-def _claim_names(
-    loop: ClosedLoop, outputs: list[str], given: list[str], states: list[str], terms: list[str]
-) -> tuple[dict[str, str], dict[str, str]]:
-    """What parameters, states and terms are called, and readings: the shortest name of each that is free.
+class _Names(NamedTuple):
+    """What is called how, by the loop's names."""
 
-    The signals of the block come first, so that they are called alike in every program.
+    parameters: Mapping[str, str]
+    states: Mapping[str, str]
+    readings: Mapping[str, str]
+    terms: Mapping[str, str]
+
+
+def _claim_names(
+    loop: ClosedLoop, outputs: Iterable[str], given: Iterable[str], states: Iterable[str], terms: Iterable[str]
+) -> _Names:
+    """The shortest name of each that is free.
+
+    The signals of the block come first, so that they are called alike in every program, then the parameters.
     """
     taken = Identifiers([*FIXED_NAMES, *outputs, *(_rate_name(q.name) for q in loop.motion_inputs)])
-    found = {CENTRE: taken.claim(CENTRE)} if CENTRE in given else {}
-    found |= {n: taken.claim(_short_name(n), n) for n in given if n != CENTRE}
+    parameters = {n: taken.claim(_short_name(n), n) for n in sorted(given, key=lambda n: n != CENTRE)}
     taken.take(*C_NAMES)
-    found |= {n: taken.claim(_short_name(n), n) for n in states}
-    readings = {n: taken.claim(n, f"{n}_reading") for n in loop.readings}
-    return found | {n: taken.claim(n, f"{n}_term") for n in terms}, readings
+    return _Names(
+        parameters,
+        {n: taken.claim(_short_name(n), n) for n in states},
+        {n: taken.claim(n, f"{n}_reading") for n in loop.readings},
+        {n: taken.claim(n, f"{n}_term") for n in terms},
+    )
 
 
 def _rate_name(name: str) -> str:
