@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.evaluation.monte_carlo import degrees_of_freedom, draw_in_ranges, select_estimates, select_ranges
+from pneuopt.evaluation.sampling import Seed, further
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, AxisNames, Factor, Scenarios, draws, tolerances
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 # Plants on which a design is tried. If it holds on all of 100, at least 97 % of such plants hold with 95 % confidence
 # (0.05^(1/100)); fewer say less, more cost time in proportion.
 PLANT_COUNT = 100
-PLANT_SEED = 1  # another one than `samples` and `draws` have by default, so that no search has seen these plants
 # By what share of its value a parameter differs from plant to plant where no fit has estimated it. Parameters on one
 # line vary together. Larger shares find fault with every design, smaller ones with none.
 TOLERANCES: Mapping[tuple[str, ...], float] = {
@@ -123,7 +123,7 @@ def expected_plants(
     estimates: "pd.DataFrame | None" = None,
     scenarios: Scenarios = NO_SCENARIOS,
     count: int = PLANT_COUNT,
-    seed: int = PLANT_SEED,
+    seed: Seed = 0,
 ) -> ExpectedPlants:
     """Draw the plants that a model may stand for.
 
@@ -140,7 +140,8 @@ def expected_plants(
         Plants that the design is meant for, the search's own or others from the same boxes: plant k differs from the
         model as the k-th of them does, over and above what else varies; after the last one comes the first.
     count : int
-    seed : int
+    seed : int or tuple
+        No search has seen these plants, whatever seed its own were drawn with.
 
     Returns
     -------
@@ -161,6 +162,7 @@ def expected_plants(
     ranges = select_ranges(parameters, estimates, others)
     from_fit = (*(map(str, estimated.index) if estimated is not None else ()), *ranges)
     shares = _usual_tolerances(parameters, {*known, *from_fit})
+    seed = further(seed, "expected_plants")
     varied = tolerances(parameters, shares, count, seed=seed) if shares else {}
     drawn = {} if estimated is None else draws(parameters, estimated, count, seed=seed, dof=dof)
     own = list(scenarios.values()) or [{}]

@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.evaluation.sampling import Sampling, Seed
+from pneuopt.evaluation.sampling import Sampling, Seed, further, generator
 from pneuopt.evaluation.scenarios import SampleSpreads, ScenarioValues, draws, samples
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_FIT_STREAM = 2  # beside the seed [1]: the fit's random numbers are not those of the stated distributions
 
 
 def monte_carlo(
@@ -25,7 +23,7 @@ def monte_carlo(
     covariance: "pd.DataFrame | None" = None,
     estimates: "pd.DataFrame | None" = None,
     spreads: SampleSpreads = MappingProxyType({}),
-    seed: int = 0,
+    seed: Seed = 0,
     sampling: Sampling = Sampling.RANDOM,
 ) -> ScenarioValues:
     """Draw plants: what a fit has estimated from its covariance, other parameters from stated distributions.
@@ -40,7 +38,8 @@ def monte_carlo(
         intervals (Student's t), and a parameter that has a range in place of an interval is drawn from anywhere in it.
     spreads : mapping, optional
         As for `samples`; a parameter in it is drawn by it, whatever the fit says.
-    seed : int
+    seed : int or tuple
+        Plants of `samples` or `draws` are independent of these for the same seed, too.
     sampling : Sampling
         How the draws of `spreads` fill their box; those of the fit are independent.
 
@@ -65,14 +64,15 @@ def monte_carlo(
     (500, ['friction.coulomb', 'load.mass'])
     """
     require(count >= 1, f"count must be at least 1, got {count}")
-    stated = samples(parameters, spreads, count, seed=seed, sampling=sampling) if spreads else {}
+    own_seed = further(seed, "monte_carlo")
+    stated = samples(parameters, spreads, count, seed=own_seed, sampling=sampling) if spreads else {}
     own = {n for values in stated.values() for n in values}
     estimated, ranges = select_estimates(parameters, covariance, own), select_ranges(parameters, estimates, own)
     nothing = "nothing varies: state how a parameter spreads, or give a fit that has estimated one of this loop"
     require(bool(own or ranges) or estimated is not None, nothing)
-    stream, dof = (seed, _FIT_STREAM), degrees_of_freedom(estimates)
-    fitted = {} if estimated is None else draws(parameters, estimated, count, seed=stream, dof=dof)
-    wide = draw_in_ranges(parameters, ranges, count, stream)
+    dof = degrees_of_freedom(estimates)
+    fitted = {} if estimated is None else draws(parameters, estimated, count, seed=own_seed, dof=dof)
+    wide = draw_in_ranges(parameters, ranges, count, own_seed)
     parts = zip(*(list(part.values()) or [{}] * count for part in (fitted, stated)), wide, strict=True)
     return {f"sample {k}": {**a, **b, **c} for k, (a, b, c) in enumerate(parts, 1)}
 
@@ -114,10 +114,11 @@ def draw_in_ranges(
     parameters: ParameterSet, ranges: Mapping[str, tuple[float, float]], count: int, seed: Seed
 ) -> list[dict[str, float]]:
     """Values anywhere in each range, by their logarithm where the parameter is searched by it."""
-    rng = np.random.default_rng((*((seed,) if isinstance(seed, int) else seed), 1))
 
-    def draw(name: str, low: float, high: float) -> float:
-        share = float(rng.random())
-        return low * (high / low) ** share if parameters[name].log else low + share * (high - low)
+    def draw(name: str, low: float, high: float) -> list[float]:
+        share = generator(seed, "ranges", name).random(count)
+        drawn = low * (high / low) ** share if parameters[name].log else low + share * (high - low)
+        return [float(v) for v in drawn]
 
-    return [{n: draw(n, *ends) for n, ends in ranges.items()} for _ in range(count)]
+    columns = {n: draw(n, *ends) for n, ends in ranges.items()}
+    return [{n: values[k] for n, values in columns.items()} for k in range(count)]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.evaluation.distributions import Distribution, quantiles
-from pneuopt.evaluation.sampling import Sampling, Seed, unit_points
+from pneuopt.evaluation.sampling import Sampling, Seed, further, generator, unit_points
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -97,7 +97,7 @@ def tolerances(
     shares: Mapping[str, float] | Mapping[AxisNames, float],
     count: int | None = None,
     *,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Scenarios:
     """Tolerances on parameters, tuned ones included: every combination of least and greatest factor, or draws between.
 
@@ -109,7 +109,7 @@ def tolerances(
         value by which they vary.
     count : int, optional
         Number of uniform draws from the box, instead of its corners.
-    seed : int
+    seed : int or tuple
 
     Returns
     -------
@@ -130,7 +130,9 @@ def tolerances(
     for axis, share in shares.items():
         require(0 < share < 1, f"{axis}: a tolerance is a fraction between 0 and 1, got {share:g}; 0.01 is +-1 %")
     units = ParameterSet({n: replace(p, value=1.0, lower=0.0, upper=2.0, log=False) for n, p in parameters.items()})
-    factors = corners(units, shares) if count is None else samples(units, shares, count, seed=seed)
+    factors = (
+        corners(units, shares) if count is None else samples(units, shares, count, seed=further(seed, "tolerances"))
+    )
     return {name: {n: Factor(v) for n, v in values.items()} for name, values in factors.items()}
 
 
@@ -165,7 +167,8 @@ def samples(
         As for `corners`, drawn uniformly; or a `Distribution`, cut off at the bounds. Parameters on one axis vary
         together.
     count : int
-    seed : int or tuple of int
+    seed : int or tuple
+        Draws of another kind, or of other parameters, are independent of these for the same seed, too.
     sampling : Sampling
         How the draws fill the box.
 
@@ -189,7 +192,7 @@ def samples(
     100
     """
     require(count >= 1, f"count must be at least 1, got {count}")
-    shares = unit_points(sampling, count, len(axis_labels(parameters, spreads)), seed)
+    shares = unit_points(sampling, count, axis_labels(parameters, spreads), seed, "samples")
     return {f"sample {k}": row for k, row in enumerate(values_at(parameters, spreads, shares), 1)}
 
 
@@ -251,7 +254,8 @@ def draws(
         `IdentificationResult.covariance`: rows and columns by parameter. A parameter that is searched by its logarithm
         is drawn by it.
     count : int
-    seed : int or tuple of int
+    seed : int or tuple
+        Draws of another kind, or of other parameters, are independent of these for the same seed, too.
     dof : mapping of str to float, optional
         Degrees of freedom of a parameter's variance, ``fit.estimates["dof"]``: each parameter is then drawn by
         Student's t, as its confidence interval is, with normal scores that are correlated as the estimates are.
@@ -277,7 +281,7 @@ def draws(
     log = np.array([parameters[n].log for n in names])
     scale = np.where(log, centre, 1.0)
     mean = np.where(log, np.log(np.where(log, centre, 1.0)), centre)
-    rng, factor = np.random.default_rng(seed), _square_root(matrix / np.outer(scale, scale))
+    rng, factor = generator(seed, "draws", *names), _square_root(matrix / np.outer(scale, scale))
     freedom = np.array([dof.get(n, math.inf) for n in names])
 
     def draw() -> Array:

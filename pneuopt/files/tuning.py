@@ -20,6 +20,7 @@ from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.rest_check import NoHunting
+from pneuopt.evaluation.sampling import further
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.budget import MAX_CASES
@@ -356,21 +357,23 @@ def _read_kind(
 ) -> Scenarios:
     entries = dict(given)
     draw = read_draw({key: entries.pop(key) for key in SCENARIO_KEYS[kind].keys if key in entries}, where)
+    seed = draw.seed if new_count is None else further(draw.seed, "validation", kind)
     many = kind == "corners" and len(entries) >= MAX_CASES.bit_length()
     require(not many, f"{where}: {len(entries)} parameters have too many corners; take [scenarios.samples]")
     try:
         if kind == "samples":
             own = read_sample_spreads(entries, where, parameters)
-            count, seed = (draw.count, draw.seed) if new_count is None else (new_count, draw.seed + 1)
-            return samples(parameters, own, count, seed=seed, sampling=draw.sampling)
+            return samples(parameters, own, new_count or draw.count, seed=seed, sampling=draw.sampling)
         spreads = read_spreads(entries, where, parameters)
         if kind == "corners":
             return (
-                corners(parameters, spreads) if new_count is None else samples(parameters, spreads, new_count, seed=1)
+                corners(parameters, spreads)
+                if new_count is None
+                else samples(parameters, spreads, new_count, seed=seed)
             )
         pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
         require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
         shares = {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)}
-        return tolerances(parameters, shares, new_count)
+        return tolerances(parameters, shares, new_count, seed=seed)
     except InputError as error:
         raise error if where in str(error) else InputError(f"{where} {error}") from None

@@ -17,6 +17,7 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import HasSystem, as_runnable, check_smooth
 from pneuopt.dynamics.system import names
+from pneuopt.evaluation.sampling import further, generator
 from pneuopt.evaluation.scenarios import draws as draw_plants
 from pneuopt.identification.criteria import Criterion, DOptimal
 from pneuopt.identification.design_search import MIN_BLOCK_SAMPLES, DesignSearch, Judge, value_size
@@ -124,7 +125,7 @@ def next_experiment(
         Judge(wanted, run.free, targets, whole, worst_case=worst_case),
         round(duration / run.sample_time),
         runs,
-        np.random.default_rng(seed),
+        generator(seed, "next_experiment"),
         budget,
         seen,
     )
@@ -223,7 +224,13 @@ def _draw(
     spread = np.sqrt(np.diag(covariance.loc[known, known].to_numpy(dtype=float)))
     most = MAX_WRONG * np.array([value_size(parameters, n) for n in known])
     cut = np.minimum(1.0, most / np.maximum(spread, 1e-300))
-    return draw_plants(parameters, covariance.loc[known, known] * np.outer(cut, cut), count, seed=seed) if known else {}
+    return (
+        draw_plants(
+            parameters, covariance.loc[known, known] * np.outer(cut, cut), count, seed=further(seed, "next_experiment")
+        )
+        if known
+        else {}
+    )
 
 
 def _known_names(free: Sequence[str], covariance: "pd.DataFrame") -> list[str]:

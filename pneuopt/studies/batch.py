@@ -26,6 +26,7 @@ from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.meter import check_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, larger_is_better
+from pneuopt.evaluation.sampling import generator
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import check_names, require
@@ -267,7 +268,7 @@ def _pick_cases(table: "pd.DataFrame", columns: Sequence[str], share: float, see
     good = np.flatnonzero(table["error"] == "")
     if not len(good):
         return []
-    picked = set(np.random.default_rng(seed).choice(good, min(ceil(share * len(good)), len(good)), replace=False))
+    picked = set(generator(seed, "recertify").choice(good, min(ceil(share * len(good)), len(good)), replace=False))
     for column in columns:
         values = table[column].to_numpy(dtype=float)[good] * (-1 if larger_is_better(column.partition("[")[0]) else 1)
         picked |= {*good[np.isnan(values)][:1]}

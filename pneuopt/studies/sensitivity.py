@@ -120,7 +120,7 @@ def sensitivity(
     """
     axes = axis_labels(parameters, spreads)
     require(count >= 16 and count & (count - 1) == 0, f"count = {count}: give a power of two, 16 or more")
-    shares = unit_points(Sampling.SOBOL, count, 2 * len(axes), seed)
+    shares = unit_points(Sampling.SOBOL, count, [*axes, *(f"{n} again" for n in axes)], seed, "sensitivity")
     A, B = shares[:, : len(axes)], shares[:, len(axes) :]
     points = [A, B, *(np.column_stack([*A.T[:k], B[:, k], *A.T[k + 1 :]]) for k in range(len(axes)))]
     values = (row for block in points for row in values_at(parameters, spreads, block))

@@ -86,18 +86,20 @@ def test_a_fraction_of_nothing_is_refused() -> None:
 @pytest.mark.parametrize("sampling", Sampling)
 @pytest.mark.parametrize("count", [1, 7, 100, 1000])
 def test_points_fill_the_cube_and_repeat_with_the_seed(sampling: Sampling, count: int) -> None:
-    points = unit_points(sampling, count, 3, 5)
+    axes = ("mass", "force", "friction")
+    points = unit_points(sampling, count, axes, 5, "samples")
     assert points.shape == (count, 3)
     assert ((points >= 0) & (points < 1)).all()
-    assert (points == unit_points(sampling, count, 3, 5)).all()
-    assert (points != unit_points(sampling, count, 3, 6)).any()
+    assert (points == unit_points(sampling, count, axes, 5, "samples")).all()
+    for seed, kind in ((6, "samples"), (5, "draws")):
+        assert (points != unit_points(sampling, count, axes, seed, kind)).any()
     if count == 1000:
         assert points.mean(axis=0) == pytest.approx([0.5] * 3, abs=0.03)
         assert np.corrcoef(points.T) == pytest.approx(np.eye(3), abs=0.12)
 
 
 def test_even_samplings_leave_no_gap() -> None:
-    hypercube, sobol = (unit_points(s, 64, 4, 1) for s in (Sampling.LATIN_HYPERCUBE, Sampling.SOBOL))
+    hypercube, sobol = (unit_points(s, 64, "abcd", 1, "samples") for s in (Sampling.LATIN_HYPERCUBE, Sampling.SOBOL))
     for points in (hypercube, sobol):
         assert (np.sort((64 * points).astype(int), axis=0) == np.arange(64)[:, None]).all()
     quarters = (4 * sobol[:, :2]).astype(int)

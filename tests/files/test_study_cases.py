@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from pneuopt.evaluation.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
+from pneuopt.evaluation.monte_carlo import monte_carlo
 from pneuopt.evaluation.sampling import Sampling
 from pneuopt.evaluation.scenarios import Spread, corners, samples
 from pneuopt.files.study import read_study, swept_axes
@@ -56,7 +57,7 @@ def test_each_kind_gives_what_python_gives(file: Path) -> None:
     spreads: dict[str, Spread | Distribution] = {"load.mass": 0.1, "friction.*": (30.0, 50.0)}
     spreads["supply.pressure"] = Normal((701325.0, 2e4))
     found = {
-        "samples": (SAMPLED, samples(RIG, spreads, 8, seed=3, sampling=Sampling.SOBOL)),
+        "samples": (SAMPLED, monte_carlo(RIG, 8, spreads=spreads, seed=3, sampling=Sampling.SOBOL)),
         "corners": ('[corners]\nload.mass = "20 %"', corners(RIG, {"load.mass": 0.2})),
         "table": ('[table]\nfile = "plants.csv"', read_cases(RIG, file.parent / "plants.csv")),
     }
@@ -78,7 +79,7 @@ def test_each_kind_gives_what_python_gives(file: Path) -> None:
 def test_distributions_are_read_in_their_units(
     file: Path, given: str, distribution: Uniform | LogUniform | Normal | LogNormal
 ) -> None:
-    expected = samples(RIG, {"load.mass": distribution}, 20)
+    expected = monte_carlo(RIG, 20, spreads={"load.mass": distribution})
     assert cases(file, f'[samples]\n"load.mass" = {given}') == expected
 
 
