@@ -63,7 +63,7 @@ def _prototypes(program: ControllerProgram, name: str) -> tuple[str, str, str]:
 def _header(program: ControllerProgram, header: Header, page: Page) -> str:
     name, guard = header.name, f"{header.name.upper()}_H"
     prepare, start, step = _prototypes(program, name)
-    signals = [f" * {v.name} [{v.unit}]: {comment_text(v.meaning)}" for v in program.inputs]
+    signals = [f" * {v.name} {comment_text(f'[{v.unit}]: {v.meaning}')}" for v in program.inputs]
     last, out = program.start_inputs[-1], program.outputs[0]
     coefficients = [f"    double {a.name};" for a in page.coefficients]
     lines = [*_comment(header), f"#ifndef {guard}", f"#define {guard}", ""]
@@ -72,12 +72,12 @@ def _header(program: ControllerProgram, header: Header, page: Page) -> str:
     lines += ["    /* states: */", *_members(program.states), "    /* outputs: */", *_members(program.outputs)]
     lines += [f"}} {name};", "", f"extern const {name}_parameters {name}_tuned;", ""]
     lines += ["/* Take over parameters, at first or while it runs. */", f"{prepare};", ""]
-    lines += [f"/* Begin, or go on without a bump; {last.name} [{last.unit}]: {comment_text(last.meaning)}. */"]
+    lines += [f"/* Begin, or go on without a bump; {last.name} {comment_text(f'[{last.unit}]: {last.meaning}')}. */"]
     lines += [
         f"{start};",
         "",
         "/*",
-        f" * Compute a sample; returns {out.name} [{out.unit}]: {comment_text(out.meaning)}.",
+        f" * Compute a sample; returns {out.name} {comment_text(f'[{out.unit}]: {out.meaning}')}.",
     ]
     lines += [*signals, " */", f"{step};", "", "#endif"]
     return "\n".join(lines) + "\n"

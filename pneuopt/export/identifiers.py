@@ -213,7 +213,7 @@ class Identifiers:
     def claim_next(self, kind: str, first: int = 1) -> str:
         """The first free name of a kind and a number."""
         number = first
-        while not self._is_free(name := _numbered(kind, number)):
+        while not self._is_free(name := _with_number(kind, number)):
             number += 1
         self.take(name)
         return name
@@ -230,6 +230,6 @@ def _identifier(text: str) -> str:
     return joined[:MAX_IDENTIFIER].rstrip("_")
 
 
-def _numbered(kind: str, number: int) -> str:
+def _with_number(kind: str, number: int) -> str:
     end = f"_{number}" if kind.endswith("_") else str(number)
     return f"{kind.rstrip('_')[: MAX_IDENTIFIER - len(end)].rstrip('_')}{end}"

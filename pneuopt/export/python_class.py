@@ -36,16 +36,8 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     name = "".join(part[:1].upper() + part[1:] for part in header.name.split("_"))
     signature = ", ".join(f"{v.name}: float" for v in program.inputs)
     begin = ", ".join(f"{v.name}: float" for v in program.start_inputs[:-1])
-    lines = [
-        '"""',
-        *header.lines,
-        '"""',
-        "",
-        "import math",
-        "",
-        f"SAMPLE_TIME = {PYTHON.literal(program.sample_time)}  # s",
-        "",
-    ]
+    period = PYTHON.literal(program.sample_time)
+    lines = ['"""', *header.lines, '"""', "", "import math", "", f"SAMPLE_TIME = {period}  # s", ""]
     lines += [
         "",
         f"class {name}:",
@@ -55,7 +47,7 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     ]
     lines += ["    ----------"]
     for v in program.parameters:
-        lines += textwrap.wrap(_told(v), 110, initial_indent="    ", subsequent_indent="        ")
+        lines += textwrap.wrap(comment_text(_told(v)), 110, initial_indent="    ", subsequent_indent="        ")
     lines += ['    """', "", "    def __init__(", "        self,", "        *,"]
     lines += [f"        {v.name}: float = {PYTHON.literal(v.value)}," for v in program.parameters]
     lines += ["    ) -> None:", *(f"        self.{v.name} = {v.name}" for v in program.parameters)]
@@ -75,7 +67,7 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     lines += [
         "",
         f"    def step(self, {signature}) -> float:",
-        f'        """Compute a sample: {out.meaning} [{out.unit}]."""',
+        f'        """Compute a sample: {out.meaning} [{comment_text(out.unit)}]."""',
     ]
     lines += [f"        {a.name} = {a.text}" for a in page.locals]
     lines += [f"        self.{n} = {text}" for n, text in {**page.outputs, **page.states}.items()]

@@ -1,6 +1,6 @@
 """Plants and compensators whose names are words of languages, of the exported files, or no identifiers at all."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,8 +99,11 @@ def hostile_plant(signals: list[str], measured: str) -> System:
     )  # fmt: skip
 
 
-def hostile_run(seed: int, samples: int = SAMPLES) -> Run:
-    """A controller whose names the seed draws from `ALL_WORDS`, and its run in the library's own closed loop."""
+def hostile_run(seed: int, samples: int = SAMPLES, words: Sequence[str] = ()) -> Run:
+    """A controller whose names the seed draws from `ALL_WORDS`, and its run in the library's own closed loop.
+
+    Or six given words, each of which names a reading, a parameter and a state.
+    """
     g = np.random.default_rng(seed)
 
     def draw(count: int) -> list[str]:
@@ -109,6 +112,7 @@ def hostile_run(seed: int, samples: int = SAMPLES) -> Run:
         return [str(n) for n in (*own, *other)]
 
     signals, gains, kept = draw(7), tuple(draw(6)), tuple(draw(6))
+    signals, gains, kept = (["rate", *words], tuple(words), tuple(words)) if words else (signals, gains, kept)
     section = str(g.choice([n for n in ALL_WORDS if n not in {*FORBIDDEN, "pid", "dither", "sensor", "feedforward"}]))
     part = HostileCompensator(section, tuple(signals[1:]), gains, kept)
     pid = PID([1e-3, 5e-5][seed % 2], True, list(Form)[seed % 3], int(g.integers(2)), bool(g.integers(2)))

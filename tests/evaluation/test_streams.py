@@ -34,13 +34,13 @@ COVARIANCE = pd.DataFrame(np.diag([0.04, 0.09]), FITTED, FITTED)
 RANGES = pd.DataFrame(
     {"stderr": [np.nan] * 2, "range_low": [1.0, 2.0], "range_high": [3.0, 9.0]}, ["load.mass", "plant.gain"]
 )
-BOX = {n: "30 %" for n in NAMES}
+BOX = dict.fromkeys(NAMES, "30 %")
 Plants = Mapping[str, Mapping[str, float | Factor]]
 
 
 def in_files(kind: str, seed: int | None, sampling: Sampling | None = None) -> dict[str, object]:
     """A tuning's [scenarios.KIND]."""
-    own: dict[str, object] = {n: "1 %" for n in GAINS} if kind == "tolerances" else dict(BOX)
+    own: dict[str, object] = dict.fromkeys(GAINS, "1 %") if kind == "tolerances" else dict(BOX)
     if kind == "samples":
         own |= {"count": COUNT} | ({} if seed is None else {"seed": seed})
         own |= {} if sampling is None else {"sampling": sampling.value}
@@ -137,7 +137,7 @@ def test_a_seed_gives_the_same_plants_and_another_others(draw: Callable[[Seed], 
 
 
 def test_an_axis_more_leaves_the_numbers_of_the_others() -> None:
-    one, two = (samples(RIG, {n: 0.3 for n in names}, 5) for names in (NAMES[:1], NAMES[:2]))
+    one, two = (samples(RIG, dict.fromkeys(names, 0.3), 5) for names in (NAMES[:1], NAMES[:2]))
     assert [v["load.mass"] for v in one.values()] == [v["load.mass"] for v in two.values()]
 
 

@@ -22,7 +22,7 @@ from pneuopt.quantities.errors import InputError
 from problems.demo.export_controllers import files_of
 from problems.demo.exported_names import Counts, check_code, check_text
 from problems.shared.exported_words import LITERAL, wrong_literals, wrong_names
-from problems.shared.hostile_names import hostile_run
+from problems.shared.hostile_names import FORBIDDEN, OWN_WORDS, hostile_run
 from problems.shared.random_controllers import run_library
 
 SOME = 10  # seeds that a fast run looks at; the script takes hundreds
@@ -46,6 +46,21 @@ def test_a_plant_of_hostile_names_is_exported_as_the_loop_is(seed: int) -> None:
     check_text(run, text["pid_x.st"], counts)
     assert (counts.names, counts.literals, counts.not_compiled) == (0, 0, 0)
     assert max(counts.differences.values()) <= 1e-12
+
+
+ODD = ["(*", "*)", "*/", "//", 'q"""', "a\nb", "$n", "??/", "x;y", "\\", "0.5", "é"]
+WORDS = [n for n in dict.fromkeys([*OWN_WORDS, *ODD]) if n not in FORBIDDEN]
+
+
+@needs_gcc
+@pytest.mark.parametrize("words", [WORDS[k : k + 6] for k in range(0, len(WORDS), 6)], ids=" ".join)
+def test_a_word_names_a_reading_a_parameter_and_a_state_at_once(words: list[str]) -> None:
+    run, counts = hostile_run(3, 50, words), Counts()
+    c, python, text = files_of(run)
+    check_code(run, c, python, counts)
+    assert counts.not_compiled == 0
+    assert max(counts.differences.values()) <= 1e-12
+    assert wrong_names(text["pid_x.st"]) == []
 
 
 @pytest.mark.parametrize(

@@ -81,3 +81,17 @@ def test_the_gains_stand_there_in_every_form() -> None:
     assert "parallel: Kp = 2 V*s/m, Ki = 4 V/m, Kd = 0.1 V*s^2/m, Tf = 0.005 s" in text
     assert "standard: Kp = 2 V*s/m, Ti = 0.5 s, Td = 0.05 s, N = 10" in text
     assert "series: K = " in text
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_a_header_says_that_the_design_counts_on_a_delay(delay: int) -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, delay=delay, limits=False))
+    for kind in Language:
+        first = next(iter(export_controller(loop, loop.parameters, kind).values()))
+        assert ("The design counts on one sample from reading to acting." in first) == bool(delay)
+
+
+@pytest.mark.parametrize("kind", Language)
+def test_files_are_ascii_whatever_their_origin_says(kind: Language) -> None:
+    files = export_controller(LOOP, LOOP.parameters, kind, origin=["Größe µ, 図"])
+    assert all(text.isascii() for text in files.values())

@@ -7,7 +7,7 @@ import pytest
 from pneuopt.evaluation.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
 from pneuopt.evaluation.monte_carlo import monte_carlo
 from pneuopt.evaluation.sampling import Sampling
-from pneuopt.evaluation.scenarios import Spread, corners, samples
+from pneuopt.evaluation.scenarios import Spread, corners
 from pneuopt.files.study import read_study, swept_axes
 from pneuopt.files.study_cases import CASE_KEYS, Cases, read_study_cases
 from pneuopt.quantities.errors import InputError
