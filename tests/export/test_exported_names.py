@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import shutil
 
 import numpy as np
@@ -12,7 +13,8 @@ from pneuopt.control.pid import PID
 from pneuopt.export.c99 import C99
 from pneuopt.export.expression_writer import Syntax
 from pneuopt.export.header import make_header
-from pneuopt.export.javascript import JAVASCRIPT
+from pneuopt.export.identifiers import RESERVED
+from pneuopt.export.javascript import JAVASCRIPT, write_loop_javascript
 from pneuopt.export.program import controller_program
 from pneuopt.export.python_class import PYTHON
 from pneuopt.export.structured_text import STRUCTURED_TEXT, write_structured_text
@@ -24,6 +26,7 @@ from problems.demo.exported_names import Counts, check_code, check_text
 from problems.shared.exported_words import LITERAL, wrong_literals, wrong_names
 from problems.shared.hostile_names import FORBIDDEN, OWN_WORDS, hostile_run
 from problems.shared.random_controllers import run_library
+from problems.shared.structured_text_run import FunctionBlock
 
 SOME = 10  # seeds that a fast run looks at; the script takes hundreds
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None or os.name == "nt", reason="no C compiler on the path")
@@ -138,3 +141,34 @@ def test_names_are_alike_in_every_language() -> None:
     for v in (*program.parameters, *program.inputs, *program.states, *program.outputs):
         assert all(v.name in files[f"controller.{end}"] for end in ("h", "st", "py"))
     assert {"pid.integral": "pid_integral"}.items() <= {v.origin: v.name for v in program.states}.items()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_pages_script_has_no_reserved_or_doubled_name(seed: int) -> None:
+    script = write_loop_javascript(hostile_run(seed, samples=1).loop)
+    head, _, body = script.partition("function makeLoop(p) {")
+    assert head.isascii()
+    body = body.partition("\n}\n")[0]
+    outside = re.findall(r"^  const (\S+) =", body, re.M)
+    for text in re.split(r"^    (?=rates|update)", body, flags=re.M):
+        names = [*outside, *re.findall(r"^      const (\S+) =", text, re.M)]
+        assert len(set(names)) == len(names)
+        assert not RESERVED["a word of JavaScript"] & {n.casefold() for n in names}
+        assert not {"t", "x", "u", "p", "dx", "y", "after", "LOOP", "makeLoop"} & set(names)
+
+
+def test_restart_begins_a_block_anew() -> None:
+    program = controller_program(LOOP, LOOP.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 30.0}))
+    header = make_header("axis", LOOP, LOOP.parameters, 0.0, [])
+    text = write_structured_text(program, header)["axis.st"]
+    block, fresh = FunctionBlock(text), FunctionBlock(text)
+    rows = np.random.default_rng(0).normal(size=(20, 2)).tolist()
+    for setpoint, measured in rows:
+        block.call(setpoint=setpoint, measured=measured, restart=False)
+    before = block.call(setpoint=1.0, measured=0.0, restart=False)["output"]
+    again = block.call(setpoint=1.0, measured=0.0, restart=True, start_output=0.25)["output"]
+    assert again == fresh.call(setpoint=1.0, measured=0.0, start_output=0.25)["output"]
+    assert again != before
+    for setpoint, measured in rows:
+        own = {"setpoint": setpoint, "measured": measured, "restart": False}
+        assert block.call(**own)["output"] == fresh.call(**own)["output"]
