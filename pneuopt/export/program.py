@@ -326,7 +326,7 @@ def _more_inputs(loop: ClosedLoop, names: Mapping[str, str]) -> tuple[Variable, 
         Variable(_rate_name(q.name), q.unit, f"the {q.name.partition('_')[2]} of the setpoint")
         for q in loop.motion_inputs
     )
-    shown = (n.replace("_", " ") for n in loop.readings)
+    shown = (n.replace("_", " ") if names[n] == n else n for n in loop.readings)  # a renamed one is told as it is
     read = zip(loop.readings, shown, strict=True)
     return (*rates, *(Variable(names[n], units[n], f"{told}, as its sensor shows it") for n, told in read))
 
