@@ -118,7 +118,7 @@ def hostile_run(seed: int, samples: int = SAMPLES, words: Sequence[str] = ()) ->
     pid = PID([1e-3, 5e-5][seed % 2], True, list(Form)[seed % 3], int(g.integers(2)), bool(g.integers(2)))
     dither, lead = (Dither(frequency=150.0) if g.integers(2) else None), (Feedforward() if g.integers(2) else None)
     plant = hostile_plant(signals[1:], signals[0])
-    loop = ClosedLoop(plant, pid, dither, measured=signals[0], feedforward=lead, compensators=(part,))
+    loop = ClosedLoop(plant, pid, dither, measured=signals[0], feedforward=lead, compensators=(part,))  # type: ignore[arg-type]  # names are its own
     values = {
         n: g.uniform(*RANGES[n.split(".")[1]]) for n in loop.parameters if n.startswith("pid.") and n[4:] in RANGES
     }
