@@ -2,6 +2,7 @@
 
 import ast
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -57,7 +58,7 @@ def drawn(seed: int | None) -> Iterator[tuple[str, Plants]]:
         given = in_files("samples", seed, way)
         yield f"validation samples {way.value}", read_validation_scenarios(given, "t", RIG)
     yield "tolerances", tolerances(RIG, dict.fromkeys(GAINS, 0.01), COUNT, **own)
-    yield "draws", draws(RIG, COVARIANCE, COUNT, **own)
+    yield "draws", draws(RIG, COVARIANCE, COUNT, **own)  # type: ignore[arg-type]
     yield "fit", monte_carlo(RIG, COUNT, covariance=COVARIANCE, estimates=RANGES, **own)  # type: ignore[arg-type]
     yield "expected of a fit", expected_plants(RIG, COVARIANCE, estimates=RANGES, **own).scenarios  # type: ignore[arg-type]
     yield "validation corners", read_validation_scenarios(in_files("corners", seed), "t", RIG)
@@ -82,7 +83,7 @@ def correlations(columns: Mapping[str, Array]) -> pd.Series:
 def bound(pairs: int) -> float:
     """The correlation that the largest of some pairs of independent columns passes with a chance of `FALSE_ALARM`."""
     t = float(student.ppf(1 - FALSE_ALARM / pairs / 2, COUNT - 2))
-    return t / np.sqrt(COUNT - 2 + t**2)
+    return t / math.sqrt(COUNT - 2 + t**2)
 
 
 @pytest.mark.parametrize("seed", [None, 0, 1, 2])
@@ -165,11 +166,8 @@ def test_whoever_draws_by_a_users_seed_names_the_stream() -> None:
     found = set()
     for path in root.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            called = isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
-            if (
-                called
-                and node.func.attr in ("default_rng", "SeedSequence")
-                and not isinstance(node.args[0], ast.Constant)
-            ):
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+                continue
+            if node.func.attr in ("default_rng", "SeedSequence") and not isinstance(node.args[0], ast.Constant):
                 found.add(path.relative_to(root).as_posix())
     assert found == set(OTHER_GENERATORS)
