@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pneuopt.export.identifiers import MAX_IDENTIFIER, reserved_as
 
 _USED = """
-    function_block end_function_block var_input var_output var constant end_var bool lreal if then end_if or and not
+    function_block end_function_block var_input var_output var constant end_var bool int dint lreal if then
+    elsif else end_if or and not
     true false sel min max abs exp ln sin cos sqrt lreal_to_lint lint_to_lreal
 """
 USED_WORDS = frozenset(_USED.split())
@@ -28,7 +29,7 @@ def declared_names(source: str) -> list[str]:
     code = code_of(source)
     return [
         *re.findall(r"FUNCTION_BLOCK\s+(\S+)", code)[:1],
-        *re.findall(r"^\s*(\S+)\s*:\s*(?:LREAL|BOOL)\b", code, re.M),
+        *re.findall(r"^\s*(\S+)\s*:\s*(?:LREAL|BOOL|INT|DINT)\b", code, re.M),
     ]
 
 
