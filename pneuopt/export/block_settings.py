@@ -20,6 +20,7 @@ from pneuopt.quantities.parameters import ParameterSet
 COMPARED_METRICS = {"SettlingTime": "s", "Overshoot": "%", "SteadyStateError": "%"}
 """What the two are compared by, and its unit."""
 SHEET_WIDTH = 116  # [character] of the sheet's sentences
+BLIND_LIMITS = "its limits, and its integral with them, do not see the sum with what is added behind it"
 MECHANICAL_UNITS = {"N": "newtons", "N*m": "newton metres"}
 """Units of a command that no output module has: the amplifier's scale lies between."""
 
@@ -115,6 +116,8 @@ def run_as_block(
     clamps = form.clamps and loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
     kind = AntiWindup.CLAMPING if clamps else loop.pid.anti_windup
     found += ["its integral is clamped at a limit, the design's unwinds by back-calculation"] * (clamps and integrates)
+    behind = integrates and form.added is None and design_of(acting, parameters, 0.0).is_added_to
+    found += [f"{BLIND_LIMITS} (simulated as if they saw it)"] if behind and loop.pid.limits else []
     found += ["it has no dead band of the integral"] if acting.pid.dead_band else []
     found += ["it has no reset of the integral"] if loop.pid.reset else []
     pid = replace(loop.pid, form=Form.PARALLEL, anti_windup=kind, dead_band=False, reset=False)
@@ -182,8 +185,8 @@ def _rest_words(d: Design, form: BlockForm) -> Iterator[str]:
 
 
 def _wrap(lines: Iterable[str]) -> list[str]:
-    indents = {"initial_indent": "  ", "subsequent_indent": "     "}
-    return [part for line in lines for part in textwrap.wrap(line, SHEET_WIDTH, break_on_hyphens=False, **indents)]
+    fill = textwrap.TextWrapper(SHEET_WIDTH, "  ", "     ", break_on_hyphens=False)
+    return [part for line in lines for part in fill.wrap(line)]
 
 
 def _rows(settings: list[Setting]) -> list[str]:

@@ -97,7 +97,9 @@ def find_surroundings(
     if outer is not None:
         low, high = outer.low, outer.high
     inner = replace(design_of(loop, parameters, centre), pv_low=low, pv_high=high)
-    _check_parts(loop, value, form, inner)
+    if outer is None:
+        inner = replace(inner, start=references[0].origin)
+    _check_parts(loop, value, form)
     rest_is_inside = inner.low <= inner.centre <= inner.high
     told = f"the valve's centre, {write_value(centre, inner.command_unit)}, lies beyond the limits of the output"
     require(rest_is_inside, f"{told}: no setting of {form.maker} rests there; mend the limits under [pid]")
@@ -177,16 +179,12 @@ def _outer_design(
     return replace(found, goes="to the inner block", zero="no speed")
 
 
-def _check_parts(loop: ClosedLoop, value: Mapping[str, float], form: BlockForm, inner: Design) -> None:
+def _check_parts(loop: ClosedLoop, value: Mapping[str, float], form: BlockForm) -> None:
     missing = list(_missing_parts(loop, value))
     block = form.title.partition(" (")[0].partition(",")[0]
     told = f"{block} cannot hold this design: {'; '.join(missing)}. No standard block of {form.maker} stands for that"
     remedy = "use --to st, which writes the whole controller"
     require(not missing, f"{told}; {remedy}")
-    winds = inner.integrates and loop.pid.limits and math.isfinite(inner.span)
-    told = f"{block} has no input that is added before its limits, and this design adds a feedforward or a dither there"
-    why = "its integral would not know of the limits of the sum"
-    require(not (inner.is_added_to and form.added is None and winds), f"{told}: {why}; {remedy}")
 
 
 def _missing_parts(loop: ClosedLoop, value: Mapping[str, float]) -> Iterator[str]:
@@ -291,8 +289,10 @@ def _limit_words(d: Design, form: BlockForm) -> str:
     if not (math.isfinite(d.low) or math.isfinite(d.high)):
         return "the design has none; the output stage has its own"
     ends = [write_value(v, d.command_unit) if math.isfinite(v) else "none" for v in (d.low, d.high)]
-    where = "behind that sum, in your program" if d.is_added_to and form.added is None else "in the block"
-    return f"{ends[0]} to {ends[1]} on the wire, {where}"
+    if not d.is_added_to or form.added is not None:
+        return f"{ends[0]} to {ends[1]} on the wire, in the block"
+    own = "; the block has the same, for its integral" if d.integrates else ""
+    return f"{ends[0]} to {ends[1]} on the wire, behind that sum, in your program{own}"
 
 
 def _hardware_lines(loop: ClosedLoop, value: Mapping[str, float]) -> Iterator[str]:

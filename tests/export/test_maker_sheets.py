@@ -186,7 +186,7 @@ def test_a_cascade_is_two_blocks_that_answer_as_one_design(block: Block, Ki: flo
     assert re.search(r"Outer block: P of the position; its output \+ 1 x speed of the setpoint", text)
 
 
-SURROUNDINGS = {
+SURROUNDINGS: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
     "the speed from an encoder": ({"sensor": Encoder(1e-5)}, {}),
     "gain schedule of pid.Kp": ({"schedule": GainSchedule(("pid.Kp",), -0.1, 0.1)}, {"schedule.Kp_curve": 0.3}),
     "set-point lead": ({"feedforward": Feedforward()}, {"feedforward.gain": 3.0}),
@@ -221,12 +221,13 @@ def test_a_part_without_a_counterpart_is_refused_by_name_and_at_zero_left_out(to
 @pytest.mark.parametrize("block", Block)
 def test_constant_gains_and_a_dither_go_into_the_input_that_a_block_has(block: Block) -> None:
     """Before its limits; a block without one takes them only where no integral has to know of the limits."""
-    parts = {"dither": Dither(50.0), "compensators": (MotionFeedforward(),)}
+    parts: dict[str, Any] = {"dither": Dither(50.0), "compensators": (MotionFeedforward(),)}
     values = {"dither.amplitude": 2.0, "dither.offset": 0.5, "motion_feedforward.acceleration": 3.0}
     loop, given = force_loop({**FULL, **values}, **parts)
     has_input = block in (Block.SIEMENS, Block.ROCKWELL, Block.CODESYS)
     plain = given.with_values({"pid.Ki": 0.0})
-    text = sheet(loop, given if has_input else plain, block)
+    text = sheet(loop, given, block)
+    assert ("its limits, and its integral with them, do not see the sum" in text) == (not has_input)
     assert "Sum: 3 N*s^2/m x acceleration of the setpoint + 0.5 N + 2 N x sin(2 pi frac(0.1 k))" in " ".join(
         text.split()
     )
@@ -237,11 +238,11 @@ def test_constant_gains_and_a_dither_go_into_the_input_that_a_block_has(block: B
     where |= {Block.CODESYS: "Y_OFFSET = 0 N + sum"}
     assert where.get(block, "a sum behind the block, before the limits") in " ".join(text.split())
     if not has_input:
-        with pytest.raises(InputError, match=r"no input that is added before its limits.*its integral.*--to st"):
-            sheet(loop, given, block)
-        (own,) = emulations(block.value, text, H)
+        (integrating,), (own,) = (emulations(block.value, t, H) for t in (text, sheet(loop, plain, block)))
+        integrating.start(0.0, 0.0)
         own.start(0.0, 0.0)
-        assert own.step(0.6, 0.0) > 40.0  # the limit stands behind the sum
+        assert integrating.step(0.6, 0.0) == 40.0
+        assert own.step(0.6, 0.0) > 40.0  # the one limit stands behind the sum
 
 
 def test_a_generator_behind_the_output_and_hardware_are_listed() -> None:
@@ -278,6 +279,17 @@ def test_the_first_lines_are_the_verdict_and_a_force_is_said_to_be_one() -> None
     valve = ClosedLoop(position_drive(), PID(H), measured="speed")
     limited = valve.parameters.with_values({"pid.lower": -5.0, "pid.upper": 5.0})
     assert "NEWTONS" not in sheet(valve, limited, Block.SIEMENS, 5.0)
+
+
+@pytest.mark.parametrize("block", Block)
+def test_a_start_at_rest_away_from_zero_begins_at_the_centre(block: Block) -> None:
+    """With set-point weights that are not 1, which the integral makes up for."""
+    loop, given = force_loop({**FULL, "pid.Tf": 0.0, "pid.b": 0.8, "pid.c": 0.0})
+    own, values, _ = run_as_block(loop, given, block)
+    text = sheet(own, values, block, 5.0, references=Step(0.01, initial=0.05, horizon=0.02))
+    for one in emulations(block.value, text, H):
+        one.start(0.05, 0.05)
+        assert [one.step(0.05, 0.05) for _ in range(3)] == pytest.approx([5.0] * 3)
 
 
 @pytest.mark.parametrize("block", Block)

@@ -35,9 +35,9 @@ def _settings(d: Design) -> list[Setting]:
     shown = write_value(Ti, "s") if math.isfinite(Ti) else ""
     told = f"{FB_CTRL_PID} counts its times in whole milliseconds, and Ti = {shown} would be 0: no integral at all"
     require(math.isinf(Ti) or round(abs(Ti) / TIME_GRAIN) > 0, f"{told}; use --to st")
-    low, high = (-OPEN_LIMIT, OPEN_LIMIT) if d.is_added_to else d.limits
+    low, high = (-OPEN_LIMIT, OPEN_LIMIT) if d.is_open else d.limits
     off = "T#0ms switches the integral off"
-    behind = "open: the sum behind the block is limited" if d.is_added_to else f"about {d.zero}"
+    behind = "open: the sum behind the block is limited" if d.is_open else f"about {d.zero}"
     return [
         Setting("fKp", number(d.gains.Kp), f"Kp [{d.command_unit} per {d.measured_unit}], with its sign"),
         Setting("tTn", _time(Ti), "Kp/Ki" if math.isfinite(Ti) else off),

@@ -33,6 +33,8 @@ class Design:
     measured, measured_unit, command_unit : str
     pv_low, pv_high : float
         The range of the process value that the block counts on [the measured unit].
+    start : float
+        The process value where the references begin [the measured unit].
     is_added_to : bool
         Whether a feedforward or a dither is added to what the block computes, before the limits.
     goes : str
@@ -54,6 +56,7 @@ class Design:
     command_unit: str
     pv_low: float = -0.5
     pv_high: float = 0.5
+    start: float = 0.0
     is_added_to: bool = False
     goes: str = "on the wire"
     zero: str = "the centre"
@@ -82,6 +85,11 @@ class Design:
     def integrates(self) -> bool:
         """Whether there is an integral at all."""
         return self.gains.Ki != 0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a block that is added to behind its limits leaves them open: without an integral none needs them."""
+        return self.is_added_to and not self.integrates
 
     @property
     def differentiates(self) -> bool:

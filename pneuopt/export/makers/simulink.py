@@ -8,6 +8,7 @@ from pneuopt.export.makers.block_form import BEHIND_FACTOR, BEHIND_OFFSET, Block
 def _settings(d: Design) -> list[Setting]:
     Tf, (low, high) = d.gains.Tf, d.limits
     kind = {(True, True): "PID", (True, False): "PI"}.get((d.integrates, d.differentiates), "PD")
+    begin = f"where it starts at rest, here y0 = {number(d.start)} {d.measured_unit}"
     filtered = Setting("N", number(1 / Tf) if Tf else "100", "1/Tf, a pole [rad/s], not ISA's ratio")
     derivative = [
         Setting("D", number(d.gains.Kd), "Kd"),
@@ -15,7 +16,7 @@ def _settings(d: Design) -> list[Setting]:
         *([filtered] if Tf else []),
         Setting("c", number(d.c), "c"),
         Setting("Filter method", "Backward Euler", "as the design is sampled"),
-        Setting("Filter initial condition", "0", "D (c r - y) at the start; 0 where it starts at r = y = 0"),
+        Setting("Filter initial condition", number(d.gains.Kd * (d.c - 1) * d.start), f"D (c - 1) y0, {begin}"),
     ]
     return [
         Setting("Controller", kind, "PD with D = 0 is P alone: the block has no P" if kind == "PD" else "its terms"),
@@ -26,7 +27,7 @@ def _settings(d: Design) -> list[Setting]:
         *([Setting("I", number(d.gains.Ki), "Ki")] if d.integrates else []),
         Setting("b", number(d.b), "b"),
         *(derivative if kind != "PI" else []),
-        *(_integral_settings() if d.integrates else []),
+        *(_integral_settings(d, begin) if d.integrates else []),
         *_limit_settings(low, high, d),
         Setting(
             BEHIND_OFFSET,
@@ -37,17 +38,17 @@ def _settings(d: Design) -> list[Setting]:
     ]
 
 
-def _integral_settings() -> list[Setting]:
+def _integral_settings(d: Design, begin: str) -> list[Setting]:
     return [
         Setting("Integrator method", "Backward Euler", "as the design is sampled"),
-        Setting("Integrator initial condition", "0", "Kp (1 - b) y0 where it starts at rest at y0"),
+        Setting("Integrator initial condition", number(d.gains.Kp * (1 - d.b) * d.start), f"P (1 - b) y0, {begin}"),
     ]
 
 
 def _limit_settings(low: float, high: float, d: Design) -> list[Setting]:
     back = math.isfinite(d.Tt)
     inside = math.isfinite(low) or math.isfinite(high)
-    if d.is_added_to or not inside:
+    if d.is_open or not inside:
         return [Setting("Limit output", "off", "the sum behind is limited" if inside else "the design has no limits")]
     windup = [
         Setting("Anti-windup method", "back-calculation" if back else "clamping", "as the design has it"),
