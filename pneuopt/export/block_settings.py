@@ -153,8 +153,8 @@ def _verdict(loop: ClosedLoop, parameters: ParameterSet, block: Block) -> str:
     """How near the block is to the design, in a line."""
     form, found = BLOCK_FORMS[block], run_as_block(loop, parameters, block)[2]
     if found:
-        points = "one point" if len(found) == 1 else f"{len(found)} points"
-        return f"The block differs from the design in {points}, at the end of this sheet, with what that costs."
+        points = "one point; it stands" if len(found) == 1 else f"{len(found)} points; they stand"
+        return f"The block differs from the design in {points} at the end of this sheet, with its figures."
     back = loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
     late = block is Block.SIMULINK and back and loop.parallel_form(parameters).Ki != 0
     but = ", but for one sample: at a limit its back-calculation acts a sample later" if late else ""

@@ -281,8 +281,8 @@ def _added_lines(loop: ClosedLoop, value: Mapping[str, float], form: BlockForm, 
             terms.append(f"{write_value(value['dither.amplitude'], unit, 9)} x {wave}, k the number of the sample")
     if terms:
         where = form.added(inner) if form.added else "a sum behind the block, before the limits"
-        yield f"Sum: {' + '.join(terms)}; in your program, once a sample."
-        yield f"Sum into the block: {where}."
+        yield f"Sum: {' + '.join(terms)}; in your program once a sample, 0 while the block is not in automatic."
+        yield f"Where it goes: {where}."
 
 
 def _limit_words(d: Design, form: BlockForm) -> str:

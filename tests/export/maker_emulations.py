@@ -60,8 +60,9 @@ class Siemens:
     def step(self, setpoint: float, measured: float, added: float = 0.0) -> float:
         assert self.rows["Config.InputPerOn"] == "FALSE"
         assert self["CycleTime.Value"] == self["Retain.CtrlParams.Cycle"]
-        if not self["Config.InputLowerLimit"] <= measured <= self["Config.InputUpperLimit"]:
-            return self.error_output
+        in_range = self["Config.InputLowerLimit"] <= measured <= self["Config.InputUpperLimit"]
+        if not in_range and self.rows["ActivateRecoverMode"] == "FALSE":
+            return self.wire(0.0)  # the recover mode would stay in automatic
         w = _clip(setpoint, self["Config.SetpointLowerLimit"], self["Config.SetpointUpperLimit"])
         Ti, Td, a = (self[f"Retain.CtrlParams.{n}"] for n in ("Ti", "Td", "TdFiltRatio"))
         h, gain, e = self["Retain.CtrlParams.Cycle"], self._gain(), w - measured
@@ -78,15 +79,9 @@ class Siemens:
         return self["Behind the block: offset"] + self["Behind the block: factor"] * percent
 
     @property
-    def error_output(self) -> float:
-        """Of an error: Inactive gives 0 %, the recover mode the substitute output."""
-        substitute = self.rows["ActivateRecoverMode"] == "TRUE"
-        return self.wire(self["SubstituteOutput"] if substitute else 0.0)
-
-    @property
     def stopped(self) -> list[float]:
-        assert self.rows["SetSubstituteOutput"] == "TRUE"
-        return [self.wire(0.0), self.error_output, self.wire(self["SubstituteOutput"])]
+        assert (self.rows["SetSubstituteOutput"], self.rows["RunModeByStartup"]) == ("TRUE", "FALSE")
+        return [self.wire(0.0), self.wire(self["SubstituteOutput"])]
 
 
 @dataclass
@@ -286,7 +281,7 @@ class Simulink:
         if "I" in self.rows["Controller"]:
             self.integral = self["Integrator initial condition"]
         if "D" in self.rows["Controller"]:
-            self.filter = self["Filter initial condition"]
+            self.filter = self["Filter initial condition"] if "N" in self.rows else 0.0
             self.before = self["c"] * setpoint - measured
 
     def step(self, setpoint: float, measured: float, added: float = 0.0) -> float:

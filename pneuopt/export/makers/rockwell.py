@@ -121,8 +121,9 @@ def _states(d: Design) -> list[str]:
             "PIDE, at a fault of the sensor: wire the fault bit of your input to PVFault; it goes to manual, CVProg.",
         ]
     else:
-        why = "without an integral its velocity form does not come back to the centre once a limit has cut it off"
-        lines += [f"PIDE is not for this design: {why}." if not d.integrates else "PIDE: its FF adds changes only."]
+        alone = "without an integral its velocity form does not come back to the centre once a limit has cut it off"
+        why = "its FF adds changes alone, of which a limit cuts off some" if d.integrates else alone
+        lines += [f"PIDE is not for this design: {why}."]
     return [
         *lines,
         f"While the controller stops or is at fault: what the output module is set to; it must be {wire(d.centre, d)}.",

@@ -9,14 +9,20 @@ def _settings(d: Design) -> list[Setting]:
     Tf, (low, high) = d.gains.Tf, d.limits
     kind = {(True, True): "PID", (True, False): "PI"}.get((d.integrates, d.differentiates), "PD")
     begin = f"where it starts at rest, here y0 = {number(d.start)} {d.measured_unit}"
-    filtered = Setting("N", number(1 / Tf) if Tf else "100", "1/Tf, a pole [rad/s], not ISA's ratio")
     derivative = [
         Setting("D", number(d.gains.Kd), "Kd"),
-        Setting("Use filtered derivative", "on" if Tf else "off", "Tf = 0: no filter" if not Tf else "as the design"),
-        *([filtered] if Tf else []),
         Setting("c", number(d.c), "c"),
-        Setting("Filter method", "Backward Euler", "as the design is sampled"),
-        Setting("Filter initial condition", number(d.gains.Kd * (d.c - 1) * d.start), f"D (c - 1) y0, {begin}"),
+        *(
+            _filter_settings(d, begin)
+            if Tf
+            else [
+                Setting(
+                    "Use filtered derivative",
+                    "off",
+                    "Tf = 0: no filter; its first sample is a kick where c r - y is not 0",
+                )
+            ]
+        ),
     ]
     return [
         Setting("Controller", kind, "PD with D = 0 is P alone: the block has no P" if kind == "PD" else "its terms"),
@@ -35,6 +41,15 @@ def _settings(d: Design) -> list[Setting]:
             f"{d.command_unit}: a Bias block behind the output and its limits" if d.centre else f"{d.command_unit}",
         ),
         Setting(BEHIND_FACTOR, "1", f"{d.command_unit} {d.goes} for 1 {d.command_unit} of the output"),
+    ]
+
+
+def _filter_settings(d: Design, begin: str) -> list[Setting]:
+    return [
+        Setting("Use filtered derivative", "on", "as the design"),
+        Setting("N", number(1 / d.gains.Tf), "1/Tf, a pole [rad/s], not ISA's ratio"),
+        Setting("Filter method", "Backward Euler", "as the design is sampled"),
+        Setting("Filter initial condition", number(d.gains.Kd * (d.c - 1) * d.start), f"D (c - 1) y0, {begin}"),
     ]
 
 
