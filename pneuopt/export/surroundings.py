@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from pneuopt.control.dither import Waveform
 from pneuopt.control.forms import ParallelForm
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.motion_feedforward import MotionFeedforward
@@ -18,6 +19,7 @@ from pneuopt.control.sensor import REFERENCE_SPEED, Encoder, SensorLag
 from pneuopt.export.makers.block_form import BlockForm, Design, number
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import write_value
 
 RANGE_MARGIN = 1.0  # travels of the references that the process value's range goes beyond them, at either end
@@ -145,7 +147,7 @@ def _process_range(references: Sequence[Reference], span: float | None, unit: st
     if span is None:
         travel = (high - low or max(abs(high), *(abs(r.nominal_size) for r in references)) or 1.0) * RANGE_MARGIN
         return low - travel, high + travel
-    told = f"the process value's span of {write_value(span, unit)} does not hold the references, from"
+    told = f"the process value's span of {write_value(span, difference_unit(unit))} does not hold the references, from"
     ends = f"{write_value(low, unit)} to {write_value(high, unit)}"
     require(span >= high - low, f"{told} {ends}; state a larger one")
     for ends_of_range in ((-span / 2, span / 2), (0.0, span), (-span, 0.0)):
@@ -258,31 +260,36 @@ def _block_words(d: Design) -> str:
 
 
 def _added_lines(loop: ClosedLoop, value: Mapping[str, float], form: BlockForm, inner: Design) -> Iterator[str]:
-    terms = []
-    for part in loop.compensators:
-        if isinstance(part, MotionFeedforward):
-            given = (n for n in ("speed", "acceleration") if value[f"{part.section}.{n}"])
-            terms += [
-                f"{write_value(value[f'{part.section}.{n}'], loop.parameters[f'{part.section}.{n}'].unit, 9)} "
-                f"x {n} of the setpoint"
-                for n in given
-            ]
-    if loop.dither is not None:
-        unit = loop.command.unit
-        if value["dither.offset"]:
-            terms.append(write_value(value["dither.offset"], unit, 9))
-        if not loop.dither.analogue and value["dither.amplitude"]:
-            turns = f"{number(value['dither.frequency'] * inner.sample_time)} k"
-            wave = (
-                f"sin(2 pi frac({turns}))"
-                if loop.dither.waveform.value == "sine"
-                else (f"(1 - 4 abs(frac({turns} + 0.25) - 0.5))")
-            )
-            terms.append(f"{write_value(value['dither.amplitude'], unit, 9)} x {wave}, k the number of the sample")
+    terms = [*_motion_terms(loop, value), *_dither_terms(loop, value, inner.sample_time)]
     if terms:
         where = form.added(inner) if form.added else "a sum behind the block, before the limits"
         yield f"Sum: {' + '.join(terms)}; in your program once a sample, 0 while the block is not in automatic."
         yield f"Where it goes: {where}."
+
+
+def _motion_terms(loop: ClosedLoop, value: Mapping[str, float]) -> Iterator[str]:
+    is_speed = REFERENCE_SPEED not in (q.name for q in loop.inputs)  # a loop of the speed: the setpoint is one
+    factors = {
+        "speed": "setpoint" if is_speed else "speed of the setpoint",
+        "acceleration": "acceleration of the setpoint",
+    }
+    for part in loop.compensators:
+        for name, factor in factors.items() if isinstance(part, MotionFeedforward) else ():
+            gain = f"{part.section}.{name}"
+            if value[gain]:
+                yield f"{write_value(value[gain], loop.parameters[gain].unit, 9)} x {factor}"
+
+
+def _dither_terms(loop: ClosedLoop, value: Mapping[str, float], sample_time: float) -> Iterator[str]:
+    if loop.dither is None:
+        return
+    unit, turns = loop.command.unit, f"{number(value['dither.frequency'] * sample_time)} k"
+    is_sine = loop.dither.waveform is Waveform.SINE
+    wave = f"sin(2 pi frac({turns}))" if is_sine else f"(1 - 4 abs(frac({turns} + 0.25) - 0.5))"
+    if value["dither.offset"]:
+        yield write_value(value["dither.offset"], unit, 9)
+    if not loop.dither.analogue and value["dither.amplitude"]:
+        yield f"{write_value(value['dither.amplitude'], unit, 9)} x {wave}, k the number of the sample"
 
 
 def _limit_words(d: Design, form: BlockForm) -> str:

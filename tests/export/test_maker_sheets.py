@@ -220,16 +220,18 @@ def test_a_part_without_a_counterpart_is_refused_by_name_and_at_zero_left_out(to
 
 @pytest.mark.parametrize("block", Block)
 def test_constant_gains_and_a_dither_go_into_the_input_that_a_block_has(block: Block) -> None:
-    """Before its limits; a block without one takes them only where no integral has to know of the limits."""
+    """Before its limits; of a block without one behind it, and what its limits then do not see is said."""
     parts: dict[str, Any] = {"dither": Dither(50.0), "compensators": (MotionFeedforward(),)}
-    values = {"dither.amplitude": 2.0, "dither.offset": 0.5, "motion_feedforward.acceleration": 3.0}
+    values = {"dither.amplitude": 2.0, "dither.offset": 0.5, "motion_feedforward.speed": 7.0}
+    values["motion_feedforward.acceleration"] = 3.0
     loop, given = force_loop({**FULL, **values}, **parts)
     has_input = block in (Block.SIEMENS, Block.ROCKWELL, Block.CODESYS)
     plain = given.with_values({"pid.Ki": 0.0})
     text = sheet(loop, given, block)
     assert ("its limits, and its integral with them, do not see the sum" in text) == (not has_input)
-    assert "Sum: 3 N*s^2/m x acceleration of the setpoint + 0.5 N + 2 N x sin(2 pi frac(0.1 k))" in " ".join(
-        text.split()
+    assert (
+        "Sum: 7 N*s/m x setpoint + 3 N*s^2/m x acceleration of the setpoint + 0.5 N + 2 N x sin(2 pi frac(0.1 k))"
+        in " ".join(text.split())
     )
     where = {
         Block.SIEMENS: "Disturbance = 1.1627907 %/(N) x sum",
@@ -243,6 +245,24 @@ def test_constant_gains_and_a_dither_go_into_the_input_that_a_block_has(block: B
         own.start(0.0, 0.0)
         assert integrating.step(0.6, 0.0) == 40.0
         assert own.step(0.6, 0.0) > 40.0  # the one limit stands behind the sum
+
+
+@pytest.mark.parametrize("block", [Block.SIEMENS, Block.ROCKWELL, Block.CODESYS])
+def test_a_dither_by_the_sheets_own_formula_is_the_library_s(block: Block) -> None:
+    loop, given = force_loop(
+        {**FULL, "pid.Tf": 0.0, "dither.amplitude": 2.0, "dither.offset": 0.5}, dither=Dither(50.0)
+    )
+    text = " ".join(sheet(loop, given, block, 5.0).split())
+    wave = re.search(r"Sum: ([\d.]+) N \+ ([\d.]+) N x sin\(2 pi frac\(([\d.]+) k\)\)", text)
+    factor = re.search(r"([\d.]+) %/\(N\) x sum", text)
+    assert wave
+    offset, size, turns = (float(v) for v in wave.groups())
+    (own,), law = emulations(block.value, sheet(loop, given, block, 5.0), H), library(loop, given, 5.0)
+    own.start(0.0, 0.0)
+    law.start(0.0, 0.0, 5.0)
+    for k, (r, y) in enumerate(INPUTS):
+        added = (offset + size * np.sin(2 * np.pi * turns * k)) * (float(factor[1]) if factor else 1.0)
+        assert is_close(own.step(r, y, added), law.step(r, y), 46.0), k
 
 
 def test_a_generator_behind_the_output_and_hardware_are_listed() -> None:

@@ -10,6 +10,7 @@ from pneuopt.export.makers.block_form import (
     number,
     wire,
 )
+from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import write_value
 
 MINUTE = 60.0  # [s], the unit of times of PIDE
@@ -45,7 +46,7 @@ def _scaled_gains(d: Design) -> tuple[float, float, float]:
 def _plain_settings(d: Design) -> list[Setting]:
     Kp, Ki, Kd = _scaled_gains(d)
     inverse = direction(d, LOGIX_PID) < 0
-    S, R = write_value(d.pv_span, d.measured_unit), wire(d.span, d)
+    S, R = write_value(d.pv_span, difference_unit(d.measured_unit)), wire(d.span, d)
     unit, on = d.measured_unit, d.command_unit
     short = "; below the usual 0.01 s: check that it is taken" if d.sample_time < USUAL_UPDATE else ""
     rows = [
@@ -81,7 +82,11 @@ def _enhanced_settings(d: Design) -> list[Setting]:
     b, c = _weights(d)
     rows = [
         ("DependIndepend", "false", "independent gains"),
-        ("PGain", number(Kp), f"Kp S/R, S the span of PV, here {write_value(d.pv_span, unit)}, R that of CV"),
+        (
+            "PGain",
+            number(Kp),
+            f"Kp S/R, S the span of PV, here {write_value(d.pv_span, difference_unit(unit))}, R that of CV",
+        ),
         ("IGain", number(Ki * MINUTE), "[1/min] 60 Ki S/R"),
         ("DGain", number(Kd / MINUTE), "[min] Kd/60 S/R; 0 is no derivative"),
         ("PVEProportional", str(b < 1).lower(), "b = 0: of PV; b = 1: of the error"),
