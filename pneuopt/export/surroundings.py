@@ -99,8 +99,8 @@ def find_surroundings(
     if outer is not None:
         low, high = outer.low, outer.high
     inner = replace(design_of(loop, parameters, centre), pv_low=low, pv_high=high)
-    if outer is None:
-        inner = replace(inner, start=references[0].origin)
+    given = references[0].origin
+    inner = replace(inner, start=given) if outer is None else replace(inner, reach="what the outer block gives at most")
     _check_parts(loop, value, form)
     rest_is_inside = inner.low <= inner.centre <= inner.high
     told = f"the valve's centre, {write_value(centre, inner.command_unit)}, lies beyond the limits of the output"

@@ -41,6 +41,8 @@ class Design:
         Where the output goes.
     zero : str
         What the command zero is.
+    reach : str
+        What the range of the process value holds.
     """
 
     gains: ParallelForm
@@ -60,6 +62,7 @@ class Design:
     is_added_to: bool = False
     goes: str = "on the wire"
     zero: str = "the centre"
+    reach: str = "the references and as far again"
 
     @property
     def span(self) -> float:
@@ -85,6 +88,11 @@ class Design:
     def integrates(self) -> bool:
         """Whether there is an integral at all."""
         return self.gains.Ki != 0
+
+    @property
+    def sum_words(self) -> str:
+        """Behind a setting that the sum of the surroundings is added to in the program; "" without one."""
+        return "; with the sum above" if self.is_added_to else ""
 
     @property
     def is_open(self) -> bool:

@@ -21,7 +21,7 @@ def _settings(d: Design) -> list[Setting]:
         ("KP", number(d.gains.Kp), f"Kp [{unit} per {d.measured_unit}], with its sign"),
         *integral,
         ("TV", number(Td), "Kd/Kp [s]; 0 is no derivative"),
-        ("Y_OFFSET", number(d.centre), f"[{unit}] {d.goes} at error 0: {d.zero}"),
+        ("Y_OFFSET", number(d.centre), f"[{unit}] {d.goes} at error 0: {d.zero}{d.sum_words}"),
         ("Y_MIN", number(low), f"[{unit}] {limits}"),
         ("Y_MAX", number(high), f"[{unit}] {limits}"),
         ("Y_MANUAL", number(d.centre), f"[{unit}] the output while MANUAL is TRUE: {d.zero}"),
@@ -34,7 +34,7 @@ def _settings(d: Design) -> list[Setting]:
 
 def _states(d: Design) -> list[str]:
     rest = wire(d.centre, d)
-    block = "Util.PID_FIXCYCLE" if d.integrates else "Util.PD, as there is no integral: TN = 0 of PID divides by zero"
+    block = "Util.PID_FIXCYCLE" if d.integrates else "Util.PD, as there is no integral: TN = 0 has no meaning in PID"
     task = f"it must be called by a task of {number(d.sample_time)} s"
     return [
         f"The block is {block}; {task}.",

@@ -65,7 +65,7 @@ def _plain_settings(d: Design) -> list[Setting]:
         ("MINCV", number(d.low), f"[{on}] {d.goes} at 0 %"),
         ("MAXO", "100", "% the limits are the ends of CV"),
         ("MINO", "0", "%"),
-        ("BIAS", number(d.rest), f"% {wire(d.centre, d)}, {d.zero}"),
+        ("BIAS", number(d.rest), f"% {wire(d.centre, d)}, {d.zero}{d.sum_words}"),
         ("NOBC", "1", "else a change from manual to auto without an integral moves BIAS"),
         ("DB", "0", "no dead band"),
         ("SO", number(d.rest), f"% the output in software manual: {d.zero}"),

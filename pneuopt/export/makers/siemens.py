@@ -26,7 +26,7 @@ def _settings(d: Design) -> list[Setting]:
     low, high = d.limits
     b, c = _weights(d)
     off = "0.0 switches the integral off" if math.isinf(Ti) else "Kp/Ki [s]"
-    pv = "the references and as far again, or the range of your sensor"
+    pv = f"{d.reach}, or the range of your sensor"
     return [
         Setting("Retain.CtrlParams.Gain", number(abs(d.gains.Kp) * percent), f"Kp 100 %/({wire(d.span, d)})"),
         Setting("Retain.CtrlParams.Ti", number(Ti) if math.isfinite(Ti) else "0.0", off),
@@ -46,7 +46,9 @@ def _settings(d: Design) -> list[Setting]:
         Setting("Config.SetpointLowerLimit", number(d.pv_low), f"[{d.measured_unit}]"),
         Setting("Config.OutputUpperLimit", number(high * percent), f"% about {d.zero}"),
         Setting("Config.OutputLowerLimit", number(low * percent), f"% about {d.zero}; as delivered: 0.0"),
-        Setting("Disturbance", "0.0", f"% of precontrol; {d.zero} is added behind the block, where it stays"),
+        Setting(
+            "Disturbance", "0.0", f"% of precontrol; the offset stands behind the block, where it stays{d.sum_words}"
+        ),
         Setting("ActivateRecoverMode", "FALSE", f"every error gives 0 %, {d.zero}, and stops the block"),
         Setting("SetSubstituteOutput", "TRUE", "if you let the block recover: the next value, not the last output"),
         Setting("SubstituteOutput", "0.0", f"% which is {d.zero}"),
