@@ -50,7 +50,7 @@ def run_export(
     force : bool
         Whether old files may be replaced.
     span : str
-        Of the process value as a block scales it, with its unit; "" for 1 in SI units.
+        Of the process value as a block scales it, with its unit; "" for what the references take.
     """
     languages, blocks = {kind.value: kind for kind in Language}, {kind.value: kind for kind in Block}
     _check_form(to, [*languages, *blocks, FMU])
@@ -58,7 +58,7 @@ def run_export(
     require(not span or to == scaled, f"--pv-span: of --to {scaled} only, whose gains are for errors in percent of it")
     task, parameters = read_fit_and_tuning(fit, tuned)
     unit = task.loop.feedback.unit
-    measured_span = read_value(span, difference_unit(unit), where="--pv-span") if span else 1.0
+    measured_span = read_value(span, difference_unit(unit), where="--pv-span") if span else None
     origin = [*_certificate_lines(tuned, uncertified), *_source_lines(fit, tuned)]
     given = (task.loop, parameters)
     if to == FMU:

@@ -15,6 +15,7 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
+from tests.export.maker_emulations import read_settings
 
 GAINS = {"pid.Kp": 200.0, "pid.Ki": 4000.0, "pid.Kd": 0.5, "pid.Tf": 4.6e-3, "pid.b": 0.8}
 STEP = Step(0.2, horizon=0.6)
@@ -25,12 +26,12 @@ def saturated(dead_band: bool = False) -> tuple[ClosedLoop, ParameterSet]:
     return loop, loop.parameters.with_values({**GAINS, "pid.lower": -46.0, "pid.upper": 46.0})
 
 
-def settings(block: Block, centre: float = 0.0) -> dict[str, float]:
+def settings(block: Block) -> dict[str, float]:
     """The numbers of the settings by their names."""
     loop, given = saturated()
-    (text,) = export_settings(loop, given, block, Step(0.2, horizon=0.02), centre=centre).values()
-    rows = re.findall(r"^  (\S.*?)  +(T#)?(-?[\d.e+-]+)(?:ms)?  ", text.partition("Formula:")[0], re.MULTILINE)
-    return {name: float(value) / (1000 if time else 1) for name, time, value in rows}
+    (text,) = export_settings(loop, given, block, Step(0.2, horizon=0.02), measured_span=1.0).values()
+    rows = {name: re.fullmatch(r"(T#)?(-?[\d.e+-]+)(ms)?", value) for name, value in read_settings(text).items()}
+    return {name: float(found[2]) / (1000 if found[1] else 1) for name, found in rows.items() if found}
 
 
 def test_the_numbers_make_the_design_by_each_makers_formula() -> None:
@@ -40,28 +41,21 @@ def test_the_numbers_make_the_design_by_each_makers_formula() -> None:
     assert (Kp, Kp / Ti, Kp * Td, s["Retain.CtrlParams.TdFiltRatio"] * Td) == pytest.approx((200, 4000, 0.5, 4.6e-3))
     s = settings(Block.ROCKWELL)
     R = 92.0
-    assert s["PID independent: Kp"] * R == pytest.approx(200)
-    assert s["PID independent: Ki [1/s]"] * R == pytest.approx(4000)
-    assert s["PID independent: Kd [s]"] * R == pytest.approx(0.5)
-    Kc, Ti, Td = (s[f"PID dependent: {n}"] for n in ("Kc", "Ti [min/repeat]", "Td [min]"))
-    assert (Kc * R, Kc * R / (60 * Ti), 60 * Kc * R * Td) == pytest.approx((200, 4000, 0.5))
-    assert (
-        s["PIDE independent: IGain [1/min]"] / 60 * R,
-        s["PIDE independent: DGain [min]"] * 60 * R,
-    ) == pytest.approx((4000, 0.5))
-    s = settings(Block.CODESYS)
+    assert [s[f"PID .{n}"] * R for n in ("KP", "KI", "KD")] == pytest.approx([200, 4000, 0.5])
+    assert [s["PIDE PGain"] * R, s["PIDE IGain"] / 60 * R, s["PIDE DGain"] * 60 * R] == pytest.approx([200, 4000, 0.5])
+    s = {n.partition(".")[2]: v for n, v in settings(Block.CODESYS).items()}
     assert (s["KP"], s["KP"] / s["TN"], s["KP"] * s["TV"]) == pytest.approx((200, 4000, 0.5))
     s = settings(Block.SIMULINK)
     assert (s["P"], s["I"], s["D"], 1 / s["N"], 1 / s["Kb"]) == pytest.approx((200, 4000, 0.5, 4.6e-3, 0.1))
     s = settings(Block.BECKHOFF)
-    assert (s["FB_CTRL_PID: fKp"], s["FB_CTRL_PID: tTn"], s["FB_CTRL_PID: tTd"]) == pytest.approx((200, 0.05, 0.005))
+    assert (s["fKp"], s["tTn"], s["tTd"]) == pytest.approx((200, 0.05, 0.005))
 
 
 def test_rockwells_gains_scale_with_the_span_of_its_process_value() -> None:
     loop, given = saturated()
     short = Step(0.2, horizon=0.02)
     (text,) = export_settings(loop, given, Block.ROCKWELL, short, measured_span=0.5).values()
-    assert re.search(rf"PID independent: Kp +{200 * 0.5 / 92:.9g} +Kp S/R, S the span of PV, here 0.5 m/s", text)
+    assert re.search(rf"PID \.KP +{200 * 0.5 / 92:.9g} +Kp S/R, S the span of PV, here 0.5 m/s", text)
     with pytest.raises(InputError, match="measured_span must be positive"):
         export_settings(loop, given, Block.ROCKWELL, short, measured_span=0.0)
 
@@ -72,11 +66,6 @@ def test_what_is_inferred_or_a_sample_late_is_said() -> None:
         (text,) = export_settings(loop, given, block, Step(0.2, horizon=0.02)).values()
         assert ("INFERRED" in text) == (block in (Block.BECKHOFF, Block.CODESYS))
         assert ("back-calculation acts a sample later" in text) == (block is Block.SIMULINK)
-
-
-def test_the_centre_is_the_output_at_rest() -> None:
-    assert settings(Block.SIEMENS, centre=50.0)["(output at rest)"] == pytest.approx(50.0)
-    assert (settings(Block.CODESYS, centre=50.0)["Y_OFFSET"], settings(Block.CODESYS, centre=50.0)["Y_MAX"]) == (50, 96)
 
 
 @pytest.mark.parametrize("block", Block)
@@ -102,7 +91,8 @@ def test_a_block_that_runs_the_design_changes_nothing() -> None:
 
 def test_what_differs_is_named_simulated_and_shown_beside_the_design() -> None:
     loop, given = saturated(dead_band=True)
-    own, values, found = run_as_block(loop, given, Block.CODESYS)
+    banded = given.with_values({"pid.dead_band": 1e-3})
+    own, values, found = run_as_block(loop, banded, Block.CODESYS)
     assert [f.partition(",")[0] for f in found] == [
         "its integral is clamped at a limit",
         "it has no dead band of the integral",
