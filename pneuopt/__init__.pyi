@@ -169,7 +169,7 @@ from .studies.sensitivity import Sensitivity, sensitivity
 from .studies.sweep import sweep
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
-from .tuning.tune import TuningResult, tune
+from .tuning.tune import TuningResult, certify, tune
 from .tuning.two_phase import TwoPhase
 from .tuning.validation import DesignValidation, validate_design
 from .tuning.without_dither import tune_without_dither
@@ -338,6 +338,7 @@ __all__ = [
     "bumpless_transfer",
     "catalog",
     "certificate",
+    "certify",
     "check",
     "check_move",
     "check_rest",

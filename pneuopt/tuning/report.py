@@ -142,13 +142,11 @@ def report_refusal(result: "TuningResult", source: str) -> Report:
     ----------
     result : TuningResult
     source : str
-        What stands.
+        What stands; empty where nothing was sought.
     """
     word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
-    found = {n.removeprefix("rejected."): v for n, v in result.stats.items() if n.startswith("rejected.")}
-    units = {n: result.parameters[n].unit for n in found}
-    tried = ", ".join(f"{n} {write_value(v, units[n])}" for n, v in found.items() if not math.isnan(v))
-    lead = Report((Line(f"{source} stand; {word}: {tried or 'none was found'}"),))
+    tried = ", ".join(f"{n} {write_value(v, result.parameters[n].unit)}" for n, v in result.best.items())
+    lead = Report((Line(f"{source} stand; {word}: {tried or 'none was found'}"),)) if source else Report()
     beside = "on rig", result.on_rig
     figures = report_metrics(result.certified, result.units, title=word, beside=beside, limits=result.limits)
     return lead + figures + report_relaxations(result.relaxations)

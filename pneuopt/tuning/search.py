@@ -56,6 +56,7 @@ SAMPLING_TOLERANCE = 5e-3
 # Margin of the search for the least relaxation of a limit, a fraction. A larger one reports more than is needed; at
 # zero the design found does not survive its certificate.
 RELAXATION_MARGIN = 0.002
+UNTRIED = "it was not tried on other plants"
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,11 +254,15 @@ class Search:
         best = self.certifier.certify(
             simulator, found, self.space.round_point(found.point, digits) if digits else found.point
         )
-        holds = "holds" if best.status.converged else "does not hold"
-        verdict = f"the best of {found.stats['simulations']:.0f} simulations so far {holds}: {best.status.verdict}"
-        status = Status(Code.INTERRUPTED, (verdict, *best.status.sentences[1:], "run again for an answer"))
-        values = {f"rejected.{n}": best.parameters.value(n) for n in self.space.names if best.status.converged}
-        return replace(best, parameters=self.space.parameters, status=status, stats={**values, **best.stats})
+        keeps = "keeps every limit on the model" if best.status.converged else "is not certified"
+        lead = f"the best of {found.stats['simulations']:.0f} simulations so far {keeps}"
+        is_candidate = not np.allclose(found.point, self.space.start, rtol=1e-9, atol=0.0)
+        if not is_candidate:
+            lead = "interrupted before anything better than the given gains was found; their evaluation"
+        details = (*best.status.sentences[1:], UNTRIED if best.status.converged else "", "run again for an answer")
+        status = Status(Code.INTERRUPTED, (f"{lead}: {best.status.verdict}", *filter(None, details)))
+        result = best.refuse(status, self.space.parameters, self.space.names)
+        return result if is_candidate else replace(result, best={})
 
     def tighten(self, margin: float) -> Specification:
         """The specification with limits tighter by a margin, as much as rounding and certificate may cost.
@@ -312,7 +317,7 @@ def _fails_late(result: TuningResult) -> bool:
 
 
 def _interruption_result(point: Array) -> SearchResult:
-    """The result of a search that was interrupted before it had found anything."""
+    """The result of a search that was interrupted before it had found anything better than its start."""
     return SearchResult(point, Status(Code.INTERRUPTED), (), {"simulations": 1.0}, is_complete=False)
 
 
@@ -382,4 +387,4 @@ def _continue_from_feasible(search: Search, point: Array) -> TuningResult:
 
 def end_point(result: TuningResult, space: Space) -> Array:
     """The gains in which a search ended, certified or rejected, shape (n,)."""
-    return np.array([result.stats.get(f"rejected.{n}", result.parameters.value(n)) for n in space.names])
+    return np.array([result.best.get(n, result.parameters.value(n)) for n in space.names])
