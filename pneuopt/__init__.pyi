@@ -85,7 +85,8 @@ from .export.vendor_blocks import Block
 from .files.drive import read_drive, write_fit
 from .files.path import read_path
 from .files.results import load_result
-from .files.tuning import read_tuning, write_tuned
+from .files.tuned import write_tuned
+from .files.tuning import read_tuning
 from .identification.assumptions import Assumption
 from .identification.checkup import Checkup, check
 from .identification.compare_logs import LogComparison, compare_logs

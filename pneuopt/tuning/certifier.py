@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -199,16 +200,18 @@ class Certifier:
             if np.isnan(value):
                 broken.append(f"the loop {WORDS_WITHOUT_VALUE.get(n, f'has no {n}')}{worst}, {allowed}")
                 continue
-            excess = user_value(q, value) / user_value(q, upper_limit(q)) - 1
-            broken.append(f"{n} is {shown}{worst}, {allowed}: off by {100 * abs(excess):.3g} %")
+            excess = 100 * abs(user_value(q, value) / user_value(q, upper_limit(q)) - 1)
+            broken.append(f"{n} is {shown}{worst}, {allowed}" + (f": off by {excess:.3g} %" if excess < inf else ""))
         if broken:
             return Status(Code.NOT_CERTIFIED, tuple(broken))
         missing = [n for n in (metric_name(q) for q in spec.weights) if np.isnan(proof[n])]
         if missing:
             lack = WORDS_WITHOUT_VALUE.get(missing[0], f"has no {missing[0]}")
             return Status(Code.NOT_CERTIFIED, (f"the loop {lack}{self._worst_case(certified, missing[0])}",))
-        kept = f"keeps {len(spec.limits)} limit{'s' if len(spec.limits) > 1 else ''}" if spec.limits else "has no limit"
-        return Status(Code.CONVERGED, (f"certified as it stands: the loop {kept} in {count} case{'s' * (count > 1)}",))
+        kept = (
+            f"keep {len(spec.limits)} limit{'s' * (len(spec.limits) > 1)}" if spec.limits else "have no limit to keep"
+        )
+        return Status(Code.CONVERGED, (f"the gains as they stand {kept} in {count} case{'s' * (count > 1)}",))
 
     def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
         """The words " at" and the worst case of a metric, where there are several cases."""

@@ -31,7 +31,8 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.files.drive import read_status
 from pneuopt.files.toml import read_toml
-from pneuopt.files.tuning import Tuning, read_tuning, write_tuned
+from pneuopt.files.tuned import write_tuned
+from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, PressureDependent
 from pneuopt.models.linear import SecondOrder
