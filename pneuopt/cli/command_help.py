@@ -46,7 +46,7 @@ COMMAND_HELP = {
         "Certify gains as they are, or say what breaks.",
         (
             "pneuopt certify fit.toml edited.toml -o tuned.toml",
-            "pneuopt certify fit.toml edited.toml --rig rig.toml --report certificate.html",
+            "pneuopt certify fit.toml edited.toml --rig rig.toml",
         ),
         "Then: pneuopt export fit.toml tuned.toml",
     ),

@@ -29,7 +29,7 @@ from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import read_unit, read_value, si_conversion, write_value
+from pneuopt.quantities.units import is_unit, read_unit, read_value, si_conversion, write_value
 
 if TYPE_CHECKING:
     from pneuopt.models.declaration import Drive
@@ -158,7 +158,7 @@ def _describe_loop(task: Tuning) -> Entries:
 def _describe_plant(drive: "Drive", plant: ParameterSet, fit: str | Path) -> Entries:
     """The drive's structure and values, and what its fit leaves uncertain, of which the plants were drawn."""
     found = {"structure": _digest(dict(_flatten(drive, drive.kind, {})))[:16]}
-    for name, frame in (("covariance", read_covariance(fit)), ("estimates", read_estimates(fit))):
+    for name, frame in (("covariance", read_covariance(fit)), ("table of estimates", read_estimates(fit))):
         if frame is not None:
             rows = {str(k): {str(n): _number(v) for n, v in row.items()} for k, row in frame.to_dict("index").items()}
             found[name] = _digest(rows)[:16]
@@ -216,7 +216,7 @@ def _describe_figures(table: Mapping[str, Any], task: Tuning) -> Entries:
     """A digest of each case's figures, and what a controller adds to the command."""
     certified, wire = table.get("certified", {}), table.get("wire", {})
     rows = certified if isinstance(certified, dict) else {"": certified}
-    found = {f"the figures of '{case}'": _digest(_plain(row))[:16] for case, row in rows.items()}
+    found = {f"the row of '{case}' in [certified]": _digest(_plain(row))[:16] for case, row in rows.items()}
     unit = task.loop.command.unit
     for n, value in (wire if isinstance(wire, dict) else {}).items():
         try:
@@ -287,13 +287,17 @@ class _Writer:
     def _write(self, name: str, text: str, digits: int) -> str:
         number, _, unit = text.partition(" ")
         try:
-            value, wanted = float.fromhex(number), self._user_unit(name, unit)
-            if not wanted:
-                return write_value(value, unit or "1", digits)
-            factor, offset = si_conversion(wanted, unit or "1")
-            return f"{(value - offset) / factor:.{digits}g} {wanted}"
-        except (ValueError, UnitError):  # a word, or a name with a space
+            value = float.fromhex(number)
+        except ValueError:  # a word
             return text
+        wanted = self._user_unit(name, unit)
+        if not is_unit(wanted):  # none, or "1 sample"
+            return write_value(value, unit or "1", digits)
+        try:
+            factor, offset = si_conversion(wanted, unit or "1")
+        except UnitError:  # a key of the same name that is something else
+            return write_value(value, unit or "1", digits)
+        return f"{(value - offset) / factor:.{digits}g} {wanted}"
 
     def _user_unit(self, name: str, unit: str) -> str:
         """The unit in which a file writes a value; empty where none does."""
@@ -307,8 +311,7 @@ class _Writer:
             entry = entries.get(key) if isinstance(entries, dict) else None
             said = entry.get(field) if isinstance(entry, dict) else entry
             if isinstance(said, str):
-                found = read_unit(said, unit or "1")
-                return "" if found == "1" else found
+                return read_unit(said, unit or "1")
         return ""
 
 
