@@ -20,11 +20,12 @@ from tomlkit.items import Table
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.files.drive import read_covariance, read_drive, read_estimates, read_status
+from pneuopt.files.reference_keys import REFERENCE_KEYS
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
 from pneuopt.files.spreads import read_draw, read_sample_spreads, read_spreads
 from pneuopt.files.toml import read_toml, toml_table
 from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning_table
-from pneuopt.files.tuning_keys import LOOP_KEYS, NO_HUNTING_KEY, REFERENCE_KEYS, SCENARIO_KEYS, signal_units
+from pneuopt.files.tuning_keys import LOOP_KEYS, NO_HUNTING_KEY, SCENARIO_KEYS, signal_units
 from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
@@ -120,13 +121,15 @@ def checksum_section(table: Mapping[str, Any], path: str | Path, fit: str | Path
     parts = _describe(table, path, fit)
     tables = {n: toml_table({"hash": _digest(own)[:16], **own}) for n, own in parts.items()}
     section = toml_table({"hash": _digest(parts), **tables})
-    return section.comment("of what the certificate is about, as parsed; it is no signature")
+    section.comment("of what the certificate is about, as parsed; it is no signature")
+    return section
 
 
 def _describe(table: Mapping[str, Any], path: str | Path, fit: str | Path) -> Parts:
     """All that a certificate is about, by part and name, as text that depends on the meaning alone."""
     drive, plant = read_drive(fit)
     task = read_tuning_table(table, path, drive.system(), plant)
+    task.scenarios(plant | task.parameters)  # refuses what is no table of scenarios, and says where
     return {
         "loop": _describe_loop(task),
         "plant": _describe_plant(drive, plant, fit),
@@ -353,7 +356,9 @@ def _plain(value: Any) -> Any:
     """Nested tables and lists with their scalars as text."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, tuple | list) else _scalar(value)
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return _scalar(value) if isinstance(value, Real | Enum) else str(value)
 
 
 def _number(value: float, unit: str = "") -> str:

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from math import isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import tomlkit
 
 from pneuopt.evaluation.cases import cases
@@ -99,9 +99,9 @@ def _check_subject(
     task = read_tuning_table(table, path, drive.system(), plant)
     known = plant | task.parameters
     for n, p in known.items():
-        same = n not in gains or np.isclose(gains.value(n), p.value, rtol=_SAME_GAINS, atol=0.0)
+        same = n not in gains or isclose(gains.value(n), p.value, rel_tol=_SAME_GAINS)
         values = f"{write_value(p.value, p.unit)}, the result was made with {write_value(gains[n].value, p.unit)}"
-        require(bool(same), f"{path}: {n} is {values}" if n in task.parameters else f"{fit}: {n} is {values}")
+        require(same, f"{path}: {n} is {values}" if n in task.parameters else f"{fit}: {n} is {values}")
     labels = [case.label for case in cases(task.references, task.scenarios(known), known)]
     told = "the result was made with other references or scenarios than its file has"
     require(labels == [str(n) for n in result.certified.columns], f"{path}: {told}")

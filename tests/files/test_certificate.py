@@ -2,7 +2,7 @@
 
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import product
 from pathlib import Path
 
@@ -210,7 +210,7 @@ def reordered(text: str) -> str:
     return tomlkit.dumps(turn(table))  # type: ignore[arg-type]
 
 
-SAME = {
+SAME: Mapping[str, Callable[[str], str]] = {
     "comments": lambda text: text.replace("\n", "   # a comment\n", 3) + "\n# the end\n",
     "blanks": lambda text: text.replace("[dither]", "\n\n[dither]").replace(" = ", "   =  "),
     "units": lambda text: (
