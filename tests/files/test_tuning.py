@@ -1,5 +1,4 @@
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -264,22 +263,6 @@ def test_a_tuned_file_keeps_the_users_text_and_adds_the_results(tmp_path: Path) 
     assert said["certified"] == {"0 to 0.2": {"SettlingTime": 0.25}}
     assert said["provenance"] == {"pneuopt": "0.1"}
     assert read_status(tmp_path / "tuned.toml") == Status(Code.CONVERGED, ("certified",))
-
-
-def test_of_a_failed_tuning_the_best_candidate_is_written_without_the_old_certificate(tmp_path: Path) -> None:
-    _, found = read_all(tmp_path, {"pid.Kp": 12.34})
-    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", tuned(found))
-    nothing = tuned(found, status=Status(Code.NOT_CERTIFIED, ("grazes the band",)))
-    with pytest.raises(InputError, match="found no candidate: grazes the band"):
-        write_tuned(tmp_path / "again.toml", tmp_path / "tuned.toml", nothing)
-    assert not (tmp_path / "again.toml").exists()
-    failed = replace(nothing, best={"pid.Kp": 50.0})
-    write_tuned(tmp_path / "again.toml", tmp_path / "tuned.toml", failed)
-    assert read_tuning(tmp_path / "again.toml", PLANT).parameters.value("pid.Kp") == 50.0
-    said = read_toml(tmp_path / "again.toml").unwrap()
-    assert "certified" not in said
-    assert "no certificate" in said["status"]["gains"]
-    assert read_status(tmp_path / "again.toml") == failed.status
 
 
 @settings(max_examples=30, deadline=None)

@@ -11,6 +11,7 @@ SEARCH = "runs a search's own simulator and merit, to compare what finds the bet
 INSIDE = {
     "problems/shared/live_page.py": "runs the script of a page, which no public name gives apart from its page",
     "problems/demo/export_controllers.py": "puts the library's run into the exported test, and asks for its parts",
+    "problems/demo/forged_certificates.py": "runs the commands themselves, whose files it forges",
     "problems/shared/random_controllers.py": "draws from the registry of compensators; begins as a program does",
     "problems/shared/b32.py": "makes its logs by machine code, and times one simulation of it as the unit of cost",
     "problems/shared/random_problems.py": "finds feasible designs by brute force on the search's batched simulator",
