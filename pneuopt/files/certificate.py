@@ -94,7 +94,7 @@ def check_certificate(fit: str | Path, tuned: str | Path) -> CertificateCheck | 
         return CertificateCheck(False, ("its gains were not written by pneuopt tune",))
     ended = () if status.code is Code.CONVERGED else (f"its tuning ended so: {status.code.value}",)
     if not isinstance(stored, dict):
-        told = "it has no checksum, as files of an older version and certificates written by hand"
+        told = "it was written by an older version, or by hand, and has no checksum"
         return CertificateCheck(False, ended or (f"{told}; run pneuopt certify",))
     parts = _describe(table, tuned, fit)
     if _digest(parts) == stored.get("hash"):

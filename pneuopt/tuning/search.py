@@ -118,7 +118,7 @@ class Search:
                 if not self.rests and _ends_elsewhere(result):
                     return self._run_with_rest(result)
             elif finder is self:
-                return result or self.certifier.certify(simulator, found, found.point)
+                return result or self.certifier.certify(simulator, found, self._round(found.point))
             finder = self._next_finder(finder, found, result, attempt)
         assert result is not None
         return result
@@ -238,9 +238,14 @@ class Search:
 
     def certify_point(self, point: Array) -> TuningResult:
         """Round a point and certify it."""
-        rounded = self.space.round_point(point, self.method.digits) if self.method.digits else point
+        rounded = self._round(point)
         found = self.restate(SearchResult(rounded, Status(Code.CONVERGED), (), {}))
         return self.certifier.certify(self.simulator, found, rounded)
+
+    def _round(self, point: Array) -> Array:
+        """The nearest point with as many digits as the method prints."""
+        digits = self.method.digits
+        return self.space.round_point(point, digits) if digits and np.isfinite(point).all() else point
 
     def with_specification(self, spec: Specification, method: Method) -> "Search":
         """A search for another specification of the same kinds of requirements, on the same compiled simulator."""
@@ -250,10 +255,7 @@ class Search:
 
     def _result_so_far(self, simulator: Simulator, found: SearchResult) -> TuningResult:
         """Round and certify the best point of an interrupted search; the result keeps the given gains."""
-        digits = self.method.digits
-        best = self.certifier.certify(
-            simulator, found, self.space.round_point(found.point, digits) if digits else found.point
-        )
+        best = self.certifier.certify(simulator, found, self._round(found.point))
         keeps = "keeps every limit on the model" if best.status.converged else "is not certified"
         lead = f"the best of {found.stats['simulations']:.0f} simulations so far {keeps}"
         is_candidate = not np.allclose(found.point, self.space.start, rtol=1e-9, atol=0.0)

@@ -77,7 +77,12 @@ FORGERIES: Mapping[str, tuple[str, str, str, str]] = {
     "plant": ("fit", '"0.12 (m/s)/V"', '"0.24 (m/s)/V"', "the plant's plant.gain was changed after tuning (0.12"),
     "figures": ("tuned", "Overshoot = ", "Overshoot = 1", "the row of '0 to 0.2' in [certified] was changed"),
     "status": ("failed_best", f'"{po.Code.INFEASIBLE.value}"', '"converged"', "the status was changed after tuning"),
-    "by hand": ("given", "[[reference]]", '[status]\ncode = "converged"\n[[reference]]', "it has no checksum"),
+    "by hand": (
+        "given",
+        "[[reference]]",
+        '[status]\ncode = "converged"\n[[reference]]',
+        "it was written by an older version, or by hand",
+    ),
 }
 UNFORGED: Mapping[str, Callable[[str], str]] = {
     "comments": lambda text: text.replace("\n", "  # a note\n", 3),
