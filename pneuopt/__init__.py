@@ -11,6 +11,7 @@ The concept map, in the order in which data flow:
     validate(drive, logs, fitted)     -> how well a held-out log is predicted, and what is left in the residuals
     ClosedLoop(drive, PID, Dither)    -> the loop to be tuned, continuous or sampled
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
+    certify(loop, steps, gains, ...)  -> the same for gains as they stand, edited by hand perhaps; nothing is sought
     validate_design(loop, ...)        -> a design on new plants: worst, 95th percentile, violations
     judge_dither(loop, steps, tuned)  -> whether the dither is useful, useless or harmful, and why, in numbers
     find_limit_cycle(t, speed)        -> hunting or crawl in a response or a log: amplitude, frequency, stick share

@@ -85,7 +85,8 @@ from .export.vendor_blocks import Block
 from .files.drive import read_drive, write_fit
 from .files.path import read_path
 from .files.results import load_result
-from .files.tuning import read_tuning, write_tuned
+from .files.tuned import write_tuned
+from .files.tuning import read_tuning
 from .identification.assumptions import Assumption
 from .identification.checkup import Checkup, check
 from .identification.compare_logs import LogComparison, compare_logs
@@ -169,7 +170,7 @@ from .studies.sensitivity import Sensitivity, sensitivity
 from .studies.sweep import sweep
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
-from .tuning.tune import TuningResult, tune
+from .tuning.tune import TuningResult, certify, tune
 from .tuning.two_phase import TwoPhase
 from .tuning.validation import DesignValidation, validate_design
 from .tuning.without_dither import tune_without_dither
@@ -338,6 +339,7 @@ __all__ = [
     "bumpless_transfer",
     "catalog",
     "certificate",
+    "certify",
     "check",
     "check_move",
     "check_rest",

@@ -43,6 +43,7 @@ PUBLIC_NAMES = [
     "catalog",
     "Certificate",
     "certificate",
+    "certify",
     "ChosenWidth",
     "ChosenWindow",
     "ClosedLoop",

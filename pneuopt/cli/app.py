@@ -1,11 +1,11 @@
-"""The commands `pneuopt init | check | identify | tune | simulate | export | ...`, as `pneuopt --help` has them.
+"""The commands `pneuopt init | check | identify | tune | certify | export | ...`, as `pneuopt --help` has them.
 
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 70 an
 error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated. Each command imports what it
 needs, so that `--help` waits for no heavy import.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import inf
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,25 @@ from typer.models import CommandFunctionType
 from pneuopt.cli.command_help import COMMAND_HELP, epilog
 from pneuopt.cli.errors import report_errors
 from pneuopt.cli.guard import run_guarded
-from pneuopt.cli.options import Accept, Between, Json, Plot, Quiet, ReportFile, RunOf, RunSampleTime, RunSpeed, Window
+from pneuopt.cli.options import (
+    Accept,
+    Between,
+    CsvFile,
+    Draws,
+    ExecutorAt,
+    HeldOut,
+    Json,
+    LogFiles,
+    Plot,
+    Quiet,
+    ReportFile,
+    RigFile,
+    RunOf,
+    RunSampleTime,
+    RunSpeed,
+    SearchBudget,
+    Window,
+)
 from pneuopt.quantities.errors import require
 
 app = typer.Typer(
@@ -89,9 +107,7 @@ def check_command(
         Path,
         typer.Argument(metavar="DRIVE", help="drive.toml: the hardware; what is `free` in it is to be identified."),
     ],
-    logs: Annotated[
-        list[Path], typer.Argument(metavar="LOGS", help="Log files, each with its sidecar .toml if it has one.")
-    ],
+    logs: LogFiles,
     json: Json = None,
     plot: Plot = None,
     report: ReportFile = None,
@@ -106,9 +122,9 @@ def check_command(
     """Show what is read, assumed and wrong before a fit, and what the logs identify; status 1 if a fit refuses them."""
     with report_errors():
         from pneuopt.cli.check import run_check
-        from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.shared import Outputs, expand_patterns
 
-        raise typer.Exit(run_check(drive, _expand_patterns(logs), Outputs(None, json, plot, report), accept or (), fix))
+        raise typer.Exit(run_check(drive, expand_patterns(logs), Outputs(None, json, plot, report), accept or (), fix))
 
 
 @_command("identify")
@@ -116,9 +132,7 @@ def identify_command(
     drive: Annotated[
         Path, typer.Argument(metavar="DRIVE", help="drive.toml: the hardware; what is `free` in it is identified.")
     ],
-    logs: Annotated[
-        list[Path], typer.Argument(metavar="LOGS", help="Log files, each with its sidecar .toml if it has one.")
-    ],
+    logs: LogFiles,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write fit.toml.")] = None,
     json: Json = None,
     plot: Plot = None,
@@ -128,34 +142,17 @@ def identify_command(
     select: Annotated[
         bool, typer.Option("--select", help="Compare friction models instead, and recommend one.")
     ] = False,
-    budget: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS",
-            help="CPU time after which the search ends with the best values so far.",
-            show_default="none",
-        ),
-    ] = inf,
-    draws: Annotated[
-        int,
-        typer.Option(
-            "--bootstrap",
-            metavar="N",
-            help="Simulate the logs N times with the estimates, and with stick-slip if the fit misses them; fit again.",
-        ),
-    ] = 0,
-    held_out: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="LOG", help="Predict this log, which the fit has not seen, in the report; repeatable."),
-    ] = None,
+    budget: SearchBudget = inf,
+    draws: Draws = 0,
+    held_out: HeldOut = None,
     quiet: Quiet = False,
 ) -> None:
     """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
     with report_errors():
         from pneuopt.cli.identify import run_identify, run_select
-        from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.shared import Outputs, expand_patterns
 
-        given = drive, _expand_patterns(logs), Outputs(output, json, plot, report), window, quiet, accept or ()
+        given = drive, expand_patterns(logs), Outputs(output, json, plot, report), window, quiet, accept or ()
         require(budget > 0, f"--budget {budget:g}: give the CPU seconds that the search may take")
         require(budget == inf or not select, "--budget limits one fit: leave it out with --select")
         require(draws == 0 or draws >= 2, f"--bootstrap {draws}: a spread takes two sets of logs at least")
@@ -172,10 +169,7 @@ def tune_command(
     tuning: Annotated[
         Path, typer.Argument(metavar="TUNING", help="tuning.toml: controller, references, requirements.")
     ],
-    rig: Annotated[
-        Path | None,
-        typer.Option("--rig", metavar="FILE", help="rig.toml: certify with its stick-slip, valve and sensors too."),
-    ] = None,
+    rig: RigFile = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write tuned.toml.")] = None,
     json: Json = None,
     plot: Plot = None,
@@ -190,6 +184,29 @@ def tune_command(
         raise typer.Exit(run_tune(fit, tuning, rig, Outputs(output, json, plot, report), quiet))
 
 
+@_command("certify")
+def certify_command(
+    fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml: the plant.")],
+    tuning: Annotated[
+        Path, typer.Argument(metavar="TUNING", help="tuned.toml with edited gains, or a tuning.toml: taken as it is.")
+    ],
+    rig: RigFile = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write tuned.toml, if all holds.")
+    ] = None,
+    json: Json = None,
+    plot: Plot = None,
+    report: ReportFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Certify gains as they are, after an edit say, or say what breaks; status 1 if so."""
+    with report_errors():
+        from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.tune import run_certify
+
+        raise typer.Exit(run_certify(fit, tuning, rig, Outputs(output, json, plot, report), quiet))
+
+
 @_command("simulate")
 def simulate_command(
     fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml.")],
@@ -198,7 +215,7 @@ def simulate_command(
     ] = None,
     log: Annotated[Path | None, typer.Option(metavar="LOG", help="Predict this log instead, in open loop.")] = None,
     window: Window = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
+    output: CsvFile = None,
     json: Json = None,
     plot: Plot = None,
     report: ReportFile = None,
@@ -209,7 +226,7 @@ def simulate_command(
         require((tuning is None) != (log is None), "give either a tuning file or --log, to say what to simulate")
         from pneuopt.cli.identify import run_predict
         from pneuopt.cli.shared import Outputs
-        from pneuopt.cli.tune import run_simulate
+        from pneuopt.cli.simulate import run_simulate
 
         outputs = Outputs(output, json, plot, report)
         require(window is None or log is not None, "--window cuts a log: give it with --log")
@@ -228,15 +245,7 @@ def study_command(
     json: Json = None,
     plot: Plot = None,
     report: ReportFile = None,
-    executor: Annotated[
-        str,
-        typer.Option(
-            metavar="WHERE",
-            help="A number of processes, dask (a cluster on this machine), or the address of a dask scheduler, "
-            "tcp://host:8786.",
-            show_default="one process a CPU",
-        ),
-    ] = "",
+    executor: ExecutorAt = "",
     time_limit: Annotated[
         float, typer.Option(metavar="SECONDS", help="A case that takes longer is killed.", show_default="none")
     ] = inf,
@@ -346,7 +355,7 @@ def track_command(
     ] = "",
     drift: Annotated[float, typer.Option(metavar="PERCENT", help="A week, to say after how many logs it is seen.")] = 1,
     horizon: Annotated[int, typer.Option(metavar="N", help="Logs for which 1 % of false alarms holds.")] = 52,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
+    output: CsvFile = None,
     json: Json = None,
     plot: Plot = None,
     report: ReportFile = None,
@@ -354,12 +363,12 @@ def track_command(
 ) -> None:
     """Tell whether parameters drift over dated logs, and what that does to a tuned loop; status 1 if so."""
     with report_errors():
-        from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.shared import Outputs, expand_patterns
         from pneuopt.cli.track import TrackOptions, run_track
 
         require(drift > 0, f"--drift {drift:g}: give the percent a week that is to be seen")
         options = TrackOptions(tuned, tuple(parameter or ()), dates, drift / 100, horizon)
-        raise typer.Exit(run_track(drive, _expand_patterns(logs), options, Outputs(output, json, plot, report), quiet))
+        raise typer.Exit(run_track(drive, expand_patterns(logs), options, Outputs(output, json, plot, report), quiet))
 
 
 @_command("keys")
@@ -385,13 +394,3 @@ def info_command() -> None:
         from pneuopt.cli.info import run_info
 
         raise typer.Exit(run_info())
-
-
-def _expand_patterns(paths: Sequence[Path]) -> list[Path]:
-    """Expand the patterns that the shell has left alone, as on Windows."""
-    found: list[Path] = []
-    for path in paths:
-        is_pattern = any(c in path.name for c in "*?[") and not path.exists()
-        found += sorted(path.parent.glob(path.name)) if is_pattern else [path]
-    require(bool(found), f"{paths[0]}: no file matches; check the name and the folder")
-    return found

@@ -42,6 +42,14 @@ COMMAND_HELP = {
         ),
         "Then: pneuopt simulate fit.toml tuned.toml, pneuopt study, pneuopt export",
     ),
+    "certify": CommandHelp(
+        "Certify gains as they are, or say what breaks.",
+        (
+            "pneuopt certify fit.toml edited.toml -o tuned.toml",
+            "pneuopt certify fit.toml edited.toml --rig rig.toml",
+        ),
+        "Then: pneuopt export fit.toml tuned.toml",
+    ),
     "simulate": CommandHelp(
         "Simulate a closed loop, or predict a log.",
         (

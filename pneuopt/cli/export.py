@@ -15,12 +15,11 @@ from pneuopt.export.block_settings import export_settings
 from pneuopt.export.fmu import export_fmu
 from pneuopt.export.targets import Language, export_controller
 from pneuopt.export.vendor_blocks import Block
-from pneuopt.files.drive import read_status
+from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import write_bytes
 from pneuopt.quantities.source import read_toml_source
-from pneuopt.quantities.status import Code
 from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import read_value
 
@@ -29,7 +28,7 @@ SHOWN_METRICS = ("SettlingTime", "Overshoot", "MaxSensitivity")
 PLC_WORDS = ("plc", "sps", "iec", "iec61131", "scl", "structured_text", "structured-text")  # what people call `st`
 MAKERS = {"tia": "siemens", "step7": "siemens", "s7": "siemens", "logix": "rockwell", "allen-bradley": "rockwell"}
 MAKERS |= {"twincat": "beckhoff", "matlab": "simulink", "py": "python", "c99": "c", "fmi": "fmu"}
-NOT_CERTIFIED = "NOT CERTIFIED: no independent simulation stands behind these gains."
+NO_CERTIFICATE = CertificateCheck(False, ("its gains were not written by pneuopt tune",))
 
 
 def run_export(
@@ -59,7 +58,7 @@ def run_export(
     task, parameters = read_fit_and_tuning(fit, tuned)
     unit = task.loop.feedback.unit
     measured_span = read_value(span, difference_unit(unit), where="--pv-span") if span else None
-    origin = [*_certificate_lines(tuned, uncertified), *_source_lines(fit, tuned)]
+    origin = [*_certificate_lines(fit, tuned, uncertified), *_source_lines(fit, tuned)]
     given = (task.loop, parameters)
     if to == FMU:
         return _write_fmu(folder / f"{name}.fmu", export_fmu(task.loop.plant, parameters, name=name), force)
@@ -103,21 +102,16 @@ def _write_fmu(path: Path, content: bytes, force: bool) -> int:
     return EXIT_SUCCESS
 
 
-def _certificate_lines(tuned: Path, uncertified: bool) -> list[str]:
-    """What a file says of its certificate; refused where it has none, unless that is accepted."""
-    status = read_status(tuned)
-    if status is None or status.code is not Code.CONVERGED:
-        why = (
-            "its gains were not written by pneuopt tune"
-            if status is None
-            else f"its tuning ended so: {status.code.value}"
-        )
-        told = "tune it, or accept that with --uncertified"
-        require(uncertified, f"{tuned}: {why}, so that no certificate holds them; {told}")
-        warn(f"{tuned}: {why}; what is written says NOT CERTIFIED")
-        return [NOT_CERTIFIED]
-    metrics = read_toml(tuned).unwrap().get("certified", {})
-    return [f"Certified: {line}" for line in _metric_lines(metrics)]
+def _certificate_lines(fit: Path, tuned: Path, uncertified: bool) -> list[str]:
+    """What a file says of its certificate; refused where none holds, unless that is accepted."""
+    found = check_certificate(fit, tuned) or NO_CERTIFICATE
+    if found.holds:
+        return [f"Certified: {line}" for line in _metric_lines(read_toml(tuned).unwrap().get("certified", {}))]
+    told = "pneuopt certify gives gains a certificate, or says what breaks; --uncertified exports them all the same"
+    require(uncertified, f"{tuned}: NOT CERTIFIED: {'; '.join(found.reasons)}. {told}")
+    for reason in found.reasons:
+        warn(f"{tuned}: {reason}; what is written says NOT CERTIFIED")
+    return list(found.lines)
 
 
 def _metric_lines(metrics: Any) -> list[str]:
@@ -133,10 +127,6 @@ def _metric_lines(metrics: Any) -> list[str]:
 
 
 def _source_lines(fit: Path, tuned: Path) -> list[str]:
-    """Which files the gains and the plant come from; a plant that is not the tuned one is warned of."""
+    """Which files the gains and the plant come from."""
     sums = {path: hashlib.sha256(read_toml_source(path)).hexdigest() for path in (fit, tuned)}
-    made = read_toml(tuned).unwrap().get("provenance", {})
-    known = [v for k, v in made.items() if str(k).startswith("sha256")] if isinstance(made, Mapping) else []
-    if known and sums[fit] not in known:
-        warn(f"{tuned}: was tuned with another file than {fit}; its units and the valve's centre are used all the same")
     return [f"from {tuned.name}, sha256 {sums[tuned]}", f"plant {fit.name}, sha256 {sums[fit]}"]

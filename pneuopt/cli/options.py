@@ -33,3 +33,40 @@ RunSpeed = Annotated[
     str, typer.Option(metavar="VALUE", help="Of --run, the largest: 0.3m/s.", show_default="half the drive's")
 ]
 RunSampleTime = Annotated[str, typer.Option(metavar="TIME", help="Of --run, the controller's.")]
+RigFile = Annotated[
+    Path | None,
+    typer.Option("--rig", metavar="FILE", help="rig.toml: certify with its stick-slip, valve and sensors too."),
+]
+CsvFile = Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")]
+LogFiles = Annotated[
+    list[Path], typer.Argument(metavar="LOGS", help="Log files, each with its sidecar .toml if it has one.")
+]
+SearchBudget = Annotated[
+    float,
+    typer.Option(
+        metavar="SECONDS",
+        help="CPU time after which the search ends with the best values so far.",
+        show_default="none",
+    ),
+]
+Draws = Annotated[
+    int,
+    typer.Option(
+        "--bootstrap",
+        metavar="N",
+        help="Simulate the logs N times with the estimates, and with stick-slip if the fit misses them; fit again.",
+    ),
+]
+HeldOut = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="LOG", help="Predict this log, which the fit has not seen, in the report; repeatable."),
+]
+ExecutorAt = Annotated[
+    str,
+    typer.Option(
+        metavar="WHERE",
+        help="A number of processes, dask (a cluster on this machine), or the address of a dask scheduler, "
+        "tcp://host:8786.",
+        show_default="one process a CPU",
+    ),
+]

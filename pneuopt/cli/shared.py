@@ -35,6 +35,8 @@ Writers = dict[Path, Callable[[Path], None]]
 Figures = Callable[[], Mapping[str, "Figure"]]
 
 
+BEST_STEM = "best"
+"""What the name of a file ends in that holds the best candidate of a tuning that is not certified."""
 INTERRUPTED_STEM = "interrupted"
 """What the name of an interrupted command's file ends in where a file is there already."""
 
@@ -215,3 +217,13 @@ def stats_and_provenance(result: IdentificationResult | TuningResult) -> dict[st
 def file_hashes(*paths: Path) -> dict[str, str]:
     """The SHA-256 of each TOML file as it was read, for provenance."""
     return {f"sha256[{path.name}]": hashlib.sha256(read_toml_source(path)).hexdigest() for path in paths}
+
+
+def expand_patterns(paths: Sequence[Path]) -> list[Path]:
+    """Expand the patterns that the shell has left alone, as on Windows."""
+    found: list[Path] = []
+    for path in paths:
+        is_pattern = any(c in path.name for c in "*?[") and not path.exists()
+        found += sorted(path.parent.glob(path.name)) if is_pattern else [path]
+    require(bool(found), f"{paths[0]}: no file matches; check the name and the folder")
+    return found

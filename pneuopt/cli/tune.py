@@ -1,50 +1,45 @@
-"""`pneuopt tune` and `pneuopt simulate`: a loop's gains, and its response."""
+"""`pneuopt tune` and `pneuopt certify`: a loop's gains, found or given, with their certificate."""
 
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.cli.interruption import interruption_status
 from pneuopt.cli.shared import (
-    Columns,
+    BEST_STEM,
     Outputs,
-    Writers,
     add_to_stem,
     describe_status,
     file_hashes,
     finish,
     read_fit_and_tuning,
     stats_and_provenance,
-    write_csv,
     write_files,
 )
+from pneuopt.cli.simulate import loop_view
 from pneuopt.cli.terminal import make_console, progress, show_output_files, show_report, show_sentence
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.expected_plants import expected_plants
-from pneuopt.evaluation.report import metric_limits, relevant_units, report_metrics
 from pneuopt.files.drive import read_covariance, read_drive, read_estimates
 from pneuopt.files.rig import read_rig
-from pneuopt.files.tuning import Tuning, write_tuned
-from pneuopt.plotting import Response
+from pneuopt.files.tuned import write_tuned
+from pneuopt.files.tuning import Tuning
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
-from pneuopt.quantities.output import check_output_paths, records
+from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
-from pneuopt.quantities.status import Code, ProgressCallback
-from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.status import Code
 from pneuopt.report.fit_page import Source
 from pneuopt.report.gains import report_exports
-from pneuopt.report.loop_figures import simulate_responses
 from pneuopt.report.page import Page
-from pneuopt.report.tuning_page import LoopView, simulation_page, tuning_page
+from pneuopt.report.tuning_page import LoopView, tuning_page
 from pneuopt.tuning.report import report_tuning
-from pneuopt.tuning.tune import TuningResult, tune
+from pneuopt.tuning.tune import TuningResult, certify, tune
 from pneuopt.tuning.without_dither import tune_without_dither
 
 if TYPE_CHECKING:
@@ -54,42 +49,153 @@ if TYPE_CHECKING:
 
 def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet: bool) -> int:
     """Tune a loop; returns the exit status."""
-    inputs = [fit, tuning, *([rig] if rig is not None else [])]
-    outputs.check(inputs, "bode")
-    task, parameters = read_fit_and_tuning(fit, tuning)
+    job = _read_job(fit, tuning, rig, outputs)
+    task, parameters = job.task, job.parameters
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
     require(bool(task.specification.weights), f"{tuning}: has nothing to minimise; {remedy}")
     require(len(task.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
     with progress("tuning", quiet=quiet) as report_progress:
-        result = _tune_task(task, parameters, fit, rig, report_progress)
-    result = replace(result, provenance={**result.provenance, **file_hashes(*inputs)})
-    stopped = result.status.code is Code.INTERRUPTED or interruption_status() is not None
-    gains: Writers = {}
-    if outputs.output is not None:
-        gains[outputs.output] = partial(write_tuned, source=tuning, result=result, wire=task.wire)
-    saved, failures = write_files(gains, beside=stopped)  # before the search without dither, which takes as long
-    console, shown = make_console(), _design_tables(result)
+        result = tune(
+            task.loop, task.references, parameters, method=task.method, progress=report_progress, **job.proof_options()
+        )
+    saved = job.save(result)  # before the search without dither, which takes as long
     was = _initial_metrics(task, parameters) if result.status.converged and result.on_rig is None else None
+    console = make_console()
     show_report(console, report_tuning(result, was=was, source=f"the gains of {tuning}"))
-    dither = Report()
+    dither, compared = Report(), dict[str, Any]()
     with suppress(KeyboardInterrupt):
         compared, dither = _compare_dither(console, task, parameters, result, quiet)
-        shown |= compared
-    show_output_files(console, saved)
-    view = _view(task, result.parameters, parameters if result.status.converged else None)
-    source = Source(f"Tuning of {fit.name} by {tuning.name}", warnings=describe_status(fit))
-    place = outputs.output if result.status.converged else None
-    exports = Report() if place is None else report_exports(task.loop, fit, place)
-    page = partial(
-        tuning_page, source, result, view, stands=f"the gains of {tuning}", was=was, dither=dither, exports=exports
-    )
-    tables = _tuning_tables(result) | shown | stats_and_provenance(result)
-    status = finish(
-        outputs, {}, tables, result.status, figures=view.figures, page=page, hints=_hints(task, fit, outputs)
-    )
-    if failures:
-        raise failures[0]
-    return status
+    title = f"Tuning of {fit.name} by {tuning.name}"
+    told = {"stands": f"the gains of {tuning}", "was": was, "dither": dither}
+    return job.finish(result, saved, partial(_make_page, job, result, title, told), compared)
+
+
+def run_certify(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet: bool) -> int:
+    """Certify a loop with the gains that it has, or say what breaks; returns the exit status."""
+    job = _read_job(fit, tuning, rig, outputs)
+    with progress("certifying", quiet=quiet) as report_progress:
+        result = certify(
+            job.task.loop, job.task.references, job.parameters, progress=report_progress, **job.proof_options()
+        )
+    saved = job.save(result)
+    show_report(make_console(), report_tuning(result, source=""))
+    title = f"Certificate of {tuning.name} with {fit.name}"
+    return job.finish(result, saved, partial(_make_page, job, result, title, {"stands": ""}))
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A loop that is to be certified, the files that it comes from, and those that are to be written.
+
+    Attributes
+    ----------
+    task : Tuning
+    parameters : ParameterSet
+        Of plant and controller, as given.
+    fit, tuning : Path
+    rig : Path or None
+    outputs : Outputs
+    """
+
+    task: Tuning
+    parameters: ParameterSet
+    fit: Path
+    tuning: Path
+    rig: Path | None
+    outputs: Outputs
+
+    @property
+    def inputs(self) -> list[Path]:
+        """The files that were read."""
+        return [self.fit, self.tuning, *([self.rig] if self.rig is not None else [])]
+
+    def proof_options(self) -> dict[str, Any]:
+        """What `tune` and `certify` prove a design by: limits, scenarios, the plants to be expected, the rig."""
+        task, parameters, fit = self.task, self.parameters, self.fit
+        plants = expected_plants(
+            task.loop.complete(parameters),
+            read_covariance(fit),
+            estimates=read_estimates(fit),
+            scenarios=task.validation_scenarios(parameters),
+        )
+        return {
+            "minimise": task.specification,
+            "scenarios": task.scenarios(parameters),
+            "plants": plants,
+            "rig": None if self.rig is None else read_rig(self.rig, read_drive(fit)[0], task.loop),
+            "max_steps": task.max_steps,
+            "accept": task.accept,
+            "throw": False,
+        }
+
+    def place(self, result: TuningResult) -> Path | None:
+        """Where a certified design is written; the best candidate beside it, which is no input; else nowhere."""
+        place = self.outputs.output
+        if place is None or result.candidate is None:
+            return None
+        while not result.status.converged and (place == self.outputs.output or place in self.inputs):
+            place = add_to_stem(place, BEST_STEM)
+        return place
+
+    def save(self, result: TuningResult) -> tuple[list[Path], list[InputError]]:
+        """Write the design, or the best candidate; an interrupted command replaces no file."""
+        stopped, place = result.status.code is Code.INTERRUPTED or interruption_status() is not None, self.place(result)
+        write = partial(
+            write_tuned, source=self.tuning, result=self._with_files(result), wire=self.task.wire, fit=self.fit
+        )
+        return write_files({place: write} if place is not None else {}, beside=stopped)
+
+    def finish(
+        self,
+        result: TuningResult,
+        saved: tuple[list[Path], list[InputError]],
+        page: Callable[[], Page],
+        compared: Mapping[str, Any] | None = None,
+    ) -> int:
+        """Say which files are written, write the others, and say what may come next; returns the exit status."""
+        (written, failures), console = saved, make_console()
+        show_output_files(console, written)
+        output = self.outputs.output
+        if output is not None and not result.status.converged and not failures:
+            stays = f"{output} stays as it was" if output.exists() else f"{output} is not written"
+            beside = f"; pneuopt export refuses {written[0]}, the best candidate" if written else ""
+            show_sentence(console, f"{stays}, for no design is certified{beside}")
+        result = self._with_files(result)
+        tables = _tuning_tables(result) | _design_tables(result) | dict(compared or {}) | stats_and_provenance(result)
+        status = finish(
+            self.outputs,
+            {},
+            tables,
+            result.status,
+            figures=self.view(result).figures,
+            page=page,
+            hints=_hints(self.task, self.fit, self.outputs),
+        )
+        if failures:
+            raise failures[0]
+        return status
+
+    def view(self, result: TuningResult) -> LoopView:
+        """What figures of the result's loop are drawn from, beside the gains before where others were found."""
+        changed = result.status.converged and bool(result.given)
+        return loop_view(self.task, result.parameters, self.parameters if changed else None)
+
+    def _with_files(self, result: TuningResult) -> TuningResult:
+        return replace(result, provenance={**result.provenance, **file_hashes(*self.inputs)})
+
+
+def _read_job(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs) -> _Job:
+    """Read the files, once it is sure that the others can be written."""
+    outputs.check([fit, tuning, *([rig] if rig is not None else [])], "bode")
+    return _Job(*read_fit_and_tuning(fit, tuning), fit, tuning, rig, outputs)
+
+
+def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, Any]) -> Page:
+    """The page of a design, or of what was refused."""
+    source = Source(title, file_hashes(*job.inputs), warnings=describe_status(job.fit))
+    place = job.outputs.output if result.status.converged else None
+    exports = Report() if place is None else report_exports(job.task.loop, job.fit, place)
+    return tuning_page(source, result, job.view(result), exports=exports, **told)
 
 
 def _hints(task: Tuning, fit: Path, outputs: Outputs) -> list[str]:
@@ -99,78 +205,6 @@ def _hints(task: Tuning, fit: Path, outputs: Outputs) -> list[str]:
         return ["with -o tuned.toml: keeps the gains, for pneuopt export", *told]
     command = f"pneuopt export {fit} {outputs.output} --to st    (for a PLC; or --help)"
     return told if task.loop.pid.sample_time is None else [command, *told]
-
-
-def _tune_task(
-    task: Tuning, parameters: ParameterSet, fit: Path, rig: Path | None, report_progress: ProgressCallback
-) -> TuningResult:
-    """Tune what a file describes, for the plants to be expected of its fit."""
-    complete, covariance = task.loop.complete(parameters), read_covariance(fit)
-    return tune(
-        task.loop,
-        task.references,
-        parameters,
-        minimise=task.specification,
-        scenarios=task.scenarios(parameters),
-        plants=expected_plants(
-            complete, covariance, estimates=read_estimates(fit), scenarios=task.validation_scenarios(parameters)
-        ),
-        rig=None if rig is None else read_rig(rig, read_drive(fit)[0], task.loop),
-        max_steps=task.max_steps,
-        accept=task.accept,
-        method=task.method,
-        throw=False,
-        progress=report_progress,
-    )
-
-
-def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
-    """Simulate the closed loop of a tuning's file; returns the exit status."""
-    outputs.check([fit, tuning], "bode")
-    task, parameters = read_fit_and_tuning(fit, tuning)
-    scenarios = task.scenarios(parameters)
-    metrics = evaluate(
-        task.loop,
-        task.references,
-        parameters,
-        scenarios=scenarios,
-        band=task.specification.band,
-        envelope=task.specification.envelope,
-        max_steps=task.max_steps,
-    )
-    writers: Writers = {}
-    if outputs.output is not None:
-        runs = [_as_logged(r, task.centre) for r in simulate_responses(task.loop, task.references, parameters)]
-        paths = number_paths(outputs.output, len(runs))
-        check_output_paths(paths, [fit, tuning])
-        columns = _loop_columns(task.loop)
-        writers |= {p: partial(write_csv, run=run, columns=columns) for p, run in zip(paths, runs, strict=True)}
-    tables = {"certified": records(metrics.T), "provenance": file_hashes(fit, tuning)}
-    view, limits = _view(task, parameters), metric_limits(task.specification.limits)
-    report = report_metrics(metrics, relevant_units(task.loop), limits=limits)
-    page = partial(_simulation_page, fit, tuning, task, view, parameters)
-    return finish(outputs, writers, tables, None, figures=view.figures, report=report, page=page)
-
-
-def _view(task: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> LoopView:
-    """What figures of a tuning's loop are drawn from."""
-    complete = task.loop.complete
-    earlier = None if before is None else complete(before)
-    return LoopView(task.loop, task.references, complete(parameters), earlier, task.specification.band)
-
-
-def _simulation_page(fit: Path, tuning: Path, task: Tuning, view: LoopView, parameters: ParameterSet) -> Page:
-    """The page of a simulated loop, which looks for defects beyond the horizon, too."""
-    found = certificate(
-        task.loop,
-        task.references,
-        parameters,
-        scenarios=task.scenarios(parameters),
-        band=task.specification.band,
-        envelope=task.specification.envelope,
-    )
-    source = Source(f"Simulation of {fit.name} with {tuning.name}", file_hashes(fit, tuning), describe_status(fit))
-    return simulation_page(source, found, view, metric_limits(task.specification.limits))
 
 
 def _design_tables(result: TuningResult) -> dict[str, Any]:
@@ -265,27 +299,9 @@ def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | 
         return None
 
 
-def number_paths(path: Path, count: int) -> list[Path]:
-    """One file a run: run.csv, or run_1.csv, run_2.csv."""
-    return [path] if count == 1 else [add_to_stem(path, str(k)) for k in range(1, count + 1)]
-
-
-def _loop_columns(loop: ClosedLoop) -> Columns:
-    """Columns of a response as a log names them, so that it can be read as one."""
-    measured, command = loop.feedback, loop.command
-    columns = {"reference": (f"{measured.name}_reference", measured.unit)}
-    columns |= {q.name: (q.name, q.unit) for q in loop.plant.outputs}
-    return columns | {"control": (command.name, command.unit)}
-
-
-def _as_logged(response: Response, centre: float) -> Trajectory:
-    """The response with its reference, and with the command that is on the wire."""
-    run, reference = response.run, response.reference
-    return run.with_columns({"reference": reference.values(run.t), "control": run["control"] + centre})
-
-
 def _tuning_tables(result: TuningResult) -> dict[str, Any]:
     gains = result.parameters.select(result.parameters.free_names).to_frame()
     tables = {"gains": gains, "claimed": result.claimed.T, "certified": result.certified.T}
     tables |= {"requirements": result.requirements, "relaxations": result.relaxations}
-    return {name: records(table) for name, table in tables.items()} | {"active": result.active}
+    best = {"best": dict(result.best)} if result.best else {}
+    return {name: records(table) for name, table in tables.items()} | {"active": result.active} | best

@@ -214,6 +214,10 @@ _DITHER = {
     "reasons": Member("in words", Holds.TEXTS),
     "rival": Member("gains tuned without it", Holds.NUMBERS, is_optional=True),
 }
+_STANDING = {
+    "holds": Member("for the files as they are", Holds.FLAG),
+    "reasons": Member("why not: what was changed", Holds.TEXTS),
+}
 _NAMED = {"name": _text("what the row is of")}
 _READ = {
     **{n: _text(m) for n, m in {"log": "name", "file": "path", "sidecar": "path, or empty"}.items()},
@@ -281,7 +285,7 @@ OUTPUTS: Mapping[str, Member] = {
         candidates=_rows("a row a model, the best first", _NAMED, is_open=True),
     ),
     "tune": _output(
-        "`pneuopt tune`",
+        "`pneuopt tune`, `pneuopt certify`",
         status=_STATUS,
         gains=_rows("a row a tuned parameter", _GAINS),
         claimed=_rows(f"by the search; {_METRICS}", _NAMED, is_open=True),
@@ -289,6 +293,7 @@ OUTPUTS: Mapping[str, Member] = {
         requirements=_rows("a row an objective or limit", _REQUIREMENTS),
         relaxations=_rows("where limits contradict each other, a row a limit", _NAMED, is_open=True),
         active=Member("what keeps the objective from being smaller", Holds.TEXTS),
+        best=Member("the best candidate's gains where none is certified [SI]", Holds.NUMBERS, is_optional=True),
         notes=Member("what the certificate notes", Holds.TEXTS, is_optional=True),
         validation=_optional(_rows("on new plants, a row a requirement", _NAMED, is_open=True)),
         dither=Member("the verdict on the dither", Holds.RECORD, _DITHER, is_optional=True),
@@ -296,7 +301,10 @@ OUTPUTS: Mapping[str, Member] = {
         provenance=_PROVENANCE,
     ),
     "simulate": _output(
-        "`pneuopt simulate FIT TUNING`", certified=_rows(_METRICS, _NAMED, is_open=True), provenance=_PROVENANCE
+        "`pneuopt simulate FIT TUNING`",
+        certified=_rows(_METRICS, _NAMED, is_open=True),
+        certificate=Member("whether a tuned.toml's holds", Holds.RECORD, _STANDING, is_optional=True),
+        provenance=_PROVENANCE,
     ),
     "predict": _output("`pneuopt simulate FIT --log LOG`", fit=_FIT, provenance=_PROVENANCE),
     "study": _output(

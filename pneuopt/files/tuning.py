@@ -1,13 +1,10 @@
-"""tuning.toml: the controller, what may be tuned, the steps to follow and what counts; tuned.toml is made from it."""
+"""tuning.toml: the controller, what may be tuned, the steps to follow and what counts."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import tomlkit
+from typing import Any
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
@@ -24,24 +21,12 @@ from pneuopt.evaluation.sampling import further
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.budget import MAX_CASES
-from pneuopt.files.loop import (
-    TUNABLE_SECTIONS,
-    TuningSections,
-    read_loop_sections,
-)
+from pneuopt.files.loop import TuningSections, read_loop_sections
 from pneuopt.files.method import read_method
-from pneuopt.files.references import move_paths, read_references
+from pneuopt.files.references import read_references
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
 from pneuopt.files.spreads import read_draw, read_sample_spreads, read_spreads
-from pneuopt.files.toml import (
-    construct_at,
-    inline_table,
-    read_fixed_value,
-    read_parameter,
-    read_toml,
-    toml_table,
-    write_parameter,
-)
+from pneuopt.files.toml import construct_at, read_fixed_value, read_toml
 from pneuopt.files.tuning_keys import (
     ACCEPT_KEY,
     BUDGET_KEYS,
@@ -54,18 +39,12 @@ from pneuopt.files.tuning_keys import (
 )
 from pneuopt.quantities.errors import InputError, UnitError, check_names, require
 from pneuopt.quantities.keys import Takes
-from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import Code
 from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import read_value, write_value
 from pneuopt.tuning.method import Method
 
-if TYPE_CHECKING:
-    from pneuopt.tuning.result import TuningResult
-
-
-TUNED_SECTIONS = ("certified", "wire", "status", "provenance")
+TUNED_SECTIONS = ("certified", "wire", "status", "provenance", "checksum")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
 
@@ -132,7 +111,14 @@ def read_tuning(path: str | Path, plant: System, parameters: ParameterSet | None
     InputError
         UnitError, UnknownNameError, ModelError or other; the message names file, section and key.
     """
-    table = {name: entry for name, entry in read_toml(path).unwrap().items() if name not in TUNED_SECTIONS}
+    return read_tuning_table(read_toml(path).unwrap(), path, plant, parameters)
+
+
+def read_tuning_table(
+    document: Mapping[str, Any], path: str | Path, plant: System, parameters: ParameterSet | None = None
+) -> Tuning:
+    """Read a tuning from the table that its file holds; parameters and errors as for `read_tuning`."""
+    table = {name: entry for name, entry in document.items() if name not in TUNED_SECTIONS}
     check_names("section", table, TUNING_KEYS, str(path))
     for name in (n for n, key in TUNING_KEYS.items() if key.takes is Takes.TABLE):
         require(isinstance(table.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
@@ -148,52 +134,6 @@ def read_tuning(path: str | Path, plant: System, parameters: ParameterSet | None
     max_steps = _read_budget(table.get("budget", {}), f"{path}: [budget]")
     accept = _read_accept(table.get(ACCEPT_KEY, TUNING_KEYS[ACCEPT_KEY].usual), f"{path}: {ACCEPT_KEY}")
     return Tuning(loop, references, own, spec, scenarios, validation, method, max_steps, accept, centre)
-
-
-def write_tuned(
-    path: str | Path, source: str | Path, result: "TuningResult", wire: Mapping[str, str] | None = None
-) -> None:
-    """Write a tuning's file with the gains found: the user's text and comments, [certified], [status], [provenance].
-
-    Parameters
-    ----------
-    path : str or Path
-        `read_tuning` reads it. A result that is not certified leaves the old gains in it, and the status says so.
-    source : str or Path
-        The tuning.toml that the result was made from.
-    result : TuningResult
-    wire : mapping of str to str, optional
-        `Tuning.wire`.
-
-    Raises
-    ------
-    InputError
-        If one of the files cannot be read or written.
-    """
-    document = read_toml(source)
-    for name in TUNED_SECTIONS:
-        document.pop(name, None)
-    move_paths(document.get("reference", []), Path(source).parent, Path(path).parent)
-    status: dict[str, Any] = {"code": result.status.code.value, "message": result.status.message}
-    if result.status.converged:
-        _write_gains(document, result.parameters, source)
-        rows = result.certified.to_dict(orient="dict")
-        document["certified"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
-    else:
-        status["gains"] = f"as in {Path(source).name}: not tuned"
-        if result.status.code is Code.INTERRUPTED:
-            status["best_so_far"] = inline_table(_rejected_gains(result))
-    if wire:
-        document["wire"] = toml_table(wire)
-    document["status"] = toml_table(status)
-    document["provenance"] = toml_table(plain_value(result.provenance))
-    write_text(path, tomlkit.dumps(document))
-
-
-def _rejected_gains(result: "TuningResult") -> dict[str, float]:
-    """The gains that an interrupted search had found [SI], which do not stand."""
-    found = {n.removeprefix("rejected."): v for n, v in result.stats.items() if n.startswith("rejected.")}
-    return {n: v for n, v in found.items() if isfinite(v)}
 
 
 def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
@@ -330,16 +270,6 @@ def _read_envelope(table: Any, where: str) -> EnvelopeBounds:
         (read_value(t, "s", where=where), read_value(low, "1", where=where), read_value(up, "1", where=where))
         for t, low, up in rows
     )
-
-
-def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:
-    """Write the tuned values of the free parameters into a document, in the units that the user gave them in."""
-    for section in TUNABLE_SECTIONS:
-        for key, entry in document.unwrap().get(section, {}).items():
-            if isinstance(entry, dict) and entry.get("free", False):
-                found = tuned[f"{section}.{key}"]
-                given = read_parameter(entry, replace(found, free=True), f"{source}: [{section}] {key}")
-                write_parameter(document, f"{section}.{key}", replace(given, value=found.value), given)
 
 
 def _read_kinds(

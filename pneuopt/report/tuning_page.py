@@ -23,6 +23,7 @@ from pneuopt.report.loop_figures import diagram_picture, loop_figures, loop_pict
 from pneuopt.report.page import Page, Picture, Section
 from pneuopt.tuning.report import (
     report_active,
+    report_certificate_status,
     report_gains,
     report_refusal,
     report_validation,
@@ -101,7 +102,7 @@ def tuning_page(
     view : LoopView, optional
         For figures, forms and diagram.
     stands : str
-        What stands where the tuning failed.
+        What stands where the tuning failed; empty where the given gains were certified or refused.
     was : DataFrame, optional
         Metrics with the gains before.
     dither : Report, optional
@@ -110,7 +111,7 @@ def tuning_page(
         How the design gets to a controller, of `report_exports`.
     """
     found, certificate, tried = result.status.converged, result.certificate, result.validation
-    verdict = report_status(result.status)
+    verdict = report_status(result.status) if stands else report_certificate_status(result.status)
     if found and tried is not None:
         verdict += report_validation_verdict(tried)
     if dither:
@@ -133,7 +134,12 @@ def tuning_page(
 
 
 def simulation_page(
-    source: Source, found: Certificate, view: LoopView | None = None, limits: Mapping[str, float] | None = None
+    source: Source,
+    found: Certificate,
+    view: LoopView | None = None,
+    limits: Mapping[str, float] | None = None,
+    *,
+    standing: Report | None = None,
 ) -> Page:
     """The page of a loop with the gains it has.
 
@@ -145,12 +151,14 @@ def simulation_page(
         For figures, forms and diagram.
     limits : mapping of str to float, optional
         Of `metric_limits`.
+    standing : Report, optional
+        Whether the certificate that the gains were written with holds.
     """
     count, cases = len(found.findings), len(found.metrics.columns)
     word = f"{count} defect{'s' if count > 1 else ''}" if count else "no defect"
     lead = Line(f"simulated: {word} in {cases} case{'s' if cases > 1 else ''}", Tone.BAD if count else Tone.GOOD)
     broken = tuple(Line(text, Tone.BAD, 2) for text in _broken_limits(found.metrics, limits or {}))
-    verdict = Report((lead, *(Line(f.sentence, indent=2) for f in found.findings), *broken))
+    verdict = (standing or Report()) + Report((lead, *(Line(f.sentence, indent=2) for f in found.findings), *broken))
     steps, bode = view.pictures() if view is not None else (None, None)
     figures = report_metrics(found.metrics, found.units, title="simulated", limits=limits)
     sections = (
@@ -179,8 +187,8 @@ def _design_sections(
 def _refusal_sections(result: TuningResult, stands: str, steps: Picture | None) -> tuple[Section, ...]:
     """What was tried and refused; below it the response with the gains that stand."""
     return (
-        Section("What was tried", (report_refusal(result, stands),)),
-        Section("The gains that stand", _some(steps)),
+        Section("What was tried" if stands else "Figures", (report_refusal(result, stands),)),
+        Section("The gains that stand" if stands else "The response", _some(steps)),
     )
 
 

@@ -1,12 +1,14 @@
-"""`Certifier`: the certificate of a search's point, its independent figures beside the search's claim."""
+"""`Certifier`: the certificate of a search's point beside the search's claim, and of gains that no search has found."""
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Certificate, Defect, judge_evaluations
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
 from pneuopt.evaluation.requirements import (
@@ -18,6 +20,8 @@ from pneuopt.evaluation.requirements import (
     describe_value,
     metric_name,
     requirement_values,
+    upper_limit,
+    user_value,
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
@@ -50,59 +54,75 @@ TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.met
 
 @dataclass(frozen=True, eq=False)
 class Certifier:
-    """Make the certificate of a point: its independent simulation, beside the claim of the search.
+    """Make the certificate of gains: their independent simulation, beside the claim of the search where there is one.
 
     Parameters
     ----------
     task : TuningTask
-    method : Method
-        Named in the provenance.
+    method : Method, optional
+        Named in the provenance; None where nothing was sought.
     """
 
     task: TuningTask
-    method: Method
+    method: Method | None = None
 
     def certify(self, simulator: Simulator, found: SearchResult, point: Array) -> TuningResult:
         """Simulate a point by both simulations; the result has its gains where the certificate holds."""
         import pandas as pd
 
-        parameters = self.task.space.parameters_at(point)
+        rows = zip(simulator.cases, simulator.table(point, self.task.spec), strict=True)
+        claimed = pd.DataFrame({case.label: metrics for case, metrics in rows})
+        result = self._prove(found, self.task.space.parameters_at(point), claimed)
+        values = dict(zip(self.task.space.names, point.tolist(), strict=True))
+        if result.status.converged:
+            return replace(result, parameters=self.task.space.parameters.with_values(values))
+        return replace(result, best=values if np.isfinite(point).all() else {})
+
+    def certify_given(self) -> TuningResult:
+        """The certificate of the task's gains as they stand, of which no search claims anything."""
+        import pandas as pd
+
+        task = self.task
+        every = cases(task.references, task.scenarios, task.space.parameters)
+        unclaimed = pd.DataFrame(np.nan, index=[*METRICS], columns=[case.label for case in every])
+        return self._prove(None, task.space.parameters, unclaimed)
+
+    def _prove(self, found: SearchResult | None, parameters: ParameterSet, claimed: "pd.DataFrame") -> TuningResult:
+        """The result of parameters, with the given ones; `found` is None where nobody has claimed the figures."""
+        import pandas as pd
+
         ripple = ("SettlingTimeRaw", "Ripple") if self.task.loop.dither_period(parameters) else ()
         shown = [n for n in METRICS if n in (*TABLE_METRICS, *ripple, *self.task.spec.kinds)]
-        rows = zip(simulator.cases, simulator.table(point, self.task.spec), strict=True)
-        claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
+        claimed = claimed.loc[shown]
         try:
             evaluations, contacts = self._evaluate(parameters)
             within = self._compare(found, claimed, tabulate_metrics(evaluations).loc[shown]).converged
-            proof = self._judge(evaluations, continues=within and not contacts)
+            proof = self._judge(evaluations, continues=(within or found is None) and not contacts)
             slopes, certified = _friction_slopes(proof.metrics), proof.metrics.loc[shown]
             status = _contact_status(contacts) if contacts else self._certificate_status(found, claimed, proof)
         except ConvergenceError as error:
             proof, certified, contacts, slopes, within = None, claimed * np.nan, [], {}, False
             status = Status(Code.NOT_CERTIFIED, (str(error),))
-        deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
-        values = dict(zip(self.task.space.names, point.tolist(), strict=True))
+        deviation = (claimed - certified).abs().max(axis=1).items() if found is not None else ()
         marks = {"contacts": float(len(contacts))} if contacts else {}
         marks |= {"fails_late": 1.0} if within and not contacts and not status.converged else {}
-        rejected = {} if status.converged else {f"rejected.{n}": v for n, v in values.items()}
+        active, stats = (found.active, found.stats) if found is not None else ((), {})
         return TuningResult(
-            self.task.space.parameters.with_values(values) if status.converged else self.task.space.parameters,
+            self.task.space.parameters,
             claimed,
             certified,
-            requirement_table(self.task.spec, claimed, certified, found.active),
+            requirement_table(self.task.spec, claimed, certified, active),
             pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.task.space.names], dtype=float),
-            found.active,
+            active,
             status,
-            {**found.stats, **deviation, **marks, **rejected, **slopes},
-            provenance(
-                self.method,
-                *self.task.spec.weights,
-                *self.task.spec.limits,
-                *self.task.references,
-                *self.task.scenarios.items(),
-            ),
+            {**stats, **{f"deviation.{n}": float(v) for n, v in deviation}, **marks, **slopes},
+            self._provenance(),
             proof,
         )
+
+    def _provenance(self) -> dict[str, str]:
+        method, spec = (self.method,) if self.method is not None else (), self.task.spec
+        return provenance(*method, *spec.weights, *spec.limits, *self.task.references, *self.task.scenarios.items())
 
     def _evaluate(self, parameters: ParameterSet) -> tuple[tuple[CaseEvaluation, ...], list[str]]:
         """Every case over its horizon, and the warnings of end stops and emptied chambers that the responses met."""
@@ -124,14 +144,17 @@ class Certifier:
         rest_error = allowed if np.isfinite(allowed) else 0.0
         return judge_evaluations(evaluations, self.task.spec.band, rest_error, continues=continues)
 
-    def _certificate_status(self, found: SearchResult, claimed: "pd.DataFrame", proof: Certificate) -> Status:
+    def _certificate_status(self, found: SearchResult | None, claimed: "pd.DataFrame", proof: Certificate) -> Status:
         """Whether the independent evaluation confirms the search, and finds no defect that is not accepted."""
         status = self._compare(found, claimed, proof.metrics.loc[claimed.index])
         defects = dict.fromkeys(f.sentence for f in proof.findings if f.defect not in self.task.accept)
-        if not found.status.converged or not defects:
+        if (found is not None and not found.status.converged) or not defects:
             details = [f"accepted: {f.sentence}" for f in proof.findings] if status.converged else proof.notes
             return status.with_details(*details[:MAX_DEFECTS_TOLD])
         words = dict.fromkeys(f.defect.value for f in proof.findings if f.defect not in self.task.accept)
+        if found is None:
+            broken = () if status.converged else status.sentences
+            return Status(Code.NOT_CERTIFIED, (*list(defects)[:MAX_DEFECTS_TOLD], *broken))
         remedy = f"limit SettlingTime or MaxSensitivity, or accept it by name: {', '.join(map(repr, words))}"
         if Defect.STANDS_STILL.value in words and self.task.spec.limits:
             limits = " and ".join(metric_name(q) for q in self.task.spec.limits)
@@ -139,8 +162,10 @@ class Certifier:
         broken = () if status.converged else status.sentences[:1]
         return Status(Code.NOT_CERTIFIED, (*list(defects)[:MAX_DEFECTS_TOLD], *broken, remedy))
 
-    def _compare(self, found: SearchResult, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
-        """Whether the certified metrics keep the limits and agree with the claimed objective."""
+    def _compare(self, found: SearchResult | None, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
+        """Whether the certified metrics keep the limits and agree with the claimed objective, where there is one."""
+        if found is None:
+            return self._check_limits(certified)
         if not found.status.converged:
             return found.status
         spec = self.task.spec
@@ -163,6 +188,30 @@ class Certifier:
         agreeing, warning = describe_agreement(found.stats)
         verdict = f"certified objective {ours:.6g}, claimed {theirs:.6g}"
         return Status(Code.CONVERGED, (f"{verdict}, {agreeing}" if agreeing else verdict,)).with_details(warning)
+
+    def _check_limits(self, certified: "pd.DataFrame") -> Status:
+        """Whether the certified metrics keep the limits; if not, by how much each of them is broken."""
+        spec, count = self.task.spec, len(certified.columns)
+        proof = worst_values([requirement_values(dict(certified[r])) for r in certified])
+        broken = list[str]()
+        for q in spec.violations(proof):
+            n, value = metric_name(q), proof[metric_name(q)]
+            (shown, allowed), worst = describe_value(q, value), self._worst_case(certified, n)
+            if np.isnan(value):
+                broken.append(f"the loop {WORDS_WITHOUT_VALUE.get(n, f'has no {n}')}{worst}, {allowed}")
+                continue
+            excess = 100 * abs(user_value(q, value) / user_value(q, upper_limit(q)) - 1)
+            broken.append(f"{n} is {shown}{worst}, {allowed}" + (f": off by {excess:.3g} %" if excess < inf else ""))
+        if broken:
+            return Status(Code.NOT_CERTIFIED, tuple(broken))
+        missing = [n for n in (metric_name(q) for q in spec.weights) if np.isnan(proof[n])]
+        if missing:
+            lack = WORDS_WITHOUT_VALUE.get(missing[0], f"has no {missing[0]}")
+            return Status(Code.NOT_CERTIFIED, (f"the loop {lack}{self._worst_case(certified, missing[0])}",))
+        kept = (
+            f"keep {len(spec.limits)} limit{'s' * (len(spec.limits) > 1)}" if spec.limits else "have no limit to keep"
+        )
+        return Status(Code.CONVERGED, (f"the gains as they stand {kept} in {count} case{'s' * (count > 1)}",))
 
     def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
         """The words " at" and the worst case of a metric, where there are several cases."""

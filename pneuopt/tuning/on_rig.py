@@ -137,19 +137,7 @@ def _reject(
     task: TuningTask, result: TuningResult, found: "pd.DataFrame | None", breaks: tuple[str, ...]
 ) -> TuningResult:
     """The result of a design that the rig refutes: the given gains stand."""
-    tuned = {f"rejected.{n}": result.parameters.value(n) for n in task.space.names if n in result.parameters}
     smooth = f"on the smooth model it is certified: {result.status.verdict}"
     remedies = () if found is None else tuple(_remedies(task, result, found))
-    return replace(
-        result,
-        parameters=_given(task, result.parameters),
-        status=Status(Code.NOT_CERTIFIED, (*breaks, smooth, *remedies)),
-        stats={**result.stats, **tuned},
-        on_rig=found,
-    )
-
-
-def _given(task: TuningTask, parameters: ParameterSet) -> ParameterSet:
-    """Parameters with the gains as they were given."""
-    names = [n for n in task.space.names if n in parameters]
-    return parameters.with_values({n: task.space.parameters.value(n) for n in names})
+    status = Status(Code.NOT_CERTIFIED, (*breaks, smooth, *remedies))
+    return replace(result.refuse(status, task.space.parameters, task.space.names), on_rig=found)

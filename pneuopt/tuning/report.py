@@ -10,7 +10,7 @@ from pneuopt.evaluation.report import metric_cell, report_margins, report_metric
 from pneuopt.evaluation.requirements import METRICS, percent_factor
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
-from pneuopt.quantities.status import Code, report_status
+from pneuopt.quantities.status import Code, Status, report_status
 from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
@@ -34,10 +34,18 @@ def report_tuning(
     was : DataFrame, optional
         Metrics with the gains before, to stand beside the certified ones.
     source : str
-        What stands where the tuning failed.
+        What stands where the tuning failed; empty where nothing was sought.
     """
-    head = report_status(result.status)
+    head = report_status(result.status) if source else report_certificate_status(result.status)
     return head + (_report_design(result, was) if result.status.converged else report_refusal(result, source))
+
+
+def report_certificate_status(status: Status) -> Report:
+    """Whether gains are certified that nobody has sought, then why not, a line each."""
+    good = status.converged
+    lead = f"{'certified' if good else 'NOT CERTIFIED'}: {status.verdict}"
+    details = (Line(text, indent=2) for text in status.sentences[1:])
+    return Report((Line(lead, Tone.GOOD if good else Tone.BAD), *details))
 
 
 def report_gains(given: Mapping[str, float], tuned: ParameterSet) -> Report:
@@ -55,7 +63,7 @@ def report_gains(given: Mapping[str, float], tuned: ParameterSet) -> Report:
         bounds = f"{format_number(p.lower, 4)} to {format_number(p.upper, 4)}"
         mark = "at its bound" if p.value in (p.lower, p.upper) else ""
         rows.append((n, *before, write_value(p.value, p.unit), bounds, mark))
-    figures = number_columns(*(["before"] if given else []), "tuned", "bounds")
+    figures = number_columns(*(["before", "tuned"] if given else ["value"]), "bounds")
     table = Table((*text_columns("parameter"), *figures, *text_columns("")), tuple(rows))
     form = _other_form(tuned)
     return Report((*([table] if rows else []), *([Line(form)] if form else [])))
@@ -142,13 +150,11 @@ def report_refusal(result: "TuningResult", source: str) -> Report:
     ----------
     result : TuningResult
     source : str
-        What stands.
+        What stands; empty where nothing was sought.
     """
-    word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
-    found = {n.removeprefix("rejected."): v for n, v in result.stats.items() if n.startswith("rejected.")}
-    units = {n: result.parameters[n].unit for n in found}
-    tried = ", ".join(f"{n} {write_value(v, units[n])}" for n, v in found.items() if not math.isnan(v))
-    lead = Report((Line(f"{source} stand; {word}: {tried or 'none was found'}"),))
+    word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected" if source else "simulated"
+    tried = ", ".join(f"{n} {write_value(v, result.parameters[n].unit)}" for n, v in result.best.items())
+    lead = Report((Line(f"{source} stand; {word}: {tried or 'none was found'}"),)) if source else Report()
     beside = "on rig", result.on_rig
     figures = report_metrics(result.certified, result.units, title=word, beside=beside, limits=result.limits)
     return lead + figures + report_relaxations(result.relaxations)

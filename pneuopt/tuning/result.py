@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 # Room left of a limit, a fraction of it, within which it counts as active. A smaller one misses limits that the
 # search's margin keeps a design away from; a larger one names limits that hold nothing back.
 ACTIVE_ROOM = 0.02
+REQUIREMENT_COLUMNS = ("claimed", "certified", "allowed", "room", "case")
 RELAXATION_COLUMNS = ("asked", "needed", "share")
 
 
@@ -68,8 +69,8 @@ class TuningResult(Result):
         found, "starts_spread", the relative excess of the worst of them, and "starts_unseen", the chance that one start
         more finds another optimum (Boender and Rinnooy Kan);
         "friction_slope[0 to 0.2]" and so on, the slope of friction with which that case's margins are read [N s/m];
-        where the given gains stand "rejected.pid.Kp" and so on, "contacts" where a response ran into an end stop, and
-        "fails_late" where only what comes after a horizon refuses the design.
+        where the given gains stand "contacts" where a response ran into an end stop, and "fails_late" where only what
+        comes after a horizon refuses the design.
     provenance : mapping of str to str
     certificate : Certificate, optional
         All that the independent evaluation found; None where its simulation stopped.
@@ -85,6 +86,9 @@ class TuningResult(Result):
         What was asked for, by metric, in the metric's unit.
     rest : RestCheck, optional
         How the loop ends on the rig's model, where `NoHunting` was asked for.
+    best : mapping of str to float
+        Where the given gains stand, the tuned parameters' values in the best candidate that was found, rounded [SI],
+        of which `claimed` and `certified` tell; empty where the design is certified, or none was found.
     """
 
     parameters: ParameterSet
@@ -103,6 +107,30 @@ class TuningResult(Result):
     units: Mapping[str, str] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     rest: RestCheck | None = None
+    best: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def candidate(self) -> ParameterSet | None:
+        """The certified design, or the best candidate that was not; None where there is neither."""
+        if self.status.converged:
+            return self.parameters
+        return self.parameters.with_values(self.best) if self.best else None
+
+    def refuse(self, status: Status, given: ParameterSet, names: Sequence[str]) -> "TuningResult":
+        """The result with another status, by which its design is no longer certified: the given gains stand.
+
+        Parameters
+        ----------
+        status : Status
+        given : ParameterSet
+            With the values before.
+        names : sequence of str
+            The tuned parameters.
+        """
+        own = [n for n in names if n in self.parameters]
+        best = {n: self.parameters.value(n) for n in own} if self.status.converged else self.best
+        stands = self.parameters.with_values({n: given.value(n) for n in own})
+        return replace(self, parameters=stands, status=status, best=best)
 
     def summary(self) -> Report:
         """How the tuning ended, gains, certified metrics beside their limits, margins, and how other plants behave."""
@@ -120,7 +148,7 @@ def requirement_table(
         metric_name(q): _requirement_row(limits.get(metric_name(q), q), claimed, certified)
         for q in (*spec.weights, *spec.limits)
     }
-    frame = pd.DataFrame.from_dict(rows, orient="index")
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=None if rows else [*REQUIREMENT_COLUMNS])
     frame["active"] = [n in active or room <= ACTIVE_ROOM for n, room in frame["room"].items()]
     return frame
 

@@ -56,6 +56,7 @@ SAMPLING_TOLERANCE = 5e-3
 # Margin of the search for the least relaxation of a limit, a fraction. A larger one reports more than is needed; at
 # zero the design found does not survive its certificate.
 RELAXATION_MARGIN = 0.002
+UNTRIED = "it was not tried on other plants"
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,7 @@ class Search:
                 if not self.rests and _ends_elsewhere(result):
                     return self._run_with_rest(result)
             elif finder is self:
-                return result or self.certifier.certify(simulator, found, found.point)
+                return result or self.certifier.certify(simulator, found, self._round(found.point))
             finder = self._next_finder(finder, found, result, attempt)
         assert result is not None
         return result
@@ -237,9 +238,14 @@ class Search:
 
     def certify_point(self, point: Array) -> TuningResult:
         """Round a point and certify it."""
-        rounded = self.space.round_point(point, self.method.digits) if self.method.digits else point
+        rounded = self._round(point)
         found = self.restate(SearchResult(rounded, Status(Code.CONVERGED), (), {}))
         return self.certifier.certify(self.simulator, found, rounded)
+
+    def _round(self, point: Array) -> Array:
+        """The nearest point with as many digits as the method prints."""
+        digits = self.method.digits
+        return self.space.round_point(point, digits) if digits and np.isfinite(point).all() else point
 
     def with_specification(self, spec: Specification, method: Method) -> "Search":
         """A search for another specification of the same kinds of requirements, on the same compiled simulator."""
@@ -249,15 +255,16 @@ class Search:
 
     def _result_so_far(self, simulator: Simulator, found: SearchResult) -> TuningResult:
         """Round and certify the best point of an interrupted search; the result keeps the given gains."""
-        digits = self.method.digits
-        best = self.certifier.certify(
-            simulator, found, self.space.round_point(found.point, digits) if digits else found.point
-        )
-        holds = "holds" if best.status.converged else "does not hold"
-        verdict = f"the best of {found.stats['simulations']:.0f} simulations so far {holds}: {best.status.verdict}"
-        status = Status(Code.INTERRUPTED, (verdict, *best.status.sentences[1:], "run again for an answer"))
-        values = {f"rejected.{n}": best.parameters.value(n) for n in self.space.names if best.status.converged}
-        return replace(best, parameters=self.space.parameters, status=status, stats={**values, **best.stats})
+        best = self.certifier.certify(simulator, found, self._round(found.point))
+        keeps = "keeps every limit on the model" if best.status.converged else "is not certified"
+        lead = f"the best of {found.stats['simulations']:.0f} simulations so far {keeps}"
+        is_candidate = not np.allclose(found.point, self.space.start, rtol=1e-9, atol=0.0)
+        if not is_candidate:
+            lead = "interrupted before anything better than the given gains was found; their evaluation"
+        details = (*best.status.sentences[1:], UNTRIED if best.status.converged else "", "run again for an answer")
+        status = Status(Code.INTERRUPTED, (f"{lead}: {best.status.verdict}", *filter(None, details)))
+        result = best.refuse(status, self.space.parameters, self.space.names)
+        return result if is_candidate else replace(result, best={})
 
     def tighten(self, margin: float) -> Specification:
         """The specification with limits tighter by a margin, as much as rounding and certificate may cost.
@@ -312,7 +319,7 @@ def _fails_late(result: TuningResult) -> bool:
 
 
 def _interruption_result(point: Array) -> SearchResult:
-    """The result of a search that was interrupted before it had found anything."""
+    """The result of a search that was interrupted before it had found anything better than its start."""
     return SearchResult(point, Status(Code.INTERRUPTED), (), {"simulations": 1.0}, is_complete=False)
 
 
@@ -382,4 +389,4 @@ def _continue_from_feasible(search: Search, point: Array) -> TuningResult:
 
 def end_point(result: TuningResult, space: Space) -> Array:
     """The gains in which a search ended, certified or rejected, shape (n,)."""
-    return np.array([result.stats.get(f"rejected.{n}", result.parameters.value(n)) for n in space.names])
+    return np.array([result.best.get(n, result.parameters.value(n)) for n in space.names])

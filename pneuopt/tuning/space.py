@@ -183,6 +183,11 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     return Space(full, free)
 
 
+def whole_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
+    """Every parameter of the loop, none of them to be changed."""
+    return Space(loop.complete(parameters).select(loop.parameters), ())
+
+
 def clip_level(loop: ClosedLoop, p: ParameterSet) -> float:
     """The largest size of a command that the controller's own limits let through [its unit]; inf without limits."""
     return max(abs(p.value("pid.lower")), abs(p.value("pid.upper"))) if loop.pid.limits else float("inf")

@@ -26,30 +26,29 @@ from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTi
 from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
-from pneuopt.evaluation.specification import Objective, Specification, specify
+from pneuopt.evaluation.specification import Objective, Specification, specify, specify_limits
 from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.quantities.status import Code, ProgressCallback
-from pneuopt.tuning.certifier import certified_objective
+from pneuopt.quantities.status import Code, ProgressCallback, Status
+from pneuopt.tuning.certifier import Certifier, certified_objective
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.methods import choose_method
 from pneuopt.tuning.on_rig import certify_on_rig, check_rig
 from pneuopt.tuning.refusal import confirm_refusal
 from pneuopt.tuning.result import TuningResult
-from pneuopt.tuning.search import Search, relax
-from pneuopt.tuning.space import Space, clip_level, search_space
+from pneuopt.tuning.search import UNTRIED, Search, relax
+from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
 from pneuopt.tuning.validation import validate_design
 
-__all__ = ["TuningResult", "prepare_search", "prepare_task", "tune"]
+__all__ = ["TuningResult", "certify", "prepare_search", "prepare_task", "tune"]
 # Starts that must end in the same optimum for a search to be believed alone: a single one may be the nearest of many;
 # more search twice where two have confirmed each other.
 MIN_AGREEING = 2
 # Endings of a search that contradictory limits may have caused: `tune` then seeks how far they have to give way.
 INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)
-STOPPED = "a second search was interrupted, and the design was not tried on other plants"
 
 
 def tune(
@@ -117,7 +116,7 @@ def tune(
     ConvergenceError
         If the limits cannot be kept, the independent simulation does not confirm them, or Ctrl-C cuts the search
         short; the error's `solution` is the result, with the given gains unchanged: `claimed` and `certified` are
-        those of the best point found, which is in its `stats`.
+        those of the best point found, which is its `best`.
 
     Warns
     -----
@@ -154,21 +153,119 @@ def tune(
         result,
         parameters=parameters.with_values(found),
         status=result.status.with_remedies(note),
-        stats={**result.stats, "seconds": time.perf_counter() - begun},
         given={n: parameters.value(n) for n in parameters.free_names},
-        units=relevant_units(loop),
         limits=metric_limits(specification.limits),
     )
-    if result.status.converged and rig is not None:
-        search.progress("certifying on the rig's model")
-        result = certify_on_rig(task, result, rig)
-    if result.status.converged and is_stopped:
-        result = replace(result, status=result.status.with_details(STOPPED))
-    elif result.status.converged:
-        result = _try_on_plants(task, result, plants, search.progress)
+    if is_stopped:
+        result = _interrupt(task, result, "a second search was interrupted")
+    result = _prove_further(task, result, rig, plants, search.progress, begun)
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status.with_remedies('the given gains stand')}", result)
     return result
+
+
+def certify(
+    loop: ClosedLoop,
+    references: Reference | Sequence[Reference],
+    parameters: ParameterSet,
+    *,
+    minimise: Objective | None = None,
+    subject_to: Sequence[Requirement | NoHunting] = (),
+    scenarios: Scenarios = NO_SCENARIOS,
+    accept: Defect | Sequence[Defect] = (),
+    plants: ExpectedPlants | Scenarios | None = None,
+    rig: Rig | None = None,
+    max_steps: float = MAX_STEPS,
+    throw: bool = True,
+    progress: Callable[[Progress], None] | None = None,
+) -> TuningResult:
+    """Certify gains as they stand, by what `tune` certifies its designs by, without any search.
+
+    Parameters
+    ----------
+    loop, references, scenarios, accept, plants, rig, max_steps, progress
+        As for `tune`.
+    parameters : ParameterSet
+        Of plant, controller and dither, with the gains to be certified. Whether any is free does not matter, but for
+        the tolerance of free gains in `plants`.
+    minimise : Requirement, mapping of Requirement to weight, or Specification, optional
+        What a design was tuned for; here it only says which metrics must have a value.
+    subject_to : sequence of Requirement
+        The limits that are to be kept.
+    throw : bool
+        Raise an error if the gains are not certified; otherwise the result's status says so.
+
+    Returns
+    -------
+    TuningResult
+        With the given parameters; nothing is `claimed`.
+
+    Raises
+    ------
+    InputError
+        If loop, references, parameters and requirements do not fit together; the message names the one.
+    ConvergenceError
+        If a limit is broken or a defect is found; its message says which, and by how much; its `solution` is the
+        result.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
+    >>> from pneuopt.models.linear import FirstOrder
+    >>> from pneuopt.evaluation.requirements import Overshoot
+    >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    >>> gains = loop.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 20.0})
+    >>> certify(loop, Step(1.0), gains, subject_to=[Overshoot(0.05)]).status.converged
+    True
+    >>> certify(loop, Step(1.0), gains.with_values({"pid.Kp": 0.1}), subject_to=[Overshoot(0.05)], throw=False).status
+    Status(code=<Code.NOT_CERTIFIED: ...
+    """
+    begun = time.perf_counter()
+    if minimise is None or isinstance(minimise, Specification):
+        spec = minimise or specify_limits(subject_to)
+        require(minimise is None or not subject_to, "minimise is a Specification, which holds its limits")
+    else:
+        spec = specify(minimise, subject_to)
+    task = _make_task(loop, references, parameters, spec, scenarios, accept, max_steps, whole_space)
+    check_rig(rig, task)
+    reporter = ProgressReporter(progress, "certify")
+    reporter("simulating the loop independently")
+    result = replace(Certifier(task).certify_given(), parameters=parameters, limits=metric_limits(spec.limits))
+    result = _prove_further(task, result, rig, plants, reporter, begun)
+    if throw and not result.status.converged:
+        raise ConvergenceError(f"the gains are {result.status}", result)
+    return result
+
+
+def _prove_further(
+    task: TuningTask,
+    result: TuningResult,
+    rig: Rig | None,
+    plants: ExpectedPlants | Scenarios | None,
+    progress: ProgressCallback,
+    begun: float,
+) -> TuningResult:
+    """The result with what the rig's model and other plants show of a certified design; other results as they are."""
+    result = replace(result, units=relevant_units(task.loop))
+    if result.status.converged and rig is not None:
+        progress("certifying on the rig's model")
+        try:
+            result = certify_on_rig(task, result, rig)
+        except KeyboardInterrupt:
+            result = _interrupt(task, result, "the simulation of the rig was interrupted")
+    if result.status.converged:
+        result = _try_on_plants(task, result, plants, progress)
+    return replace(result, stats={**result.stats, "seconds": time.perf_counter() - begun})
+
+
+def _interrupt(task: TuningTask, result: TuningResult, reason: str) -> TuningResult:
+    """The result of a certified design that Ctrl-C kept from its last trials; any other result as it is."""
+    if not result.status.converged:
+        return result
+    lead = f"it keeps every limit on the model: {result.status.verdict}"
+    sentences = (lead, f"{reason}: {UNTRIED}", *result.status.sentences[1:], "run again for an answer")
+    return result.refuse(Status(Code.INTERRUPTED, sentences), task.space.parameters, task.space.names)
 
 
 def _warn_of_swing(task: TuningTask) -> None:
@@ -214,9 +311,10 @@ def _try_on_plants(
         found = validate_design(
             task.loop, task.references, result.parameters, minimise=task.spec, scenarios=chosen, accept=task.accept
         )
-    except (ConvergenceError, KeyboardInterrupt) as error:
-        reason = str(error) or "interrupted"
-        return replace(result, status=result.status.with_details(f"not tried on other plants: {reason}"))
+    except KeyboardInterrupt:
+        return _interrupt(task, result, "the trial on other plants was interrupted")
+    except ConvergenceError as error:
+        return replace(result, status=result.status.with_details(f"not tried on other plants: {error}"))
     return replace(result, validation=found)
 
 
@@ -230,6 +328,24 @@ def prepare_task(
     max_steps: float = MAX_STEPS,
 ) -> TuningTask:
     """Check what is to be tuned, and that its limits can be kept at all; parameters and errors as for `tune`."""
+    task = _make_task(loop, references, parameters, spec, scenarios, accept, max_steps, search_space)
+    space = task.space
+    every = cases(task.references, scenarios, space.parameters, space.names)
+    check_feasibility(task.loop, every, space, task.spec)
+    return task
+
+
+def _make_task(
+    loop: ClosedLoop,
+    references: Reference | Sequence[Reference],
+    parameters: ParameterSet,
+    spec: Specification,
+    scenarios: Scenarios,
+    accept: Defect | Sequence[Defect],
+    max_steps: float,
+    span: Callable[[ClosedLoop, ParameterSet], Space],
+) -> TuningTask:
+    """The checked task, its space as `span` makes it of the loop and its parameters."""
     check_closed_loop(loop)
     check_parameters(parameters)
     check_smooth(loop.plant)
@@ -237,9 +353,8 @@ def prepare_task(
     loop = add_disturbances(loop, steps)
     require(len(steps) > 0, "no reference to tune for; give a Step or a Move")
     check_steps(loop, steps, loop.complete(parameters), plants=1 + len(scenarios), max_steps=max_steps)
-    space = search_space(loop, parameters)
+    space = span(loop, parameters)
     spec = spec.without(PeakControl) if clip_level(loop, space.parameters) <= spec.limit(PeakControl) else spec
-    check_feasibility(loop, cases(steps, scenarios, space.parameters, space.names), space, spec)
     known = ", ".join(str(defect) for defect in Defect)
     accept = as_tuple("accept", accept, Defect, f"one of {known}, or several")
     return TuningTask(loop, steps, scenarios, space, spec, accept)

@@ -158,7 +158,7 @@ def validate_design(
     expected = scenarios if isinstance(scenarios, ExpectedPlants) else ExpectedPlants(scenarios, ())
     message = "no new plants; draw some: scenarios=samples(parameters, {'load.mass': 0.3}, 100)"
     require(len(expected.scenarios) > 0, message)
-    spec = specify(minimise, subject_to)
+    spec = minimise if isinstance(minimise, Specification) and not subject_to else specify(minimise, subject_to)
     check_closed_loop(loop)
     check_parameters(parameters)
     steps = as_references(references)

@@ -131,8 +131,7 @@ def tuned(
 
 def best(found: po.TuningResult) -> po.ParameterSet:
     """Its values, those of the last candidate where the certificate did not hold."""
-    tried = {n.removeprefix("rejected."): v for n, v in found.stats.items() if n.startswith("rejected.")}
-    return found.parameters.with_values(tried)
+    return found.parameters.with_values(found.best)
 
 
 def worst(found: po.TuningResult, metric: str) -> float:

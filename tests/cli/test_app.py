@@ -143,18 +143,26 @@ def test_tune_certifies_and_its_file_simulates_to_the_same_figures(folder: Path)
     assert all(Path(f).exists() for f in ("tuned.svg", "tuned_bode.svg", "run.pdf", "run_bode.pdf"))
 
 
-def test_a_tuning_that_fails_says_so_first_and_keeps_the_gains(folder: Path) -> None:
+def test_a_tuning_that_fails_says_so_first_and_writes_its_best_candidate_beside(folder: Path) -> None:
     add("tuning.toml", 'settling_time = { max = "3 ms", band = "5 %" }\n')
-    result = run("tune drive.toml tuning.toml -o tuned.toml")
+    Path("tuned.toml").write_text("# of an earlier tuning", encoding="utf-8")
+    result = run("tune drive.toml tuning.toml -o tuned.toml --json tuned.json")
     assert result.exit_code == 1
     assert result.stdout.startswith("NOT converged (the limits contradict each other): ")
     assert "the gains of tuning.toml stand; rejected: pid.Kp" in result.stdout
-    status = read_status("tuned.toml")
+    assert Path("tuned.toml").read_text("utf-8") == "# of an earlier tuning"
+    assert "wrote tuned_best.toml\ntuned.toml stays as it was, for no design is certified" in result.stdout
+    status = read_status("tuned_best.toml")
     assert status is not None
     assert status.code is Code.INFEASIBLE
-    plant = read_drive("drive.toml")[0].system()
-    assert read_tuning("tuned.toml", plant).parameters.value("pid.Kp") == 100.0
-    assert "certified" not in read_toml("tuned.toml")
+    gains = read_tuning("tuned_best.toml", read_drive("drive.toml")[0].system()).parameters
+    best = json.loads(Path("tuned.json").read_text(encoding="utf-8"))["best"]
+    assert {n: gains.value(n) for n in best} == pytest.approx(best)
+    assert best["pid.Kp"] != 100.0
+    assert "certified" not in read_toml("tuned_best.toml")
+    again = run("tune drive.toml tuned_best.toml -o tuned.toml -q")
+    assert again.exit_code == 1
+    assert Path("tuned_best_best.toml").exists(), "an input is not replaced"
 
 
 def test_a_log_is_predicted_in_open_loop(folder: Path) -> None:
@@ -232,12 +240,32 @@ def test_an_interrupted_tuning_writes_the_best_so_far_and_replaces_nothing(
     assert result.exit_code == 130
     assert result.stdout.startswith("NOT converged (interrupted): the best of 160 simulations so far ")
     assert "the gains of tuning.toml stand; best so far: pid.Kp " in result.stdout
-    assert result.stdout.endswith("wrote tuned_interrupted.toml\nwrote tuned.json\n")
+    assert "wrote tuned_best.toml\ntuned.toml stays as it was" in result.stdout
     assert Path("tuned.toml").read_text("utf-8") == "# of an earlier tuning"
     assert not Path("tuned.png").exists()
-    said = tomllib.loads(Path("tuned_interrupted.toml").read_text("utf-8"))["status"]
-    assert said["code"] == "interrupted"
-    assert 10 < said["best_so_far"]["pid.Kp"] < 600
+    said = tomllib.loads(Path("tuned_best.toml").read_text("utf-8"))
+    assert said["status"]["code"] == "interrupted"
+    assert "holds" not in said["status"]["message"]
+    gain = read_tuning("tuned_best.toml", read_drive("drive.toml")[0].system()).parameters.value("pid.Kp")
+    assert 10 < gain < 600
+    assert gain != 100.0
+
+
+def test_a_tuning_that_is_interrupted_before_its_first_candidate_writes_no_gains(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*args: Any, **options: Any) -> TuningResult:
+        def stop(_: object) -> None:
+            raise KeyboardInterrupt
+
+        return tune(*args, **(options | {"progress": stop}))
+
+    monkeypatch.setattr(tune_module, "tune", stopped)
+    result = run("tune drive.toml tuning.toml -o tuned.toml")
+    assert result.exit_code == 130
+    assert "the gains of tuning.toml stand; best so far: none was found" in result.stdout
+    assert "tuned.toml is not written" in result.stdout
+    assert list(folder.glob("tuned*")) == []
 
 
 def test_a_fit_that_fails_is_written_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

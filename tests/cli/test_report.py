@@ -143,8 +143,8 @@ def test_a_tuning_that_is_refused_says_so_first(folder: Path, monkeypatch: pytes
         metrics = evaluate(loop, references, parameters)
         status = Status(Code.NOT_CERTIFIED, ("hunts at 0 to 0.2", "widen the limits"))
         empty = pd.DataFrame()
-        stats, units = {"rejected.pid.Kp": 321.0}, relevant_units(loop)
-        return TuningResult(parameters, metrics, metrics, empty, empty, (), status, stats, {}, units=units)
+        units, best = relevant_units(loop), {"pid.Kp": 321.0}
+        return TuningResult(parameters, metrics, metrics, empty, empty, (), status, {}, {}, units=units, best=best)
 
     monkeypatch.setattr(tune_module, "tune", refuse)
     result = run("tune", "drive.toml", "tuning.toml", "--report", "page.html", "-q")

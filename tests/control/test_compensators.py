@@ -26,7 +26,8 @@ from pneuopt.evaluation.record import record
 from pneuopt.evaluation.requirements import Overshoot, SettlingTime
 from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.evaluation.specification import specify
-from pneuopt.files.tuning import read_tuning, write_tuned
+from pneuopt.files.tuned import write_tuned
+from pneuopt.files.tuning import read_tuning
 from pneuopt.models import catalog
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck

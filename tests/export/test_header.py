@@ -26,6 +26,7 @@ HOSTILE = [
     "g **//** evil **)) ((**",
     "h '''{$crlf} <script>evil</script> \x00\x1b[2J\u2028evil",
     "i \\u002a/ evil",
+    "j höher, 軸, Ω évil",
 ]
 LOOP = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, limits=False))
 
@@ -36,6 +37,17 @@ def test_a_hostile_text_ends_no_comment(text: str) -> None:
     assert plain.isascii()
     assert plain.isprintable()
     assert not any(mark in plain for mark in ("*/", "/*", "(*", "*)", '"""', "'''", "\\", "??", "//"))
+
+
+@pytest.mark.parametrize("language", Language)
+def test_a_design_that_counts_on_a_delay_says_so_and_no_other_does(language: Language) -> None:
+    told = "The design counts on one sample from reading to acting."
+    for delay in (0, 1):
+        loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, limits=False, delay=delay))
+        first = next(
+            text for name, text in export_controller(loop, loop.parameters, language).items() if "test" not in name
+        )
+        assert (told in first) == bool(delay)
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler on the path")

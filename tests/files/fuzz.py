@@ -15,8 +15,11 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
+import tomlkit
+
 from pneuopt.cli.init import run_init
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.files.certificate import check_certificate, checksum_section
 from pneuopt.files.drive import read_covariance, read_drive, read_estimates, read_marks, read_status
 from pneuopt.files.requirements import bound_units
 from pneuopt.files.rig import read_rig
@@ -47,6 +50,17 @@ SCENARIOS = """
 count = 3
 seed = 1
 "load.mass" = "30 %"
+"""
+CERTIFICATE = """
+[certified]
+"0 to 0.1" = { SettlingTime = 0.3, Overshoot = 2.0 }
+[wire]
+centre = "5 V"
+[status]
+code = "converged"
+message = "certified objective 0.3"
+[provenance]
+pneuopt = "0.2"
 """
 VALUES = (
     *('"1e999 N"', '"-1e-999 m"', '"inf m/s"', '"nan"', "nan", "inf", "-inf", "1e308", "0", "-1", "1", "true", "[1]"),
@@ -101,6 +115,10 @@ def _write_base(kind: str, folder: Path) -> Base:
         texts["tuning.toml"] += SCENARIOS.replace("mass", "inertia" if kind == "rotary" else "mass")
     texts["fit.toml"] = texts["drive.toml"] + RESULT
     drive, parameters = read_drive(folder / "drive.toml")
+    (folder / "fit.toml").write_text(texts["fit.toml"], "utf-8")
+    document = tomlkit.parse(texts["tuning.toml"] + CERTIFICATE)
+    document["checksum"] = checksum_section(document.unwrap(), folder / "tuned.toml", folder / "fit.toml")
+    texts["tuned.toml"] = tomlkit.dumps(document)
     return Base(folder, texts, drive, parameters, read_tuning(folder / "tuning.toml", drive.system(), parameters))
 
 
@@ -116,6 +134,8 @@ def _read(base: Base, name: str, path: Path) -> str:
         given = base.parameters.fixed(*base.parameters.free_names) | task.parameters
         task.scenarios(given)
         task.validation_scenarios(given)
+    elif name == "tuned.toml":
+        check_certificate(base.folder / "fit.toml", path)
     elif name == "rig.toml":
         read_rig(path, base.drive, loop)
     else:

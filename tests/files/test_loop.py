@@ -10,7 +10,8 @@ from pneuopt.control.forms import Form, SeriesForm, to_parallel
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
 from pneuopt.files.toml import read_toml
-from pneuopt.files.tuning import read_tuning, write_tuned
+from pneuopt.files.tuned import write_tuned
+from pneuopt.files.tuning import read_tuning
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import SecondOrder

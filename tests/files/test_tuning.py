@@ -31,7 +31,8 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.files.drive import read_status
 from pneuopt.files.toml import read_toml
-from pneuopt.files.tuning import Tuning, read_tuning, write_tuned
+from pneuopt.files.tuned import write_tuned
+from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, PressureDependent
 from pneuopt.models.linear import SecondOrder
@@ -262,18 +263,6 @@ def test_a_tuned_file_keeps_the_users_text_and_adds_the_results(tmp_path: Path) 
     assert said["certified"] == {"0 to 0.2": {"SettlingTime": 0.25}}
     assert said["provenance"] == {"pneuopt": "0.1"}
     assert read_status(tmp_path / "tuned.toml") == Status(Code.CONVERGED, ("certified",))
-
-
-def test_a_failed_tuning_keeps_the_old_gains_and_no_old_certificate(tmp_path: Path) -> None:
-    _, found = read_all(tmp_path, {"pid.Kp": 12.34})
-    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", tuned(found))
-    failed = tuned(found.with_values({"pid.Kp": 50.0}), status=Status(Code.NOT_CERTIFIED, ("grazes the band",)))
-    write_tuned(tmp_path / "again.toml", tmp_path / "tuned.toml", failed)
-    assert read_tuning(tmp_path / "again.toml", PLANT).parameters.value("pid.Kp") == 12.34
-    said = read_toml(tmp_path / "again.toml").unwrap()
-    assert "certified" not in said
-    assert said["status"]["gains"] == "as in tuned.toml: not tuned"
-    assert read_status(tmp_path / "again.toml") == failed.status
 
 
 @settings(max_examples=30, deadline=None)

@@ -14,6 +14,7 @@ INSIDE = {
     "problems/demo/exported_names.py": "asks a controller for its parts, and the table of names for what is reserved",
     "problems/shared/exported_words.py": "asks the table of names for what is reserved",
     "problems/shared/hostile_names.py": "is a compensator of the library's protocol, and draws from its reserved names",
+    "problems/demo/forged_certificates.py": "runs the commands themselves, whose files it forges",
     "problems/shared/random_controllers.py": "draws from the registry of compensators; begins as a program does",
     "problems/shared/b32.py": "makes its logs by machine code, and times one simulation of it as the unit of cost",
     "problems/shared/random_problems.py": "finds feasible designs by brute force on the search's batched simulator",

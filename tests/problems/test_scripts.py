@@ -5,7 +5,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from problems.demo import other_rigs, rig_demo
+from problems.demo import forged_certificates, other_rigs, rig_demo
 from problems.friction import stick_slip
 from problems.identify import (
     b32,
@@ -70,6 +70,11 @@ def test_rig_demo(tmp_path: Path) -> None:
     assert failed(rig_demo.main(demo)) == []
     rig_demo.figure(demo).savefig(tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_forged_certificates() -> None:
+    assert failed(forged_certificates.main()) == []
 
 
 @pytest.mark.slow

@@ -164,7 +164,7 @@ def test_an_optimum_that_grazes_is_rejected() -> None:
     refused = prepare_search(prepare_task(loop, STEP, parameters, spec), method).run()
     assert refused.status.code is Code.NOT_CERTIFIED
     assert [refused.parameters.value(n) for n in GAINS] == [parameters.value(n) for n in GAINS]
-    assert refused.stats["rejected.pid.Kp"] != parameters.value("pid.Kp")
+    assert refused.best["pid.Kp"] != parameters.value("pid.Kp")
     second = tune(loop, STEP, parameters, minimise=spec, method=method, plants={})
     assert "the first search's design was refused" in second.status.message
     assert second.certified.loc["SettlingTime"].max() > refused.stats["optimum"]
@@ -379,15 +379,20 @@ def test_ctrl_c_keeps_the_given_gains_and_shows_the_best_so_far_certified() -> N
     result = interrupted(after=16)  # the first line says that the given gains never settle
     assert result.status.code is Code.INTERRUPTED
     count = f"{result.stats['simulations']:.0f}"
-    assert result.status.message.startswith(f"the best of {count} simulations so far holds: certified objective 0.0")
+    assert result.status.message.startswith(f"the best of {count} simulations so far keeps every limit on the model: ")
+    assert "not tried on other plants" in result.status.message
+    assert "holds" not in result.status.message
+    assert result.candidate is not None
     assert 100 < int(count) < 400
     assert {n: p.value for n, p in result.parameters.items()} == {n: p.value for n, p in given.items()}
     assert result.certified["0 to 0.1"]["SettlingTime"] < 0.1
-    assert result.stats["rejected.pid.Kp"] != given.value("pid.Kp")
+    assert result.best["pid.Kp"] != given.value("pid.Kp")
 
 
 def test_ctrl_c_at_once_says_that_nothing_was_found() -> None:
-    assert interrupted(after=1).status.message.startswith("the best of 1 simulations so far does not hold")
+    first = interrupted(after=1)
+    assert first.status.message.startswith("interrupted before anything better than the given gains was found")
+    assert (first.best, first.candidate) == ({}, None)
     result = interrupted(after=2)
     assert result.status.code is Code.INTERRUPTED
     assert result.status.message.startswith("the best of 16 simulations so far ")

@@ -1,0 +1,113 @@
+"""`pneuopt simulate FIT TUNING`: the response of a loop, and whether its certificate holds."""
+
+from functools import partial
+from pathlib import Path
+
+from pneuopt.cli.shared import (
+    Columns,
+    Outputs,
+    Writers,
+    add_to_stem,
+    describe_status,
+    file_hashes,
+    finish,
+    read_fit_and_tuning,
+    write_csv,
+)
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.evaluation.certificate import certificate
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.report import metric_limits, relevant_units, report_metrics
+from pneuopt.files.certificate import CertificateCheck, check_certificate
+from pneuopt.files.tuning import Tuning
+from pneuopt.plotting import Response
+from pneuopt.quantities.output import check_output_paths, records
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.report.fit_page import Source
+from pneuopt.report.loop_figures import simulate_responses
+from pneuopt.report.page import Page
+from pneuopt.report.tuning_page import LoopView, simulation_page
+
+
+def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
+    """Simulate the closed loop of a tuning's file; returns the exit status."""
+    outputs.check([fit, tuning], "bode")
+    task, parameters = read_fit_and_tuning(fit, tuning)
+    found = check_certificate(fit, tuning)
+    standing = Report() if found is None else _report_standing(found, tuning)
+    scenarios = task.scenarios(parameters)
+    metrics = evaluate(
+        task.loop,
+        task.references,
+        parameters,
+        scenarios=scenarios,
+        band=task.specification.band,
+        envelope=task.specification.envelope,
+        max_steps=task.max_steps,
+    )
+    writers: Writers = {}
+    if outputs.output is not None:
+        runs = [_as_logged(r, task.centre) for r in simulate_responses(task.loop, task.references, parameters)]
+        paths = number_paths(outputs.output, len(runs))
+        check_output_paths(paths, [fit, tuning])
+        columns = _loop_columns(task.loop)
+        writers |= {p: partial(write_csv, run=run, columns=columns) for p, run in zip(paths, runs, strict=True)}
+    tables = {"certified": records(metrics.T), "provenance": file_hashes(fit, tuning)}
+    tables |= {} if found is None else {"certificate": {"holds": found.holds, "reasons": list(found.reasons)}}
+    view, limits = loop_view(task, parameters), metric_limits(task.specification.limits)
+    report = standing + report_metrics(metrics, relevant_units(task.loop), limits=limits)
+    page = partial(_simulation_page, fit, tuning, task, view, parameters, standing)
+    return finish(outputs, writers, tables, None, figures=view.figures, report=report, page=page)
+
+
+def _report_standing(found: CertificateCheck, tuning: Path) -> Report:
+    """Whether the certificate in a tuned.toml holds for the gains and the plant that are simulated."""
+    if found.holds:
+        return Report(
+            (Line(f"certified: the certificate in {tuning} holds for these gains and this plant", Tone.GOOD),)
+        )
+    return Report(tuple(Line(line, Tone.BAD) for line in found.lines))
+
+
+def loop_view(task: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> LoopView:
+    """What figures of a tuning's loop are drawn from."""
+    complete = task.loop.complete
+    earlier = None if before is None else complete(before)
+    return LoopView(task.loop, task.references, complete(parameters), earlier, task.specification.band)
+
+
+def _simulation_page(
+    fit: Path, tuning: Path, task: Tuning, view: LoopView, parameters: ParameterSet, standing: Report
+) -> Page:
+    """The page of a simulated loop, which looks for defects beyond the horizon, too."""
+    found = certificate(
+        task.loop,
+        task.references,
+        parameters,
+        scenarios=task.scenarios(parameters),
+        band=task.specification.band,
+        envelope=task.specification.envelope,
+    )
+    source = Source(f"Simulation of {fit.name} with {tuning.name}", file_hashes(fit, tuning), describe_status(fit))
+    return simulation_page(source, found, view, metric_limits(task.specification.limits), standing=standing)
+
+
+def number_paths(path: Path, count: int) -> list[Path]:
+    """One file a run: run.csv, or run_1.csv, run_2.csv."""
+    return [path] if count == 1 else [add_to_stem(path, str(k)) for k in range(1, count + 1)]
+
+
+def _loop_columns(loop: ClosedLoop) -> Columns:
+    """Columns of a response as a log names them, so that it can be read as one."""
+    measured, command = loop.feedback, loop.command
+    columns = {"reference": (f"{measured.name}_reference", measured.unit)}
+    columns |= {q.name: (q.name, q.unit) for q in loop.plant.outputs}
+    return columns | {"control": (command.name, command.unit)}
+
+
+def _as_logged(response: Response, centre: float) -> Trajectory:
+    """The response with its reference, and with the command that is on the wire."""
+    run, reference = response.run, response.reference
+    return run.with_columns({"reference": reference.values(run.t), "control": run["control"] + centre})
