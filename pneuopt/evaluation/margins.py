@@ -15,8 +15,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import eigvals
+from scipy.linalg import eig, eigvals, matrix_balance
 from scipy.optimize import brentq, minimize_scalar
+from scipy.sparse.csgraph import connected_components
 
 from pneuopt.control.compensation import acting_always
 from pneuopt.control.linear_controller import linear_gains, pade_delay_response
@@ -31,6 +32,14 @@ ComplexArray = NDArray[np.complex128]
 # Angle over a horizon of the slowest noise that counts [rad]. With a smaller one the noise gain is that of a drift, far
 # slower than the response; with a larger one a resonance of slow loops is missed.
 NOISE_ANGLE = 0.3
+# Share of a matrix's size by which rounding moves its well conditioned poles. With a smaller one the drift of a piston
+# under speed control makes it unstable; with a larger one slow instabilities beside fast filters pass.
+ROUNDING = 1e-13
+# Relative change of a response between the two lowest frequencies of a grid, below which it is that at rest. With a
+# larger one an integral's response counts as one; with a smaller one a gain margin at rest is missed on a coarse grid.
+FLAT = 1e-3
+# Share of the fastest pole beyond which no rounding moves even a double pole at zero, the root of a double's precision.
+MOST_ROUNDING = 1e-7
 
 
 @dataclass(frozen=True)
@@ -40,11 +49,13 @@ class Margins:
     Attributes
     ----------
     gain_margin : float
-        Factor on the gain at which the loop oscillates, the closest to one of several; inf where there is none.
+        Factor on the gain, up or down, beyond which the loop is unstable, the closest to one of several; inf where
+        there is none.
     phase_margin : float
         Phase margin [deg], the smallest magnitude of several; inf where the gain never crosses one.
     gain_crossover, phase_crossover : float
-        Frequencies of the phase margin and of the gain margin [rad/s]; NaN where there is none.
+        Frequencies of the phase margin and of the gain margin [rad/s]; NaN where there is none. At a gain margin at 0
+        the loop does not swing, but runs away: that of an unstable plant under a P controller.
     max_sensitivity : float
         ``Ms = max |1/(1 + L(jw))|``; its reciprocal is the Nyquist curve's distance from -1.
     max_sensitivity_frequency : float
@@ -124,12 +135,13 @@ def margins(open_loop: Linearisation, on_grid: GridResponse | None = None) -> Ma
     real = _crossing_frequencies(lambda w: response(w).imag, omega, L.imag)
     phases = [((float(np.angle(response(w), deg=True)) % 360) - 180, w) for w in gain]
     gains = [(1 / abs(z), w) for w in real if (z := response(w)).real < 0]
+    gains += [(1 / abs(L[0]), 0.0)] if rests_below_zero(L[None, :2])[0] else []
     gain_margin, phase_crossover = min(gains, key=lambda g: abs(np.log(g[0])), default=(inf, nan))
     phase_margin, gain_crossover = min(phases, key=lambda m: abs(m[0]), default=(inf, nan))
     D = float(open_loop.D[0, 0])
     Ms, at = _response_peak(lambda _, L: 1 / (1 + L), open_loop, on_grid, 1 / (1 + D))
     Mt, _ = _response_peak(lambda _, L: 1 - 1 / (1 + L), open_loop, on_grid, D / (1 + D))
-    stable = bool(are_stable(_loop_poles(open_loop)))
+    stable = bool(are_stable(_closed_loop(open_loop)[None])[0])
     return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, stable)
 
 
@@ -234,7 +246,7 @@ def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
 
     Logarithmic from three decades below the slowest pole or zero to three above the fastest, denser at resonances.
     """
-    roots = np.concatenate([eigvals(open_loop.A), _loop_poles(open_loop), _zeros(open_loop)])
+    roots = np.concatenate([eigvals(open_loop.A), eigvals(_closed_loop(open_loop)), _zeros(open_loop)])
     size = [s for s in np.abs(roots) if s > 1e-10 * np.max(np.abs(roots))]
     low, high = min(size, default=1.0), max(size, default=1.0)
     decades = np.log10(high / low) + 6
@@ -333,6 +345,12 @@ def _crossing_frequencies(function: Callable[[float], float], omega: Array, valu
     return sorted(exact + [float(brentq(function, omega[k], omega[k + 1], xtol=1e-14 * omega[k])) for k in brackets])
 
 
+def rests_below_zero(first: ComplexArray) -> NDArray[np.bool_]:
+    """Whether L(0) is finite and negative, by L at the two lowest frequencies of a grid, shape (m, 2)."""
+    is_flat = np.abs(first[:, 0] - first[:, 1]) < FLAT * np.abs(first[:, 0])
+    return np.asarray(is_flat & (first[:, 0].real < -(1 - FLAT) * np.abs(first[:, 0])))
+
+
 def _response_peak(
     response: Callable[[Array, ComplexArray], ComplexArray],
     open_loop: Linearisation,
@@ -356,9 +374,8 @@ def _response_peak(
     return (largest, at) if largest > abs(limit) else (abs(limit), inf)
 
 
-def _loop_poles(open_loop: Linearisation) -> ComplexArray:
-    feedback = open_loop.B @ open_loop.C / (1 + open_loop.D[0, 0])
-    return np.asarray(eigvals(open_loop.A - feedback), dtype=complex)
+def _closed_loop(open_loop: Linearisation) -> Array:
+    return np.asarray(open_loop.A - open_loop.B @ open_loop.C / (1 + open_loop.D[0, 0]))
 
 
 def _zeros(open_loop: Linearisation) -> ComplexArray:
@@ -369,9 +386,30 @@ def _zeros(open_loop: Linearisation) -> ComplexArray:
     return np.array([z for z in zeros if np.abs(z) < 1e3 * fastest], dtype=complex)
 
 
-def are_stable(poles: ComplexArray) -> NDArray[np.bool_]:
-    """Which loops are stable, by their closed loop's poles along the last axis.
+def are_stable(closed: Array, poles: ComplexArray | None = None) -> NDArray[np.bool_]:
+    """Which closed loops are stable, by their state matrices, shape (m, n, n), and their poles where they are known.
 
-    Poles at zero are allowed: a position in a speed loop, an unused integral.
+    Poles at zero are allowed: a position in a speed loop, an unused integral. A pole counts as zero where rounding may
+    have moved it that far, whatever the fastest pole (`_has_stable_poles`).
     """
-    return np.asarray(poles.real.max(axis=-1, initial=-1.0) <= 1e-7 * np.abs(poles).max(axis=-1, initial=1.0))
+    poles = np.linalg.eigvals(closed) if poles is None else poles
+    growth, size = poles.real.max(axis=-1, initial=-1.0), np.abs(poles).max(axis=-1, initial=1.0)
+    stable = np.asarray(growth <= 0)
+    for k in np.flatnonzero(~stable & (growth <= MOST_ROUNDING * size)):
+        label = connected_components(closed[k] != 0, connection="strong")[1]
+        parts = (np.flatnonzero(label == part) for part in range(label.max() + 1))
+        stable[k] = all(_has_stable_poles(closed[k][np.ix_(part, part)]) for part in parts)
+    return stable
+
+
+def _has_stable_poles(A: Array) -> bool:
+    """Whether no pole of a matrix, none of whose parts stands alone, lies further right of zero than rounding moves it.
+
+    That is `ROUNDING` times the size of the balanced matrix times the pole's condition number: G. H. Golub & C. F. Van
+    Loan, Matrix Computations, 4th ed., Johns Hopkins 2013, section 7.2.2.
+    """
+    balanced = matrix_balance(A)[0]
+    poles, left, right = eig(balanced, left=True, right=True)
+    with np.errstate(divide="ignore"):
+        condition = 1 / np.abs((left.conj() * right).sum(axis=0))
+    return bool((poles.real <= ROUNDING * np.linalg.norm(balanced) * condition).all())
