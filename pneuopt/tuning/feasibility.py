@@ -117,10 +117,12 @@ def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
     """Check that the least noise gain within the bounds keeps its limit."""
     if loop.is_composed:  # what the other paths add may turn the PID's gain either way
         return
-    Tf = _parameter_range(space, "pid.Tf")[1] + 0.5 * (loop.pid.sample_time or 0.0)  # as `linear_gains` has it
-    least = _least_size(space, "pid.Kp") + (_least_size(space, "pid.Kd") / Tf if Tf else 0.0)
+    filters = [Tf + 0.5 * (loop.pid.sample_time or 0.0) for Tf in _parameter_range(space, "pid.Tf")]
+    high = [d / Tf for d in _parameter_range(space, "pid.Kd") for Tf in filters if Tf]  # Tf as `linear_gains` has it
+    Kp = _parameter_range(space, "pid.Kp")
+    least = _nearest_to_zero(Kp[0] + min(high, default=0.0), Kp[1] + max(high, default=0.0))
     message = (
-        f"NoiseGain: max {spec.limit(NoiseGain):g} is below Kp + Kd/Tf, at least {least:.4g} within the gains' bounds"
+        f"NoiseGain: max {spec.limit(NoiseGain):g} is below |Kp + Kd/Tf|, at least {least:.4g} within the gains' bounds"
     )
     require(least <= spec.limit(NoiseGain), f"{message}; lower pid.Kp or pid.Kd, raise pid.Tf, or raise max")
 
@@ -266,7 +268,11 @@ def _parameter_range(space: Space, n: str) -> tuple[float, float]:
 
 def _least_size(space: Space, n: str) -> float:
     """The least absolute value that a parameter may have."""
-    low, high = _parameter_range(space, n)
+    return _nearest_to_zero(*_parameter_range(space, n))
+
+
+def _nearest_to_zero(low: float, high: float) -> float:
+    """The least absolute value of a range."""
     return 0.0 if low <= 0 <= high else min(abs(low), abs(high))
 
 

@@ -100,8 +100,8 @@ def test_no_old_file_is_replaced_and_then_none_is_written(place: Path) -> None:
     [
         (
             'code = "converged"',
-            'code = "the limits contradict each other"',
-            "its tuning ended so: the limits contradict each other, so that no certificate holds",
+            'code = "no answer found keeps all limits"',
+            "its tuning ended so: no answer found keeps all limits, so that no certificate holds",
         ),
         ("[status]", "[provenance]", "its gains were not written by pneuopt tune"),
         ('sample_time = "1 ms"', "", "a continuous controller cannot be exported"),

@@ -235,7 +235,7 @@ CONTRADICTIONS: dict[str, tuple[list[Requirement], str]] = {
     "tube after the record": ([StepEnvelope(((2.0, 0.9, 1.1),))], "begins 2 s after the step, the record of"),
     "noise below the least gain": (
         [NoiseGain(0.5)],
-        "max 0.5 is below Kp + Kd/Tf, at least 1 within the gains' bounds",
+        "max 0.5 is below |Kp + Kd/Tf|, at least 1 within the gains' bounds",
     ),
 }
 
@@ -244,6 +244,19 @@ CONTRADICTIONS: dict[str, tuple[list[Requirement], str]] = {
 def test_contradictory_limits_are_named_with_their_numbers(case: str) -> None:
     limits, message = CONTRADICTIONS[case]
     assert message in refusal(lag(), Step(1.0), limits)
+
+
+def test_a_derivative_against_the_proportional_gain_may_keep_a_noise_limit() -> None:
+    """At high frequency they add up to ``|Kp + Kd/Tf|``, which is zero where they have opposite signs."""
+    loop, given = lag()
+    bounds = {"pid.Kp": (1.0, 4.0), "pid.Kd": (-0.1, -0.01)}
+    opposed = given.with_values({"pid.Kd": -0.02, "pid.Tf": 0.01}).with_bounds(bounds).freed(*bounds)
+    space = search_space(loop, opposed)
+    check_feasibility(
+        loop, cases([Step(1.0)], NO_SCENARIOS, space.parameters, space.names), space, specify(IAE(), [NoiseGain(0.5)])
+    )
+    alike = given.with_values({"pid.Kd": 0.05}).with_bounds({**bounds, "pid.Kd": (0.01, 0.1)}).freed(*bounds)
+    assert "is below |Kp + Kd/Tf|, at least" in refusal((loop, alike), Step(1.0), [NoiseGain(0.5)])
 
 
 def test_a_start_that_never_settles_is_reported_and_searched_from() -> None:
