@@ -14,8 +14,6 @@ from pneuopt.control.linear_controller import controller_matrices, linear_gains,
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.margins import (
-    ComplexArray,
-    are_stable,
     batch_frequency_response,
     controller_parts,
     rests_below_zero,
@@ -23,6 +21,7 @@ from pneuopt.evaluation.margins import (
 from pneuopt.evaluation.operating_points import NOISE_GAIN, counted_points
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.sensitivity_peaks import PEAK_GRID_POINTS, PEAK_REFINEMENTS, sensitivity_peaks
+from pneuopt.evaluation.stability import ComplexArray, are_stable
 from pneuopt.quantities.arrays import Array
 
 MAX_SENSITIVITY = "MaxSensitivity"

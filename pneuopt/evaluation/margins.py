@@ -15,31 +15,25 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import eig, eigvals, matrix_balance
+from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
-from scipy.sparse.csgraph import connected_components
 
 from pneuopt.control.compensation import acting_always
 from pneuopt.control.linear_controller import linear_gains, pade_delay_response
 from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.stability import ComplexArray, are_stable
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 
-ComplexArray = NDArray[np.complex128]
 # Angle over a horizon of the slowest noise that counts [rad]. With a smaller one the noise gain is that of a drift, far
 # slower than the response; with a larger one a resonance of slow loops is missed.
 NOISE_ANGLE = 0.3
-# Share of a matrix's size by which rounding moves its well conditioned poles. With a smaller one the drift of a piston
-# under speed control makes it unstable; with a larger one slow instabilities beside fast filters pass.
-ROUNDING = 1e-13
 # Relative change of a response between the two lowest frequencies of a grid, below which it is that at rest. With a
 # larger one an integral's response counts as one; with a smaller one a gain margin at rest is missed on a coarse grid.
 FLAT = 1e-3
-# Share of the fastest pole beyond which no rounding moves even a double pole at zero, the root of a double's precision.
-MOST_ROUNDING = 1e-7
 
 
 @dataclass(frozen=True)
@@ -384,32 +378,3 @@ def _zeros(open_loop: Linearisation) -> ComplexArray:
     zeros = np.asarray(eigvals(pencil, np.diag([1.0] * n + [0.0])), dtype=complex)
     fastest = np.max(np.abs(eigvals(open_loop.A)), initial=1.0)
     return np.array([z for z in zeros if np.abs(z) < 1e3 * fastest], dtype=complex)
-
-
-def are_stable(closed: Array, poles: ComplexArray | None = None) -> NDArray[np.bool_]:
-    """Which closed loops are stable, by their state matrices, shape (m, n, n), and their poles where they are known.
-
-    Poles at zero are allowed: a position in a speed loop, an unused integral. A pole counts as zero where rounding may
-    have moved it that far, whatever the fastest pole (`_has_stable_poles`).
-    """
-    poles = np.linalg.eigvals(closed) if poles is None else poles
-    growth, size = poles.real.max(axis=-1, initial=-1.0), np.abs(poles).max(axis=-1, initial=1.0)
-    stable = np.asarray(growth <= 0)
-    for k in np.flatnonzero(~stable & (growth <= MOST_ROUNDING * size)):
-        label = connected_components(closed[k] != 0, connection="strong")[1]
-        parts = (np.flatnonzero(label == part) for part in range(label.max() + 1))
-        stable[k] = all(_has_stable_poles(closed[k][np.ix_(part, part)]) for part in parts)
-    return stable
-
-
-def _has_stable_poles(A: Array) -> bool:
-    """Whether no pole of a matrix, none of whose parts stands alone, lies further right of zero than rounding moves it.
-
-    That is `ROUNDING` times the size of the balanced matrix times the pole's condition number: G. H. Golub & C. F. Van
-    Loan, Matrix Computations, 4th ed., Johns Hopkins 2013, section 7.2.2.
-    """
-    balanced = matrix_balance(A)[0]
-    poles, left, right = eig(balanced, left=True, right=True)
-    with np.errstate(divide="ignore"):
-        condition = 1 / np.abs((left.conj() * right).sum(axis=0))
-    return bool((poles.real <= ROUNDING * np.linalg.norm(balanced) * condition).all())

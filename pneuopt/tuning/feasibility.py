@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from math import inf
 
 import numpy as np
 
+from pneuopt.control.averaged_plant import is_affine
 from pneuopt.control.compensation import acting_always
 from pneuopt.control.composed_loops import ComposedLoops
 from pneuopt.control.dither import DITHER_AMPLITUDE
@@ -17,12 +19,20 @@ from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.counts import describe_counts, sees_speed
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
-from pneuopt.evaluation.margins import are_stable
 from pneuopt.evaluation.motion_requirements import FollowingError
 from pneuopt.evaluation.move_check import check_motion
-from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
+from pneuopt.evaluation.requirements import (
+    NoiseGain,
+    PeakControl,
+    RiseTime,
+    SettlingTime,
+    SteadyStateError,
+    metric_name,
+    upper_limit,
+)
 from pneuopt.evaluation.response import highest_dither_frequency
 from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.stability import are_stable
 from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
@@ -34,6 +44,7 @@ SIGNED_GAINS = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")  # which turn with the ac
 # Growth of a deviation over the horizon, in its logarithm, below which nothing is called unstable before a search. A
 # smaller one meets the rounding of poles at zero; a larger one leaves slow instabilities to the certificate.
 LEAST_GROWTH = 1e-3
+JUST_BELOW = 0.999  # of a pole: where the number of poles beyond is counted, far from rounding
 # Parameters over whose corners a loop's instability is proved, at most: their corners double with each.
 MAX_CORNER_NAMES = 10
 # Points within the bounds that count beside the corners. Fewer may miss a dither that stabilises the loop.
@@ -72,7 +83,7 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
         check_travel(loop, case, space.parameters)
         check_motion(loop, case, space.parameters)
         _check_hold(loop, case, space, spec)
-    _check_stability(loop, cases[0], space)
+    _check_stability(loop, cases[0], space, spec)
 
 
 def _check_dither(loop: ClosedLoop, space: Space) -> None:
@@ -199,7 +210,7 @@ def _describe_command_excess(
     return ""
 
 
-def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
+def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
     """Check that the bounds allow gains that may stabilise the loop, linearised where the reference ends.
 
     The closed loop's characteristic polynomial is positive for large s > 0, so it is negative where an odd number of
@@ -207,7 +218,13 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
     corners of the gains' bounds, it is so for all gains within, and each of them has an unstable pole beyond s. Of a
     sampled loop this holds for z = (1 + s h/2)/(1 - s h/2) > 1 (`ComposedLoops`). Points within the bounds count as
     well, for what need not be monotone, such as a free dither.
+
+    A nonlinear loop may rest elsewhere where it may miss the reference. Its growth counts within the horizon, and a
+    slower one where other gains remove it: else it is a drift of the plant's own, such as a piston's position has.
     """
+    may_miss = spec.limit(SteadyStateError) < inf and not spec.concerns(SettlingTime)
+    if may_miss and not is_affine(loop.plant):
+        return
     names, order = [n for n in space.names if _shapes_linear_loop(loop, n)], list(space.parameters)
     if len(names) > MAX_CORNER_NAMES:
         return
@@ -227,6 +244,8 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
         remedies = [words for words, by in changes.items() if are_stable(_closed_loops(loop, p * by, *at)).any()]
     except (ConvergenceError, InputError, ModelError, np.linalg.LinAlgError):
         return  # no linearisation, no proof
+    if not (remedies or is_affine(loop.plant) or growth * case.reference.horizon >= 1):
+        return
     ranges = {n: _parameter_range(space, n) for n in SIGNED_GAINS if any(_parameter_range(space, n))}
     words = ", ".join(f"{n} {f'within [{a:g}, {b:g}]' if a < b else f'= {a:g}'}" for n, (a, b) in ranges.items())
     end = write_value(case.reference.final, loop.feedback.unit, 3)
@@ -253,9 +272,9 @@ def _common_growth(loop: ClosedLoop, closed: Array, least: float) -> float:
     """The largest rate, above `least` [1/s], beyond which all loops have an odd number of real poles; 0 for none."""
     poles, h = np.linalg.eigvals(closed).astype(complex), loop.pid.sample_time
     real = np.where((poles.imag == 0) & (poles.real < (2 / h if h else inf)), poles.real, 0.0)
-    ends = np.array([least, *np.unique(real[real > least])])
-    between = np.sqrt(ends[:-1] * ends[1:])
-    return max((s for s in between.tolist() if ((real > s).sum(axis=1) % 2).all()), default=0.0)
+    ends = [least, *np.unique(real[real > least]).tolist()]
+    rates = [JUST_BELOW * b for a, b in pairwise(ends) if JUST_BELOW * b > a]
+    return max((s for s in rates if ((real > s).sum(axis=1) % 2).all()), default=0.0)
 
 
 def _parameter_range(space: Space, n: str) -> tuple[float, float]:

@@ -15,7 +15,6 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import Linearisation, System, define
 from pneuopt.evaluation.batch_margins import _partial_fraction_response, batch_margin_function
 from pneuopt.evaluation.margins import (
-    are_stable,
     batch_frequency_response,
     frequency_grid,
     frequency_response,
@@ -23,6 +22,7 @@ from pneuopt.evaluation.margins import (
     noise_gain,
     sensitivity_terms,
 )
+from pneuopt.evaluation.stability import are_stable
 from pneuopt.models.catalog import s32
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.errors import ModelError
