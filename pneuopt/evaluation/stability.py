@@ -1,5 +1,7 @@
 """`are_stable`: which closed loops are stable, each pole judged by how far rounding may have moved it."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eig, matrix_balance
@@ -21,8 +23,8 @@ def are_stable(closed: Array, poles: ComplexArray | None = None) -> NDArray[np.b
     Poles at zero are allowed: a position in a speed loop, an unused integral. A pole counts as zero where rounding may
     have moved it that far, whatever the fastest pole (`_has_stable_poles`).
     """
-    poles = np.linalg.eigvals(closed) if poles is None else poles
-    growth, size = poles.real.max(axis=-1, initial=-1.0), np.abs(poles).max(axis=-1, initial=1.0)
+    found = np.linalg.eigvals(closed).astype(complex) if poles is None else poles
+    growth, size = found.real.max(axis=-1, initial=-1.0), np.abs(found).max(axis=-1, initial=1.0)
     stable = np.asarray(growth <= 0)
     for k in np.flatnonzero(~stable & (growth <= MOST_POLE_ROUNDING * size)):
         label = connected_components(closed[k] != 0, connection="strong")[1]
@@ -38,7 +40,8 @@ def _has_stable_poles(A: Array) -> bool:
     Van Loan, Matrix Computations, 4th ed., Johns Hopkins 2013, section 7.2.2.
     """
     balanced = matrix_balance(A)[0]
-    poles, left, right = eig(balanced, left=True, right=True)
+    parts: Any = eig(balanced, left=True, right=True)
+    poles, left, right = parts
     with np.errstate(divide="ignore"):
         condition = 1 / np.abs((left.conj() * right).sum(axis=0))
     return bool((poles.real <= POLE_ROUNDING * np.linalg.norm(balanced) * condition).all())
