@@ -33,7 +33,11 @@ RATIOS = (0.3, 0.7, 1.0, 2.0)  # speed wanted, of the Stribeck velocity
 SAMPLE = 1e-3  # [s]
 MOST_SECONDS = 60.0  # [s] of CPU time of a tuning
 LAWS = ("stribeck", "lugre", "karnopp")
-FRICTIONS = {"stribeck": po.Stribeck(), "lugre": po.LuGre(), "karnopp": po.Karnopp(po.Stribeck())}
+FRICTIONS: Mapping[str, po.Stribeck | po.LuGre | po.Karnopp] = {
+    "stribeck": po.Stribeck(),
+    "lugre": po.LuGre(),
+    "karnopp": po.Karnopp(po.Stribeck()),
+}
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,7 @@ class Tuning:
         """[s]; NaN without a certified design."""
         if self.result is None or not self.is_certified:
             return float("nan")
-        return float(self.result.certified.loc["SettlingTime"].max())
+        return float(self.result.certified.loc["SettlingTime"].to_numpy(dtype=float).max())
 
 
 Runs = Mapping[tuple[str, str, float], Tuning]

@@ -21,7 +21,7 @@ from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import SensorLag
 from pneuopt.dynamics.system import System, define
-from pneuopt.evaluation.requirements import IAE, Overshoot, SettlingTime, SteadyStateError
+from pneuopt.evaluation.requirements import IAE, MaxSensitivity, Overshoot, SettlingTime, SteadyStateError
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive
@@ -251,7 +251,7 @@ def closed_poles(transfer: Transfer, gains: NDArray[np.float64], h: float | None
     n = full[0].shape[1] - 1
     companion = np.tile(np.eye(n, k=-1), (len(gains), 1, 1))
     companion[:, 0] = -full[0][:, 1:] / full[0][:, :1]
-    return np.linalg.eigvals(companion)
+    return np.linalg.eigvals(companion).astype(complex)
 
 
 pole = st.one_of(st.floats(-20.0, -0.2), st.floats(-20.0, -0.2), st.floats(0.2, 6.0), st.just(0.0))
@@ -335,3 +335,45 @@ def test_a_crawl_step_is_tuned_and_certified(friction: Stribeck | LuGre) -> None
     best = tune(loop, step, p, minimise=SettlingTime(), subject_to=[Overshoot(0.2)], plants={})
     assert best.certified.loc["SettlingTime"].max() < 0.15
     assert best.parameters.value("pid.Kp") > 0
+
+
+TUNED: dict[str, tuple[System, Bounds, Mapping[str, float], float | None]] = {  # plant, bounds, fixed values, sampling
+    "one unstable pole": (
+        plant([1.0], [1.0, -1.0]),
+        {"pid.Kp": (1.5, 8.0), "pid.Ki": (0.1, 8.0)},
+        {"pid.Tf": 0.1},
+        None,
+    ),
+    "two unstable poles": (
+        plant([1.0], [1.0, -3.0, 2.0]),
+        {"pid.Kp": (9.0, 51.0), "pid.Ki": (0.0, 60.0), "pid.Kd": (0.0, 18.0)},
+        {"pid.Tf": 0.005},
+        None,
+    ),
+    "a sampled pendulum": (
+        plant([1.0], [1.0, 0.1, -9.81]),
+        {"pid.Kp": (10.0, 90.0), "pid.Ki": (0.0, 90.0), "pid.Kd": (0.0, 18.0)},
+        {"pid.Tf": 0.02, "pid.b": 0.5},
+        0.01,
+    ),
+    "a zero beyond the pole": (
+        plant([-1.0, 8.0], [0.01, 0.99, -1.0]),
+        {"pid.Kp": (0.05, 0.6), "pid.Ki": (0.0, 0.2)},
+        {"pid.b": 0.3},
+        None,
+    ),
+    "two integrals": (plant([3.0], [1.0, 0.0, 0.0]), {"pid.Kp": (1.0, 9.0), "pid.Kd": (1.0, 9.0)}, {}, None),
+    "a negative gain": (plant([-2.0], [0.5, 1.0]), {"pid.Kp": (-9.0, -0.1), "pid.Ki": (-20.0, -0.1)}, {}, None),
+}
+
+
+@pytest.mark.slow  # 1 to 3 s each
+@pytest.mark.parametrize("case", TUNED)
+def test_plants_that_run_away_or_turn_the_sign_are_tuned_and_certified(case: str) -> None:
+    system, bounds, fixed, h = TUNED[case]
+    loop = ClosedLoop(system, PID(h, limits=False))
+    middle = {n: 0.5 * (low + up) for n, (low, up) in bounds.items()}
+    p = loop.parameters.with_values(middle | fixed).with_bounds(bounds).freed(*bounds)
+    limits = [Overshoot(0.6), MaxSensitivity(3.0)]
+    best = tune(loop, Step(1.0, horizon=10.0), p, minimise=SettlingTime(), subject_to=limits, plants={})
+    assert best.certified.loc["MaxSensitivity"].max() <= 3.0
