@@ -129,7 +129,7 @@ def margins(open_loop: Linearisation, on_grid: GridResponse | None = None) -> Ma
     real = _crossing_frequencies(lambda w: response(w).imag, omega, L.imag)
     phases = [((float(np.angle(response(w), deg=True)) % 360) - 180, w) for w in gain]
     gains = [(1 / abs(z), w) for w in real if (z := response(w)).real < 0]
-    gains += [(1 / abs(L[0]), 0.0)] if rests_below_zero(L[None, :2])[0] else []
+    gains += [(float(1 / abs(L[0])), 0.0)] if rests_below_zero(L[None, :2])[0] else []
     gain_margin, phase_crossover = min(gains, key=lambda g: abs(np.log(g[0])), default=(inf, nan))
     phase_margin, gain_crossover = min(phases, key=lambda m: abs(m[0]), default=(inf, nan))
     D = float(open_loop.D[0, 0])

@@ -373,7 +373,7 @@ def test_plants_that_run_away_or_turn_the_sign_are_tuned_and_certified(case: str
     system, bounds, fixed, h = TUNED[case]
     loop = ClosedLoop(system, PID(h, limits=False))
     middle = {n: 0.5 * (low + up) for n, (low, up) in bounds.items()}
-    p = loop.parameters.with_values(middle | fixed).with_bounds(bounds).freed(*bounds)
+    p = loop.parameters.with_values({**middle, **fixed}).with_bounds(bounds).freed(*bounds)
     limits = [Overshoot(0.6), MaxSensitivity(3.0)]
     best = tune(loop, Step(1.0, horizon=10.0), p, minimise=SettlingTime(), subject_to=limits, plants={})
     assert best.certified.loc["MaxSensitivity"].max() <= 3.0
