@@ -13,10 +13,15 @@ from pneuopt.control.composed_loops import ComposedLoops
 from pneuopt.control.linear_controller import controller_matrices, linear_gains, pade_delay_response
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import names
-from pneuopt.evaluation.margins import ComplexArray, are_stable, batch_frequency_response, controller_parts
+from pneuopt.evaluation.margins import (
+    batch_frequency_response,
+    controller_parts,
+    rests_below_zero,
+)
 from pneuopt.evaluation.operating_points import NOISE_GAIN, counted_points
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.sensitivity_peaks import PEAK_GRID_POINTS, PEAK_REFINEMENTS, sensitivity_peaks
+from pneuopt.evaluation.stability import ComplexArray, are_stable
 from pneuopt.quantities.arrays import Array
 
 MAX_SENSITIVITY = "MaxSensitivity"
@@ -59,16 +64,17 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
         plants = linearise(p, x, u)
         gains = linear_gains(loop, p.T, plants.measured, u[:, command]).full()
         controllers, matrices = controller_matrices(gains, loop.dead_time), plants.with_sensor()
-        closed = _closed_loop_poles(matrices, controllers)
+        closed = _close_loops(matrices, controllers)
+        poles = _poles(closed)
         if set(only) == {MAX_SENSITIVITY} and not plants.D.any():
             opened = np.concatenate([_poles(matrices[0]), _poles(controllers[0])], axis=1)
-            found = {MAX_SENSITIVITY: sensitivity_peaks(opened, closed, w[0], w[-1])}
+            found = {MAX_SENSITIVITY: sensitivity_peaks(opened, poles, w[0], w[-1])}
         else:
             respond, at_infinity = _pid_responses(gains, plants.response(loop.dead_time, w))
             found = _read_responses(respond, at_infinity, w, lowest_noise, only)
         if MAX_SENSITIVITY in only:  # at infinity the loop is open
             found[MAX_SENSITIVITY] = np.maximum(found[MAX_SENSITIVITY], 1.0)
-        return _mark_unstable(found, closed)
+        return _mark_unstable(found, closed, poles)
 
     return _read_worst(read_points)
 
@@ -97,7 +103,8 @@ def _composed_reader(loop: ClosedLoop, w: Array, lowest_noise: float) -> MarginF
         )
         if MAX_SENSITIVITY in only:
             found[MAX_SENSITIVITY] = np.maximum(found[MAX_SENSITIVITY], np.abs(1 / (1 + ends[0])))
-        return _mark_unstable(found, _poles(A - B @ C / (1 + D)))
+        closed = A - B @ C / (1 + D)
+        return _mark_unstable(found, closed, _poles(closed))
 
     return read_points
 
@@ -109,9 +116,9 @@ def _matrix_response(system: Matrices4, typical: Array) -> Callable[[Array], Com
     return lambda w: np.asarray(response(w) + D[:, 0])
 
 
-def _mark_unstable(found: dict[str, Array], closed: ComplexArray) -> dict[str, Array]:
-    """Metrics with those of unstable loops NaN or infinite, by the closed loops' poles."""
-    stable = are_stable(closed)
+def _mark_unstable(found: dict[str, Array], closed: Array, poles: ComplexArray) -> dict[str, Array]:
+    """Metrics with those of unstable loops NaN or infinite, by the closed loops' matrices and poles."""
+    stable = are_stable(closed, poles)
     return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
 
 
@@ -230,24 +237,28 @@ def _add_sensor(plant: Matrices, lag: Array) -> Matrices:
     return sensed, np.concatenate([B, np.zeros((m, 1, 1))], axis=1), reading
 
 
-def _closed_loop_poles(plant: Matrices, controller: tuple[Array, Array, Array, Array]) -> ComplexArray:
-    """Poles of m loops with negative feedback, shape (m, n); NaN matrices count as unstable."""
+def _close_loops(plant: Matrices, controller: Matrices4) -> Array:
+    """State matrices of m loops with negative feedback, shape (m, n, n)."""
     (A, B, C), (Ac, Bc, Cc, Dc) = plant, controller
-    return _poles(np.block([[A - B @ Dc @ C, B @ Cc], [-Bc @ C, Ac]]))
+    return np.block([[A - B @ Dc @ C, B @ Cc], [-Bc @ C, Ac]])
 
 
 def _poles(A: Array) -> ComplexArray:
-    """Eigenvalues of m matrices, shape (m, n); those of NaN matrices are 1."""
+    """Eigenvalues of m matrices, shape (m, n); those of NaN matrices are 1, so that they count as unstable."""
     sound = np.asarray(np.isfinite(A).all(axis=(1, 2)))
     tame = A if sound.all() else np.where(sound[:, None, None], A, np.eye(A.shape[-1]))
     return np.asarray(np.linalg.eigvals(tame), dtype=complex)
 
 
 def _gain_margins(L: ComplexArray) -> Array:
-    """Gain margins, shape (m,); crossings of -180 deg are interpolated in phase and logarithm of gain."""
+    """Gain margins, shape (m,); crossings of -180 deg are interpolated in phase and logarithm of gain.
+
+    Where L(0) is negative the first frequency counts as well.
+    """
     phase, gain = np.angle(-L), np.log(np.abs(L))
     at, crossing = _interpolate_crossings(phase, gain, np.abs(np.diff(phase, axis=1)) < np.pi)
-    return np.asarray(np.exp(_smallest_in_rows(np.where(crossing, -at, inf))))
+    at_rest = np.where(rests_below_zero(L[:, :2]), -gain[:, 0], inf)
+    return np.asarray(np.exp(_smallest_in_rows(np.column_stack([np.where(crossing, -at, inf), at_rest]))))
 
 
 def _phase_margins(L: ComplexArray) -> Array:

@@ -23,14 +23,17 @@ from pneuopt.control.linear_controller import linear_gains, pade_delay_response
 from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.stability import ComplexArray, are_stable
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 
-ComplexArray = NDArray[np.complex128]
 # Angle over a horizon of the slowest noise that counts [rad]. With a smaller one the noise gain is that of a drift, far
 # slower than the response; with a larger one a resonance of slow loops is missed.
 NOISE_ANGLE = 0.3
+# Relative change of a response between the two lowest frequencies of a grid, below which it is that at rest. With a
+# larger one an integral's response counts as one; with a smaller one a gain margin at rest is missed on a coarse grid.
+FLAT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -40,11 +43,13 @@ class Margins:
     Attributes
     ----------
     gain_margin : float
-        Factor on the gain at which the loop oscillates, the closest to one of several; inf where there is none.
+        Factor on the gain, up or down, beyond which the loop is unstable, the closest to one of several; inf where
+        there is none.
     phase_margin : float
         Phase margin [deg], the smallest magnitude of several; inf where the gain never crosses one.
     gain_crossover, phase_crossover : float
-        Frequencies of the phase margin and of the gain margin [rad/s]; NaN where there is none.
+        Frequencies of the phase margin and of the gain margin [rad/s]; NaN where there is none. At a gain margin at 0
+        the loop does not swing, but runs away: that of an unstable plant under a P controller.
     max_sensitivity : float
         ``Ms = max |1/(1 + L(jw))|``; its reciprocal is the Nyquist curve's distance from -1.
     max_sensitivity_frequency : float
@@ -124,12 +129,13 @@ def margins(open_loop: Linearisation, on_grid: GridResponse | None = None) -> Ma
     real = _crossing_frequencies(lambda w: response(w).imag, omega, L.imag)
     phases = [((float(np.angle(response(w), deg=True)) % 360) - 180, w) for w in gain]
     gains = [(1 / abs(z), w) for w in real if (z := response(w)).real < 0]
+    gains += [(float(1 / abs(L[0])), 0.0)] if rests_below_zero(L[None, :2])[0] else []
     gain_margin, phase_crossover = min(gains, key=lambda g: abs(np.log(g[0])), default=(inf, nan))
     phase_margin, gain_crossover = min(phases, key=lambda m: abs(m[0]), default=(inf, nan))
     D = float(open_loop.D[0, 0])
     Ms, at = _response_peak(lambda _, L: 1 / (1 + L), open_loop, on_grid, 1 / (1 + D))
     Mt, _ = _response_peak(lambda _, L: 1 - 1 / (1 + L), open_loop, on_grid, D / (1 + D))
-    stable = bool(are_stable(_loop_poles(open_loop)))
+    stable = bool(are_stable(_closed_loop(open_loop)[None])[0])
     return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, stable)
 
 
@@ -234,7 +240,7 @@ def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
 
     Logarithmic from three decades below the slowest pole or zero to three above the fastest, denser at resonances.
     """
-    roots = np.concatenate([eigvals(open_loop.A), _loop_poles(open_loop), _zeros(open_loop)])
+    roots = np.concatenate([eigvals(open_loop.A), eigvals(_closed_loop(open_loop)), _zeros(open_loop)])
     size = [s for s in np.abs(roots) if s > 1e-10 * np.max(np.abs(roots))]
     low, high = min(size, default=1.0), max(size, default=1.0)
     decades = np.log10(high / low) + 6
@@ -333,6 +339,12 @@ def _crossing_frequencies(function: Callable[[float], float], omega: Array, valu
     return sorted(exact + [float(brentq(function, omega[k], omega[k + 1], xtol=1e-14 * omega[k])) for k in brackets])
 
 
+def rests_below_zero(first: ComplexArray) -> NDArray[np.bool_]:
+    """Whether L(0) is finite and negative, by L at the two lowest frequencies of a grid, shape (m, 2)."""
+    is_flat = np.abs(first[:, 0] - first[:, 1]) < FLAT * np.abs(first[:, 0])
+    return np.asarray(is_flat & (first[:, 0].real < -(1 - FLAT) * np.abs(first[:, 0])))
+
+
 def _response_peak(
     response: Callable[[Array, ComplexArray], ComplexArray],
     open_loop: Linearisation,
@@ -356,9 +368,8 @@ def _response_peak(
     return (largest, at) if largest > abs(limit) else (abs(limit), inf)
 
 
-def _loop_poles(open_loop: Linearisation) -> ComplexArray:
-    feedback = open_loop.B @ open_loop.C / (1 + open_loop.D[0, 0])
-    return np.asarray(eigvals(open_loop.A - feedback), dtype=complex)
+def _closed_loop(open_loop: Linearisation) -> Array:
+    return np.asarray(open_loop.A - open_loop.B @ open_loop.C / (1 + open_loop.D[0, 0]))
 
 
 def _zeros(open_loop: Linearisation) -> ComplexArray:
@@ -367,11 +378,3 @@ def _zeros(open_loop: Linearisation) -> ComplexArray:
     zeros = np.asarray(eigvals(pencil, np.diag([1.0] * n + [0.0])), dtype=complex)
     fastest = np.max(np.abs(eigvals(open_loop.A)), initial=1.0)
     return np.array([z for z in zeros if np.abs(z) < 1e3 * fastest], dtype=complex)
-
-
-def are_stable(poles: ComplexArray) -> NDArray[np.bool_]:
-    """Which loops are stable, by their closed loop's poles along the last axis.
-
-    Poles at zero are allowed: a position in a speed loop, an unused integral.
-    """
-    return np.asarray(poles.real.max(axis=-1, initial=-1.0) <= 1e-7 * np.abs(poles).max(axis=-1, initial=1.0))

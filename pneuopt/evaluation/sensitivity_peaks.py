@@ -9,7 +9,7 @@ from math import inf
 
 import numpy as np
 
-from pneuopt.evaluation.margins import ComplexArray
+from pneuopt.evaluation.stability import ComplexArray
 from pneuopt.quantities.arrays import Array
 
 # Frequencies spread over the range, beside those about the closed poles. Fewer miss a broad maximum between them;

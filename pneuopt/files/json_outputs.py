@@ -291,7 +291,7 @@ OUTPUTS: Mapping[str, Member] = {
         claimed=_rows(f"by the search; {_METRICS}", _NAMED, is_open=True),
         certified=_rows(f"by the independent simulation; {_METRICS}", _NAMED, is_open=True),
         requirements=_rows("a row an objective or limit", _REQUIREMENTS),
-        relaxations=_rows("where limits contradict each other, a row a limit", _NAMED, is_open=True),
+        relaxations=_rows("where no design found keeps all limits, a row a limit", _NAMED, is_open=True),
         active=Member("what keeps the objective from being smaller", Holds.TEXTS),
         best=Member("the best candidate's gains where none is certified [SI]", Holds.NUMBERS, is_optional=True),
         notes=Member("what the certificate notes", Holds.TEXTS, is_optional=True),

@@ -80,7 +80,7 @@ def _mark_margins(top: "Axes", middle: "Axes", m: Margins, omega: Array, phase: 
         text = f"phase margin {m.phase_margin:.1f}° at {m.gain_crossover:.3g} rad/s"
         _mark_frequency((top, middle), m.gain_crossover, ORANGE)
         middle.plot([m.gain_crossover] * 2, [foot, at], color=ORANGE, lw=2.5, label=text)
-    if math.isfinite(m.phase_crossover):
+    if m.phase_crossover > 0:  # a logarithmic axis has no frequency 0
         decibel = -20 * math.log10(m.gain_margin)
         text = f"gain margin {-decibel:.1f} dB at {m.phase_crossover:.3g} rad/s"
         _mark_frequency((top, middle), m.phase_crossover, RED)

@@ -17,7 +17,7 @@ class Code(Enum):
     MISFIT = "converged, but the model misses the logs"
     NOT_CONVERGED = "not converged"
     ITERATION_LIMIT = "iteration limit reached"
-    INFEASIBLE = "the limits contradict each other"
+    INFEASIBLE = "no answer found keeps all limits"
     DIVERGED = "the iteration left the region where the model is defined"
     NOT_CERTIFIED = "the independent simulation does not confirm the claim"
     INTERRUPTED = "interrupted"

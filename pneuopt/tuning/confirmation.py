@@ -1,4 +1,4 @@
-"""Confirmation that limits contradict each other, by a search that shares neither method nor merit with the first.
+"""Confirmation that no design keeps all limits, by a search that shares neither method nor merit with the first.
 
 A search adds up the excesses over its limits. Where that sum has a local minimum it stays there, though a design far
 away keeps every limit. The second search is SciPy's differential evolution on the largest excess.

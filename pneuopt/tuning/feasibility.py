@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from math import inf
 
 import numpy as np
 
+from pneuopt.control.averaged_plant import is_affine
+from pneuopt.control.compensation import acting_always
+from pneuopt.control.composed_loops import ComposedLoops
 from pneuopt.control.dither import DITHER_AMPLITUDE
-from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Reference, Step
@@ -16,12 +19,20 @@ from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.counts import describe_counts, sees_speed
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
-from pneuopt.evaluation.margins import frequency_response
 from pneuopt.evaluation.motion_requirements import FollowingError
 from pneuopt.evaluation.move_check import check_motion
-from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
+from pneuopt.evaluation.requirements import (
+    NoiseGain,
+    PeakControl,
+    RiseTime,
+    SettlingTime,
+    SteadyStateError,
+    metric_name,
+    upper_limit,
+)
 from pneuopt.evaluation.response import highest_dither_frequency
 from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.stability import are_stable
 from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
@@ -29,9 +40,15 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 from pneuopt.tuning.space import Space
 
-# Frequencies at which the sign of the plant's static gain is read [rad per horizon]. A high one may meet phase lag that
-# turns the sign, a low one a drift slower than the horizon, or rounding errors; so they have to agree.
-STATIC_SIGN_FREQUENCIES = (1e-3, 0.1)
+SIGNED_GAINS = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")  # which turn with the actuator; times and ratios do not
+# Growth of a deviation over the horizon, in its logarithm, below which nothing is called unstable before a search. A
+# smaller one meets the rounding of poles at zero; a larger one leaves slow instabilities to the certificate.
+LEAST_GROWTH = 1e-3
+JUST_BELOW = 0.999  # of a pole: where the number of poles beyond is counted, far from rounding
+# Parameters over whose corners a loop's instability is proved, at most: their corners double with each.
+MAX_CORNER_NAMES = 10
+# Points within the bounds that count beside the corners. Fewer may miss a dither that stabilises the loop.
+POINTS_INSIDE = 100
 # Bisections for the largest part of a reference that can be held. Fewer make the message's figure coarse; each more
 # costs an equilibrium.
 BISECTION_STEPS = 10
@@ -53,8 +70,8 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
     InputError
         If a limit lies beyond the horizon, settling and following error contradict each other, the dither cannot be
         sampled, the settling band is below half a count of an encoder, the stroke is too short for a reference or the
-        drive too weak for a move, no command holds it, or none that the limits allow, or all gains allowed have the
-        wrong sign.
+        drive too weak for a move, no command holds it, or none that the limits allow, or all gains allowed make the
+        loop unstable.
     """
     _check_dither(loop, space)
     for case in cases:
@@ -66,7 +83,7 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
         check_travel(loop, case, space.parameters)
         check_motion(loop, case, space.parameters)
         _check_hold(loop, case, space, spec)
-    _check_sign(loop, cases[0], space)
+    _check_stability(loop, cases[0], space, spec)
 
 
 def _check_dither(loop: ClosedLoop, space: Space) -> None:
@@ -111,10 +128,12 @@ def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
     """Check that the least noise gain within the bounds keeps its limit."""
     if loop.is_composed:  # what the other paths add may turn the PID's gain either way
         return
-    Tf = _parameter_range(space, "pid.Tf")[1] + 0.5 * (loop.pid.sample_time or 0.0)  # as `linear_gains` has it
-    least = _least_size(space, "pid.Kp") + (_least_size(space, "pid.Kd") / Tf if Tf else 0.0)
+    filters = [Tf + 0.5 * (loop.pid.sample_time or 0.0) for Tf in _parameter_range(space, "pid.Tf")]
+    high = [d / Tf for d in _parameter_range(space, "pid.Kd") for Tf in filters if Tf]  # Tf as `linear_gains` has it
+    Kp = _parameter_range(space, "pid.Kp")
+    least = _nearest_to_zero(Kp[0] + min(high, default=0.0), Kp[1] + max(high, default=0.0))
     message = (
-        f"NoiseGain: max {spec.limit(NoiseGain):g} is below Kp + Kd/Tf, at least {least:.4g} within the gains' bounds"
+        f"NoiseGain: max {spec.limit(NoiseGain):g} is below |Kp + Kd/Tf|, at least {least:.4g} within the gains' bounds"
     )
     require(least <= spec.limit(NoiseGain), f"{message}; lower pid.Kp or pid.Kd, raise pid.Tf, or raise max")
 
@@ -191,41 +210,71 @@ def _describe_command_excess(
     return ""
 
 
-def _check_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
-    """Check that the bounds allow gains of the sign that makes the feedback negative."""
-    sign = _static_sign(loop, case, space)
-    gains = {n: [sign * v for v in _parameter_range(space, n)] for n in ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")}
-    best = {n: max(ends) for n, ends in gains.items()}
-    wrong = [n for n, ends in gains.items() if max(ends) <= 0 and min(ends) < 0]
-    hopeless = best["pid.Ki"] < 0 or (wrong and all(v <= 0 for v in best.values()))
-    if sign and hopeless:
-        words = ", ".join(f"{n} within [{', '.join(f'{v:g}' for v in _parameter_range(space, n))}]" for n in wrong)
-        moves = f"{loop.feedback.name} {'rises' if sign > 0 else 'falls'} with {loop.command.name}"
-        remedy = "turn the sign of the gains' bounds, or of the actuator"
-        require(False, f"{words}: every gain allowed has the wrong sign, for the plant's {moves}; {remedy}")
+def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
+    """Check that the bounds allow gains that may stabilise the loop, linearised where the reference ends.
 
+    The closed loop's characteristic polynomial is positive for large s > 0, so it is negative where an odd number of
+    real poles lies beyond s. It is monotone in each gain of every form of a PID. Where it is negative at one s for all
+    corners of the gains' bounds, it is so for all gains within, and each of them has an unstable pole beyond s. Of a
+    sampled loop this holds for z = (1 + s h/2)/(1 - s h/2) > 1 (`ComposedLoops`). Points within the bounds count as
+    well, for what need not be monotone, such as a free dither.
 
-def _static_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> float:
-    """The sign of the plant's response to a slow command at the reference's final value; 0 where it is unknown."""
-    reference, own = case.reference, case.case_parameters(space.parameters)
+    A nonlinear loop may rest elsewhere where it may miss the reference. Its growth counts within the horizon, and a
+    slower one where other gains remove it: else it is a drift of the plant's own, such as a piston's position has.
+    """
+    may_miss = spec.limit(SteadyStateError) < inf and not spec.concerns(SettlingTime)
+    if may_miss and not is_affine(loop.plant):
+        return
+    names, order = [n for n in space.names if _shapes_linear_loop(loop, n)], list(space.parameters)
+    if len(names) > MAX_CORNER_NAMES:
+        return
+    box, rng = Space(case.case_parameters(space.parameters), tuple(names)), np.random.default_rng(0)
+    p = box.vectors(np.vstack([box.corners(), box.from_unit(rng.random((POINTS_INSIDE, len(names))))]))
+    free = np.isin(order, SIGNED_GAINS) & np.isin(order, names)
+    changes = {
+        "turn the sign of the gains' bounds": np.where(free, -1.0, 1.0),
+        "turn the sign of the actuator": np.where(np.isin(order, SIGNED_GAINS), -1.0, 1.0),
+        "widen the gains' bounds, for some gains ten times as large hold the loop": np.where(free, 10.0, 1.0),
+    }
     try:
-        x, command = _find_operating_point(loop, case, space, reference.final)
-        plant = linear_plant(loop, own, x, {loop.command.name: command})
-        frequencies = np.array(STATIC_SIGN_FREQUENCIES) / reference.horizon
-        slow, faster = (frequency_response(plant, factor * frequencies) for factor in (1, 2))
+        at = _find_operating_point(loop, case, space, case.reference.final)
+        growth = _common_growth(loop, _closed_loops(loop, p, *at), LEAST_GROWTH / case.reference.horizon)
+        if not growth:
+            return
+        remedies = [words for words, by in changes.items() if are_stable(_closed_loops(loop, p * by, *at)).any()]
     except (ConvergenceError, InputError, ModelError, np.linalg.LinAlgError):
-        return 0.0
-    first, *others = [_response_sign(complex(s), complex(f)) for s, f in zip(slow, faster, strict=True)]
-    return first if all(sign == first for sign in others) else 0.0
+        return  # no linearisation, no proof
+    if not (remedies or is_affine(loop.plant) or growth * case.reference.horizon >= 1):
+        return
+    ranges = {n: _parameter_range(space, n) for n in SIGNED_GAINS if any(_parameter_range(space, n))}
+    words = ", ".join(f"{n} {f'within [{a:g}, {b:g}]' if a < b else f'= {a:g}'}" for n, (a, b) in ranges.items())
+    end = write_value(case.reference.final, loop.feedback.unit, 3)
+    told = f"every gain allowed makes the loop unstable: {words}; linearised at {end}, where the reference ends, "
+    remedy = ", or ".join(remedies) or "neither turned signs nor gains ten times as large hold it"
+    require(False, f"{told}a deviation grows e-fold in {1 / growth:.2g} s or less; {remedy}")
 
 
-def _response_sign(slow: complex, faster: complex) -> float:
-    """The sign of a plant's response, by those at a frequency and at twice it."""
-    if abs(slow.real) >= abs(slow.imag):
-        return float(np.sign(slow.real))
-    # It integrates, or a drifting position counters: k s/(s - d), whose phase a stable and an unstable d turn opposite
-    # ways; its real part has the sign of k for both.
-    return float(np.sign(-slow.imag if abs(faster) < abs(slow) else slow.real))
+def _shapes_linear_loop(loop: ClosedLoop, n: str) -> bool:
+    """Whether the linearised loop depends on a parameter of the controller."""
+    section, _, name = n.partition(".")
+    acting = {"dither", "position_loop", "schedule", *(part.section for part in acting_always(loop))}
+    return section in acting or (section == "pid" and name in loop.pid.form.gains)
+
+
+def _closed_loops(loop: ClosedLoop, p: Array, x: Array, command: float) -> Array:
+    """State matrices of closed loops, shape (m, n, n), for parameters of shape (m, n_parameters)."""
+    u = np.array([command * (q.name == loop.command.name) for q in loop.plant.inputs])
+    A, B, C, D = ComposedLoops(loop)(p, np.tile(x, (len(p), 1)), np.tile(u, (len(p), 1))).loop
+    return np.asarray(A - B @ C / (1 + D))
+
+
+def _common_growth(loop: ClosedLoop, closed: Array, least: float) -> float:
+    """The largest rate, above `least` [1/s], beyond which all loops have an odd number of real poles; 0 for none."""
+    poles, h = np.linalg.eigvals(closed).astype(complex), loop.pid.sample_time
+    real = np.where((poles.imag == 0) & (poles.real < (2 / h if h else inf)), poles.real, 0.0)
+    ends = [least, *np.unique(real[real > least]).tolist()]
+    rates = [JUST_BELOW * b for a, b in pairwise(ends) if JUST_BELOW * b > a]
+    return max((s for s in rates if ((real > s).sum(axis=1) % 2).all()), default=0.0)
 
 
 def _parameter_range(space: Space, n: str) -> tuple[float, float]:
@@ -238,7 +287,11 @@ def _parameter_range(space: Space, n: str) -> tuple[float, float]:
 
 def _least_size(space: Space, n: str) -> float:
     """The least absolute value that a parameter may have."""
-    low, high = _parameter_range(space, n)
+    return _nearest_to_zero(*_parameter_range(space, n))
+
+
+def _nearest_to_zero(low: float, high: float) -> float:
+    """The least absolute value of a range."""
     return 0.0 if low <= 0 <= high else min(abs(low), abs(high))
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pneuopt.evaluation.requirements import SettlingTime, describe_value, metric_name, upper_limit
-from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.specification import STABILITY_SENSITIVITY, Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.method import SearchResult, TuningTask
@@ -77,7 +77,9 @@ def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
         for q in spec.violations(values, LIMIT_TOLERANCE)
     ]
     if not broken and spec.with_stability().violations(values):
-        verdict = f"the closest found is no stable loop (MaxSensitivity {values['MaxSensitivity']:.3g})"
+        Ms = values["MaxSensitivity"]
+        nearly = f"nearly unstable, with a MaxSensitivity of {Ms:.3g}, more than {STABILITY_SENSITIVITY:g}"
+        verdict = f"the closest found is {nearly if np.isfinite(Ms) else 'no stable loop'}"
         return Status(Code.INFEASIBLE, (verdict, WIDEN_BOUNDS))
     if broken:
         verdict = f"the closest found has {' and '.join(broken)}"

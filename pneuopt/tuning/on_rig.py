@@ -103,14 +103,21 @@ def _breaks(task: TuningTask, found: "pd.DataFrame") -> Iterator[str]:
 
 
 def _remedies(task: TuningTask, result: TuningResult, found: "pd.DataFrame") -> Iterator[str]:
-    """With which limit the search would leave the room that the rig needs, if the rig adds as much again."""
+    """With which limit the search would leave the room that the rig needs, if the rig adds as much again.
+
+    A relaxed limit is named only where the loop settles on the rig, for it mends nothing else.
+    """
+    settles = bool(np.isfinite(found.loc["SettlingTime"].to_numpy(dtype=float)).all())
     for q in task.spec.limits:
         n = metric_name(q)
         on_rig, smooth = (max(_requirement_rows(n, f).values(), default=-np.inf) for f in (found, result.certified))
         room = upper_limit(q) - (on_rig - smooth)
         if np.isfinite(on_rig) and on_rig > upper_limit(q) and q.metric.sense is Sense.AT_MOST:
             added = f"the rig adds {_shown(q, on_rig - smooth, task)} to {n}"
-            yield f"{added}: tune with at most {_shown(q, room, task)}" if room > 0 else f"{added}: relax its limit"
+            if room > 0:
+                yield f"{added}: tune with at most {_shown(q, room, task)}"
+            elif settles:
+                yield f"{added}: relax its limit"
 
 
 def _requirement_rows(metric: str, found: "pd.DataFrame") -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Relaxation of limits that contradict each other: by how much each alone, or all together, must give way.
+"""Relaxation of limits that no design found keeps: by how much each alone, or all together, must give way.
 
 For one limit alone the answer is a tuning of its own, which minimises that requirement under the other limits. For all
 together it is the least share by which every limit has to widen: a minimax over the simulator's values, from the points

@@ -88,7 +88,7 @@ def report_active(requirements: "pd.DataFrame", active: Sequence[str], parameter
 
 
 def report_relaxations(table: "pd.DataFrame") -> Report:
-    """How far limits that contradict each other must be relaxed; nothing where there is no such table."""
+    """How far limits that no design found keeps must be relaxed; nothing where there is no such table."""
     if table.empty:
         return Report()
     rows = []

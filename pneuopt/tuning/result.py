@@ -55,10 +55,10 @@ class TuningResult(Result):
         left of the limit as a fraction of it, negative where it is broken, "active", whether it holds the objective
         back, and "case", where it is worst.
     relaxations : DataFrame
-        Where the limits contradict each other: a row a limit with what is "asked", and what alone is "needed" for a
+        Where no design found keeps all limits: a row a limit with what is "asked", and what alone is "needed" for a
         design that keeps the others (NaN where none was found), "share", how far that is from what is asked as a
         fraction of it, and that design's gains; in a last row, "all", the share by which all limits together have to
-        give way. The independent simulation has confirmed each. Empty where the limits do not contradict each other.
+        give way. The independent simulation has confirmed each. Empty where a design keeps all limits.
     active : tuple of str
         Requirements and bounds that keep the objective from being smaller.
     status : Status

@@ -47,7 +47,7 @@ __all__ = ["TuningResult", "certify", "prepare_search", "prepare_task", "tune"]
 # Starts that must end in the same optimum for a search to be believed alone: a single one may be the nearest of many;
 # more search twice where two have confirmed each other.
 MIN_AGREEING = 2
-# Endings of a search that contradictory limits may have caused: `tune` then seeks how far they have to give way.
+# Endings of a search whose limits perhaps no design keeps: `tune` then seeks how far they have to give way.
 INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)
 
 

@@ -148,7 +148,7 @@ def test_a_tuning_that_fails_says_so_first_and_writes_its_best_candidate_beside(
     Path("tuned.toml").write_text("# of an earlier tuning", encoding="utf-8")
     result = run("tune drive.toml tuning.toml -o tuned.toml --json tuned.json")
     assert result.exit_code == 1
-    assert result.stdout.startswith("NOT converged (the limits contradict each other): ")
+    assert result.stdout.startswith("NOT converged (no answer found keeps all limits): ")
     assert "the gains of tuning.toml stand; rejected: pid.Kp" in result.stdout
     assert Path("tuned.toml").read_text("utf-8") == "# of an earlier tuning"
     assert "wrote tuned_best.toml\ntuned.toml stays as it was, for no design is certified" in result.stdout

@@ -46,6 +46,7 @@ def cut(folder: Path) -> None:
 IDENTIFY = "identify drive.toml run_01.csv -o fit.toml --json fit.json --plot fit.png"
 TUNE = "tune drive.toml tuning.toml -o tuned.toml --json tuned.json --plot tuned.png"
 KP = 'Kp = { value = "100 N*s/m", lower = "10 N*s/m", upper = "600 N*s/m", free = true }   # by hand\nKi = "4000 N/m"'
+TURNED = 'Kp = { value = "-9 N*s/m", lower = "-60 N*s/m", upper = "-1 N*s/m", free = true }'
 TUBE = 'step_envelope = { bounds = [["0 s", "-10 %", "150 %"], ["0.1 s", "50 %", "80 %"]] }'
 SMOOTHING = 'smoothing = "5 mm/s"\n'
 PRESSURE = 'pressure_dependent = true\n[ambient]\npressure = "1 bar"\n'
@@ -134,8 +135,8 @@ BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
     ),
     "gains of the wrong sign": (
         TUNE,
-        edit("tuning.toml", KP, 'Kp = { value = "-9 N*s/m", lower = "-60 N*s/m", upper = "-1 N*s/m", free = true }'),
-        "pid.Kp within [-60, -1]: every gain allowed has the wrong sign, for the plant's speed rises with force; turn",
+        edit("tuning.toml", KP, f"{TURNED}\nKi = '-400 N/m'"),
+        "every gain allowed makes the loop unstable: pid.Kp within [-60, -1], pid.Ki = -400; linearised at 0.2 m/s,",
     ),
     "disturbance of nothing": (
         TUNE,

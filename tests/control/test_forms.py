@@ -220,14 +220,6 @@ def test_bad_gains_of_a_form_are_named(second_order: System) -> None:
             search_space(loop, freed)
 
 
-@pytest.mark.parametrize(("form", "gain"), [(Form.STANDARD, "pid.Kp"), (Form.SERIES, "pid.K")])
-def test_gains_of_the_wrong_sign_are_told_in_any_form(form: Form, gain: str) -> None:
-    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(2e-3, form=form))
-    freed = loop.parameters.with_values({gain: -100.0, "pid.Ti": 0.1}).with_bounds({gain: (-300.0, -10.0)}).freed(gain)
-    with pytest.raises(InputError, match=rf"{gain} within \[-300, -10\]: every gain allowed has the wrong sign"):
-        tune(loop, Step(0.1, horizon=0.3), freed, minimise=SettlingTime())
-
-
 def test_a_form_is_no_string() -> None:
     with pytest.raises(InputError, match=r"PID: form is one of Form\.PARALLEL, Form\.STANDARD, .* got 'standard'"):
         PID(form="standard")  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ from pneuopt.control.linear_controller import linear_gains
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.dynamics.system import Linearisation, System
+from pneuopt.dynamics.system import Linearisation, System, define
 from pneuopt.evaluation.batch_margins import _partial_fraction_response, batch_margin_function
 from pneuopt.evaluation.margins import (
     batch_frequency_response,
@@ -22,9 +22,11 @@ from pneuopt.evaluation.margins import (
     noise_gain,
     sensitivity_terms,
 )
+from pneuopt.evaluation.stability import are_stable
 from pneuopt.models.catalog import s32
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.errors import ModelError
+from pneuopt.quantities.parameters import ParameterSet, Quantity
 
 
 def linearised(numerator: list[float], denominator: list[float]) -> Linearisation:
@@ -56,6 +58,9 @@ def test_the_papers_loop(second_order: System) -> None:
         ([40.0, 4.0, 4000.0], [1, 0.02, 100, 0]),
         ([3.0], [1, 0.004, 4, 0.001]),
         ([1e-3, 1e-9], [1, 0.01, 0]),
+        ([3.0], [1, -2]),
+        ([20.0, 20.0], [1, 3, -4]),
+        ([30.0, 90.0, 60.0], [1, -3, 2, 0]),
     ],
 )
 def test_agreement_with_python_control(numerator: list[float], denominator: list[float]) -> None:
@@ -64,7 +69,7 @@ def test_agreement_with_python_control(numerator: list[float], denominator: list
     expected = [gm, pm, wpc, wgc]
     ours = [m.gain_margin, m.phase_margin, m.phase_crossover, m.gain_crossover]
     np.testing.assert_allclose(ours, expected, rtol=1e-6)
-    if np.isfinite(m.max_sensitivity_frequency):
+    if np.isfinite(m.max_sensitivity_frequency) and np.isfinite(sm):  # it has none for a largest value at rest
         assert m.max_sensitivity == pytest.approx(1 / sm, rel=1e-6)
         assert m.max_sensitivity_frequency == pytest.approx(wms, rel=1e-3)
     closed = control.feedback(control.tf(numerator, denominator), 1)
@@ -92,6 +97,53 @@ def test_an_unseen_position_does_not_make_a_speed_loop_unstable(axis: System) ->
     m = margins(open_loop(loop, loop.parameters.with_values({"pid.Ki": 2.0})))
     assert m.stable
     assert not margins(open_loop(loop, loop.parameters.with_values({"pid.Kp": -20.0, "pid.Ki": 2.0}))).stable
+
+
+@pytest.mark.parametrize("Tf", [1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("time_constant", [0.01, 10.0, 1e3])
+@pytest.mark.parametrize(("Kp", "Ki"), [(-1.001, 0.0), (-1.5, 0.0), (-0.99, 0.0), (0.5, -0.01), (0.5, 0.01)])
+def test_no_fast_pole_excuses_a_slow_unstable_one(Tf: float, time_constant: float, Kp: float, Ki: float) -> None:
+    """A lag of gain 1 under P control has its pole at -(1 + Kp)/T; an integral of the wrong sign another beyond 0."""
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    gains = {"plant.time_constant": time_constant, "pid.Kp": Kp, "pid.Ki": Ki, "pid.Tf": Tf}
+    given = loop.parameters.with_values(gains)
+    stable = Kp > -1 and Ki >= 0
+    assert margins(open_loop(loop, given)).stable == stable
+    found = batch_margin_function(loop, np.geomspace(1e-4, 1e4, 200))(
+        loop.parameter_vector(given)[None], np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), ("MaxSensitivity",)
+    )
+    assert np.isfinite(found["MaxSensitivity"][0]) == stable
+
+
+@pytest.mark.parametrize("fastest", [1.0, 1e4, 1e8])
+def test_poles_at_zero_are_stable_and_those_just_beyond_are_not(fastest: float) -> None:
+    """A zero that no zeros of the matrix show, and the same with the pole moved by more than rounding can."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        basis = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+        at, beyond = (
+            basis @ np.diag([-fastest, -0.3 * fastest, -1e-3 * fastest, s]) @ basis.T for s in (0.0, 1e-9 * fastest)
+        )
+        assert are_stable(np.array([at, beyond])).tolist() == [True, False]
+
+
+def test_a_gain_margin_at_rest_counts_on_a_grid_as_well() -> None:
+    """``3/(s - 2)`` runs away where its gain is cut to two thirds; with an integral it swings there."""
+    unstable = define(
+        [Quantity("y", "1")],
+        [Quantity("u", "1")],
+        [Quantity("y", "1")],
+        ParameterSet(),
+        lambda _t, x, u, _p: ({"y": 2 * x["y"] + u["u"]}, {"y": x["y"]}),
+    )
+    loop = ClosedLoop(unstable, PID(limits=False))
+    for Ki in (0.0, 1.0):
+        given = loop.parameters.with_values({"pid.Kp": 3.0, "pid.Ki": Ki})
+        assert margins(open_loop(loop, given)).gain_margin == pytest.approx(2 / 3, rel=1e-5)
+        found = batch_margin_function(loop, np.geomspace(1e-2, 1e3, 500))(
+            loop.parameter_vector(given)[None], np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), ("GainMargin",)
+        )
+        assert found["GainMargin"] == pytest.approx(2 / 3, rel=1e-3)
 
 
 def test_a_sampled_loop_has_less_phase(second_order: System) -> None:

@@ -1,4 +1,4 @@
-"""An answer that limits contradict each other is confirmed by a second search before it is given."""
+"""That no design keeps all limits is confirmed by a second search before it is said."""
 
 import pytest
 

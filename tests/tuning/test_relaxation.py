@@ -1,4 +1,4 @@
-"""Limits that contradict each other: the smallest relaxation is the known one, and a design that was found keeps it."""
+"""Limits that no design keeps: the smallest relaxation is the known one, and a design that was found keeps it."""
 
 from functools import cache
 from typing import Any
