@@ -194,7 +194,9 @@ def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, A
     """The page of a design, or of what was refused."""
     source = Source(title, file_hashes(*job.inputs), warnings=describe_status(job.fit))
     place = job.outputs.output if result.status.converged else None
-    exports = Report() if place is None else report_exports(job.task.loop, job.fit, place)
+    task = job.task
+    design = (task.loop, result.parameters, task.references, task.centre)
+    exports = Report() if place is None else report_exports(*design, job.fit, place)
     return tuning_page(source, result, job.view(result), exports=exports, **told)
 
 

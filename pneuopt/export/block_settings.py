@@ -98,6 +98,24 @@ def export_settings(
     return {f"{name}_{block.value}.txt": "\n".join(lines) + "\n"}
 
 
+def describe_refusal(
+    loop: ClosedLoop,
+    parameters: ParameterSet,
+    block: Block,
+    references: Reference | Sequence[Reference],
+    centre: float = 0.0,
+) -> str:
+    """Why a block cannot hold a design, as `export_settings` refuses it; empty where it can."""
+    form, steps = BLOCK_FORMS[block], as_references(references)
+    try:
+        around = find_surroundings(acting_loop(loop, parameters), parameters, form, steps, centre, None)
+        for design in filter(None, (around.inner, around.outer)):
+            form.settings(design)
+    except InputError as reason:
+        return str(reason)
+    return ""
+
+
 def run_as_block(
     loop: ClosedLoop, parameters: ParameterSet, block: Block
 ) -> tuple[ClosedLoop, ParameterSet, list[str]]:

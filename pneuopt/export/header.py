@@ -94,8 +94,9 @@ def make_header(name: str, loop: ClosedLoop, parameters: ParameterSet, centre: f
     lines += [
         f"Sample time: {write_value(h, 's')}. Call it once a sample, at equal times; the gains hold for no other."
     ]
-    lines += ["Numbers are in SI units, as marked.", "", "Gains, in every form that controllers take:"]
-    lines += [*_gain_lines(loop, parameters), "", *_notes(loop, parameters, centre)]
+    of = f" of the inner loop, which controls the {loop.pid_signal.name}" if loop.outer else ""
+    lines += ["Numbers are in SI units, as marked.", "", f"Gains{of}, in every form that controllers take:"]
+    lines += [*_gain_lines(loop, parameters), *_part_lines(loop, parameters), "", *_notes(loop, parameters, centre)]
     return Header(name, tuple(map(comment_text, lines)))
 
 
@@ -120,6 +121,17 @@ def _gain_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
         line("standard", lambda: to_standard(gains), "Kp (1 + 1/(Ti s) + Td s/(1 + s Td/N)), N a ratio"),
         line("series", lambda: to_series(gains), "K (1 + 1/(Ti s)) (1 + Td s/(Tf s + 1))"),
     ]
+
+
+def _part_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
+    """The parts beside the PID, each with its parameters, in the loop's order."""
+    complete, parts = loop.complete(parameters), dict[str, list[str]]()
+    for n in (n for n in loop.parameters if n not in loop.plant.parameters):
+        section, _, name = n.partition(".")
+        parts.setdefault(section, []).append(f"{name} = {write_value(complete.value(n), complete[n].unit)}")
+    parts.pop("pid", None)
+    lines = [f"- {section}: {', '.join(values)}" for section, values in parts.items()]
+    return ["", "Parts beside it, which belong to the design as much as its gains:", *lines] if lines else []
 
 
 def _notes(loop: ClosedLoop, parameters: ParameterSet, centre: float) -> list[str]:

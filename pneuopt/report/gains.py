@@ -1,10 +1,13 @@
 """`report_forms`: a loop's gains in every form that controllers take, and its settings that are not tuned."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 from pneuopt.control.forms import ParallelForm, to_series, to_standard
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Reference
+from pneuopt.export.block_settings import describe_refusal
 from pneuopt.export.vendor_blocks import BLOCK_FORMS, Block
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
@@ -56,19 +59,30 @@ def report_forms(loop: ClosedLoop, parameters: ParameterSet) -> Report:
     return Report((Table(text_columns("form", "", "", "", "", "law"), tuple(rows)), *refused, Line(N_NOTE)))
 
 
-def report_exports(loop: ClosedLoop, fit: Path, tuned: Path) -> Report:
-    """The commands that take a design to a controller.
+def report_exports(
+    loop: ClosedLoop, parameters: ParameterSet, references: Sequence[Reference], centre: float, fit: Path, tuned: Path
+) -> Report:
+    """The commands that take a design to a controller, and the makers whose block cannot hold it.
 
     Parameters
     ----------
     loop : ClosedLoop
+    parameters : ParameterSet
+        Of the design.
+    references : sequence of Reference
+    centre : float
+        On the wire while the command is zero [the command's unit].
     fit, tuned : Path
         The files of the plant and of the design.
     """
     if loop.pid.sample_time is None:
         return Report((Line("A continuous controller has no export: give it a sample_time, and tune it so."),))
-    rows = tuple((what, f"pneuopt export {fit} {tuned} --to {form}") for form, what in EXPORTS.items())
-    return Report((Table(text_columns("what it takes", "command"), rows),))
+    refused = [block for block in Block if describe_refusal(loop, parameters, block, references, centre)]
+    taken = {form: what for form, what in EXPORTS.items() if form not in {block.value for block in refused}}
+    rows = tuple((what, f"pneuopt export {fit} {tuned} --to {form}") for form, what in taken.items())
+    makers = ", ".join(BLOCK_FORMS[block].maker for block in refused)
+    told = f"The PID block of these makers cannot hold this design: {makers}. The structured text holds it whole."
+    return Report((Table(text_columns("what it takes", "command"), rows), *([Line(told)] if refused else [])))
 
 
 def report_settings(loop: ClosedLoop, parameters: ParameterSet) -> Report:

@@ -112,8 +112,8 @@ def test_no_old_file_is_replaced_and_then_none_is_written(place: Path) -> None:
     [
         (
             'code = "converged"',
-             'code = "no answer found keeps all limits"',
-             "NOT CERTIFIED: its tuning ended so: no answer found keeps all limits",
+            'code = "no answer found keeps all limits"',
+            "NOT CERTIFIED: its tuning ended so: no answer found keeps all limits",
         ),
         ("[status]", "[provenance]", "its gains were not written by pneuopt tune"),
         ('sample_time = "1 ms"', "", "a continuous controller cannot be exported"),

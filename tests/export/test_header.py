@@ -7,13 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from pneuopt.control.dither import Dither
 from pneuopt.control.forms import Form
+from pneuopt.control.friction_feedforward import FrictionFeedforward
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.export.header import comment_text
 from pneuopt.export.targets import Language, export_controller
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, ModelError
+from pneuopt.quantities.units import write_value
 from problems.shared.structured_text_run import FunctionBlock
 
 HOSTILE = [
@@ -107,3 +113,25 @@ def test_a_header_says_that_the_design_counts_on_a_delay(delay: int) -> None:
 def test_files_are_ascii_whatever_their_origin_says(kind: Language) -> None:
     files = export_controller(LOOP, LOOP.parameters, kind, origin=["Größe µ, 図"])
     assert all(text.isascii() for text in files.values())
+
+
+@pytest.mark.parametrize("language", Language)
+def test_a_header_names_every_number_of_the_controller(language: Language) -> None:
+    plant = ForceDrive(Stribeck()).system()
+    loop = ClosedLoop(
+        plant,
+        PID(sample_time=1e-3),
+        Dither(frequency=100.0),
+        measured="position",
+        outer=PositionLoop(),
+        compensators=(FrictionFeedforward(),),
+    )
+    numbers = {n: 0.011 + 0.001 * k for k, n in enumerate(loop.parameters) if not n.startswith("pid.")}
+    numbers = {n: v for n, v in numbers.items() if n not in plant.parameters}
+    files = export_controller(loop, loop.parameters.with_values(numbers), language)
+    header = " ".join(next(text for name, text in files.items() if "test" not in name)[:6000].split())
+    assert len({n.partition(".")[0] for n in numbers}) == 3
+    for n, value in numbers.items():
+        section, _, name = n.partition(".")
+        assert f"{section}: " in header
+        assert f"{name} = {write_value(value, loop.parameters[n].unit)}" in header
