@@ -34,7 +34,7 @@ class Page:
     start_locals, locals : tuple of Assignment
         Values on the way.
     outputs, states : mapping of str to str
-        What each becomes, in terms of the locals; no state is read here that has been written.
+        What each becomes, in terms of the locals; no state is read here that has been written. A flag's is a condition.
     operations : frozenset of int
         CasADi's operations in all of them.
     """
@@ -77,7 +77,7 @@ def write_page(program: ControllerProgram, syntax: Syntax, places: Places) -> Pa
         (*started.coefficients, *started.statements),
         tuple(Assignment(n, started.results[f"{n}_first"]) for n in states),
         tuple(own),
-        {n: found[f"{n}_now"] for n in outputs},
+        {v.name: found[f"{v.name}_now"] + (" > 0.0" if v.is_flag else "") for v in program.outputs},
         {n: found[f"{n}_next"] for n in states},
         frozenset(started.operations | step.operations),
     )

@@ -1,7 +1,7 @@
 """The controller as one function block in IEC 61131-3 structured text, of standard functions alone.
 
 Type conversions and functions are those of IEC 61131-3:2013, 6.6.2.5; it has neither tanh nor floor, which are made of
-EXP and of a rounding. All numbers are LREAL.
+EXP and of a rounding. All numbers are LREAL, flags BOOL.
 """
 
 import textwrap
@@ -83,7 +83,8 @@ def _declare(variables: tuple[Variable, ...], initial: bool) -> list[str]:
     lines = []
     for v in variables:
         value = f" := {STRUCTURED_TEXT.literal(v.value)}" if initial else ""
-        lines.append(f"    {v.name} : LREAL{value}; (* {comment_text(f'{v.unit}: {v.meaning}')} *)")
+        kind, told = ("BOOL", v.meaning) if v.is_flag else (f"LREAL{value}", f"{v.unit}: {v.meaning}")
+        lines.append(f"    {v.name} : {kind}; (* {comment_text(told)} *)")
     return lines
 
 

@@ -10,7 +10,7 @@ import pytest
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.export.header import comment_text
+from pneuopt.export.header import comment_text, make_header
 from pneuopt.export.targets import Language, export_controller
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, ModelError
@@ -81,3 +81,17 @@ def test_the_gains_stand_there_in_every_form() -> None:
     assert "parallel: Kp = 2 V*s/m, Ki = 4 V/m, Kd = 0.1 V*s^2/m, Tf = 0.005 s" in text
     assert "standard: Kp = 2 V*s/m, Ti = 0.5 s, Td = 0.05 s, N = 10" in text
     assert "series: K = " in text
+
+
+@pytest.mark.parametrize(
+    ("Ki", "told"), [(0.0, "the output so far passes"), (50.0, "the setpoint counts as if it moved")]
+)
+def test_the_header_tells_of_starts_and_faults(Ki: float, told: str) -> None:
+    """With their time, count and safe output, on the wire and within the limits."""
+    loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-2))
+    values = {"pid.Ki": Ki, "pid.Tt": 0.25, "pid.lower": -5.0, "pid.upper": 5.0}
+    p = loop.parameters.with_values({**values, "pid.fault_samples": 7.0, "pid.fault_output": -9.0})
+    text = " ".join(make_header("pid", loop, p, 5.0, []).lines)
+    assert told in text
+    assert "a time constant of 250 ms" in text
+    assert "After 7 bad samples in a row (fault_samples), 70 ms, the output goes to 0 V (fault_output)" in text
