@@ -206,6 +206,7 @@ def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centr
     read = _read_limits(table["pid"], own, centre, f"{path}: [pid] limits")
     for section in TUNABLE_SECTIONS:
         read |= _section_parameters(table.get(section, {}), section, own, f"{path}: [{section}]")
+    read = _fault_values(read, loop, centre, f"{path}: [pid]")
     for name in (n for n, p in read.items() if p.free):
         section, _, key = name.partition(".")
         finite = abs(read[name].lower) < float("inf") and abs(read[name].upper) < float("inf")
@@ -213,6 +214,16 @@ def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centr
     parameters = own | ParameterSet(read)
     construct_at(lambda: loop.check(parameters), str(path))
     return parameters
+
+
+def _fault_values(read: dict[str, Parameter], loop: ClosedLoop, centre: float, where: str) -> dict[str, Parameter]:
+    """The parameters with the safe output about the valve's centre, from that on the wire; none of a fault is free."""
+    for key in loop.pid.fixed_parameters:
+        given = read.get(f"pid.{key}")
+        told = f"{where} {key} says what the machine does in a fault, which no search decides; take free = true out"
+        require(given is None or not given.free, told)
+    safe = read.get("pid.fault_output")
+    return read | ({"pid.fault_output": replace(safe, value=safe.value - centre)} if safe else {})
 
 
 def _section_parameters(
