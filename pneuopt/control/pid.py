@@ -219,8 +219,7 @@ class PID:
             require(Tt > 0 and Tt >= least, f"pid.Tt = {Tt:g} s: {told}")
         if h is not None:
             count, safe = p["fault_samples"], p["fault_output"]
-            told = f"pid.fault_samples must be a whole number of samples, 1 at least, got {count:g}"
-            require(1 <= count < inf and count == int(count), told)
+            require(0 < count < inf, f"pid.fault_samples must be positive and finite, got {count:g}")
             require(abs(safe) < inf, f"pid.fault_output must be finite, got {safe:g} {unit}")
 
     def states(self, measured: Quantity, command: Quantity) -> tuple[Quantity, ...]:
@@ -371,7 +370,7 @@ def _fault_parameters(unit: str) -> ParameterSet:
     safe = "output after that many, as the command counts: 0 is the centre"
     return ParameterSet(
         {
-            "fault_samples": Parameter(FAULT_SAMPLES, "1", lower=1.0, meaning=count),
+            "fault_samples": Parameter(FAULT_SAMPLES, "1", lower=0.0, meaning=count),
             "fault_output": Parameter(0.0, unit, meaning=safe),
         }
     )

@@ -166,7 +166,7 @@ def _start_notes(loop: ClosedLoop, parameters: ParameterSet, value: Mapping[str,
 
 def _fault_notes(loop: ClosedLoop, value: Mapping[str, float], centre: float) -> list[str]:
     """What happens at a sample that is no number, after how many, and how the controller recovers."""
-    count, h = int(value["pid.fault_samples"]), loop.pid.sample_time or 0.0
+    count, h = math.ceil(value["pid.fault_samples"]), loop.pid.sample_time or 0.0
     inside = min(max(value["pid.fault_output"], value.get("pid.lower", -math.inf)), value.get("pid.upper", math.inf))
     safe, time = write_value(inside + centre, loop.command.unit), write_value(count * h, "s", 3)
     return [

@@ -14,7 +14,7 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID, AntiWindup
+from pneuopt.control.pid import FAULT_SAMPLES, PID, AntiWindup
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.hooks import Axis
@@ -222,6 +222,9 @@ def _fault_values(read: dict[str, Parameter], loop: ClosedLoop, centre: float, w
         given = read.get(f"pid.{key}")
         told = f"{where} {key} says what the machine does in a fault, which no search decides; take free = true out"
         require(given is None or not given.free, told)
+    count = read.get("pid.fault_samples")
+    whole = count is None or (count.value >= 1 and count.value == round(count.value))
+    require(whole, f"{where} fault_samples is a whole number of samples, 1 at least; the default is {FAULT_SAMPLES:g}")
     safe = read.get("pid.fault_output")
     return read | ({"pid.fault_output": replace(safe, value=safe.value - centre)} if safe else {})
 

@@ -208,7 +208,7 @@ def test_what_a_fault_does_is_never_free(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "told"), [({"fault_samples": 2.5}, "whole number"), ({"fault_output": np.inf}, "finite")]
+    ("values", "told"), [({"fault_samples": 0.0}, "positive"), ({"fault_output": np.inf}, "finite")]
 )
 def test_what_cannot_run_is_refused(values: dict[str, float], told: str) -> None:
     loop = ClosedLoop(FORCE, PID(H))

@@ -186,7 +186,7 @@ def test_the_safe_output_is_the_wires_and_the_centre_by_default(tmp_path: Path) 
         ('"6 V"', '{ value = "6 V", lower = "5 V", upper = "7 V", free = true }', "fault_output says what the machine"),
         ("= 8", "= { value = 8, lower = 1, upper = 9, free = true }", "fault_samples says what the machine"),
         ("= 8", "= 0", "fault_samples"),
-        ("= 8", "= 2.5", "pid.fault_samples must be a whole number"),
+        ("= 8", "= 2.5", "fault_samples is a whole number"),
         ('sample_time = "2 ms"\n', "", "unknown key 'fault_"),
     ],
 )
