@@ -82,7 +82,7 @@ class AccelerationFeedback:
 
     def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The states' rates or next values, and u_a [the command's unit]."""
-        moved, signal, h, time = Signals(), seen.measured, seen.sample_time, p["filter"]
+        moved, signal, h, time = Signals(), seen.measured, seen.elapsed, p["filter"]
         fed_back = ca.SX(0)
         for name, before in x.items():
             now = before if h is None else (time * before + h * signal) / (time + h)

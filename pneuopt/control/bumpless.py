@@ -2,12 +2,16 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.control.compensation import invert_increasing
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.system import names
+from pneuopt.control.pid import integrates
+from pneuopt.control.sampled import controller_update
+from pneuopt.control.wiring import Signals, evaluate_plant
+from pneuopt.dynamics.system import names, stack, symbols
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -21,7 +25,9 @@ def bumpless_transfer(
     The next command that the new gains give, before the clip, is the one that the old gains would have given. What
     differs is taken by the integral, ``I' = I + Kp (b r - y) + D - Kp' (b' r - y) - D'``, each with what it adds by
     itself (feedforward, dither's offset), and where c changes, the error that the derivative remembers moves with it.
-    With compensators, which bend the command, the integral is sought that gives the same sum.
+    With compensators, which bend the command, the integral is sought that gives the same sum. A sampled controller
+    keeps what is due to the distance from the set point, ``(Kp b - Kp' b') (r - y)``, in its transfer, which passes
+    with Tt as after a start (`PID`).
 
     Parameters
     ----------
@@ -53,7 +59,8 @@ def bumpless_transfer(
     >>> new = old.with_values({"pid.Kp": 4.0})
     >>> before = loop.initial(old, reference=1.0)
     >>> after = bumpless_transfer(loop, before, old, new, reference=1.0)
-    >>> [loop.update(0, x, [1.0], loop.parameter_vector(new))[-1].__float__() for x in (before, after)]
+    >>> command = names(loop.states).index("pid.command")
+    >>> [float(loop.update(0, x, [1.0], loop.parameter_vector(new))[command]) for x in (before, after)]
     [0.0, 1.0]
     """
     loop.check(new)
@@ -65,6 +72,9 @@ def bumpless_transfer(
     if loop.outer is None:  # the speed that a cascade's PID has been given is not known here
         state[remembered] += (c_new - c) * reference
     integral = order.index("pid.integral")
+    if loop.pid.sample_time is not None and integrates(loop.parallel_form(new).Ki):
+        shares = [_distance_share(loop, state, p, reference) for p in (old, new)]
+        state[order.index("pid.transfer")] += shares[0] - shares[1]
     state[integral] += before - _next_command(loop, state, new, reference)
     if loop.compensators:
         state[integral] = _integral_for(loop, state, new, reference, before)
@@ -79,6 +89,18 @@ def _integral_for(loop: ClosedLoop, x: Array, parameters: ParameterSet, referenc
         return np.array([_next_command(loop, np.where(own, i, x), parameters, reference) for i in integrals])
 
     return float(invert_increasing(commands, np.array([command]))[0])
+
+
+def _distance_share(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:
+    """The part of the next command that is due to the distance from the set point, Kp b (r - y) as the PID sees it."""
+    t, state, u = ca.SX.sym("t"), symbols(loop.states), symbols(loop.inputs)
+    p: Signals = {n: ca.SX.sym(n) for n in loop.parameters}
+    y = evaluate_plant(loop.plant, loop.command.name, t, state, u, p, ca.SX(0))[1]
+    terms = controller_update(loop, t, state, u, y, p).terms
+    of = ca.Function("share", [t, *map(stack, (state, u, p))], [terms["Kp_parallel"] * p["pid.b"] * terms["error"]])
+    given = np.zeros(len(loop.inputs))
+    given[0] = reference
+    return float(of(0.0, x, given, loop.parameter_vector(parameters)))
 
 
 def _next_command(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:

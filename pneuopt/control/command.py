@@ -103,7 +103,8 @@ def added_terms(
         v = parts.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
         rates = {n: u[n] for n in (REFERENCE_SPEED, REFERENCE_ACCELERATION) if n in u}
         error = u.get(ERROR, u["reference"] - measured)
-        seen = Instant(t, u["reference"], measured, v + lead, parts.pid.sample_time, rates, y, error)
+        h = parts.pid.sample_time
+        seen = Instant(t, u["reference"], measured, v + lead, h, rates, y, error, _elapsed_time(parts, x))
         own, bent = compensate(parts.compensators, seen, x, p)
         moved = moved | own
     return moved, {"feedforward": lead, "compensation": bent, "dither": _dither_command(parts, t, p)}
@@ -123,6 +124,11 @@ def _feedforward_terms(parts: CommandParts, x: Symbols, u: Symbols, p: Symbols) 
     if parts.feedforward is None:
         return {}, ca.SX(0)
     own = (without_prefix(x, "feedforward"), u["reference"], without_prefix(p, "feedforward"))
-    h = parts.pid.sample_time
-    moved, added = parts.feedforward.rates(*own) if h is None else parts.feedforward.update(*own, h)
+    elapsed = _elapsed_time(parts, x)
+    moved, added = parts.feedforward.rates(*own) if elapsed is None else parts.feedforward.update(*own, elapsed)
     return with_prefix(moved, "feedforward"), added
+
+
+def _elapsed_time(parts: CommandParts, x: Symbols) -> ca.SX | float | None:
+    """The time since the last good sample [s]; None of a continuous PID."""
+    return None if parts.pid.sample_time is None else parts.pid.elapsed_time(without_prefix(x, "pid"))

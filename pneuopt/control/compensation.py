@@ -33,6 +33,7 @@ class Instant:
     `sample_time` [s] is the controller's, None of a continuous one. `rates` are the motion inputs that the part asks
     for ("reference_speed", "reference_acceleration"), `readings` the plant's outputs, by name, and `error` that of the
     signal that the loop is judged by, which in a cascade is the position; a rest, where parts start, has none.
+    `elapsed` [s] is the time since the last good sample of a sampled controller, over which differences are taken.
     """
 
     t: Any
@@ -43,6 +44,7 @@ class Instant:
     rates: Mapping[str, Any] = field(default_factory=dict)
     readings: Mapping[str, Any] = field(default_factory=dict)
     error: Any = 0.0
+    elapsed: Any = None
 
 
 @runtime_checkable

@@ -158,7 +158,8 @@ class ComposedLoops:
 # Norm of a matrix and terms of the series of its exponential, whose remainder is then .5^17/17!, below rounding: a
 # larger norm needs more terms, a smaller one more squarings, each of which doubles the rounding.
 LARGEST_TAYLOR_NORM, TAYLOR_TERMS = 0.5, 16
-_COMMANDS = ("pid.command", "pid.pending")  # states that hold the command: the hold and the delay have their own
+# States that hold the command, as the hold and the delay have their own, and those that nothing moves in normal work.
+_COMMANDS = ("pid.command", "pid.pending", "pid.transfer", "pid.bad_samples")
 
 
 class _Laws(NamedTuple):
@@ -202,7 +203,7 @@ def _controller(loop: ClosedLoop, x: Signals, r: ca.SX, y: Signals, noise: ca.SX
     noisy = loop.feedback.name
     y = {**y, noisy: y[noisy] + noise} if loop.outer else y
     seen = (
-        loop.sensor.update(own, y, loop.sensed_signal, without_prefix(p, "sensor"))
+        loop.sensor.update(own, y, loop.sensed_signal, without_prefix(p, "sensor"), loop.pid.sample_time or 0.0)
         if isinstance(loop.sensor, Encoder)
         else {}
     )
@@ -233,7 +234,7 @@ def _resting_states(loop: ClosedLoop, x: Signals, y: Signals, v: ca.SX, p: Signa
     for part in loop.compensators:
         named = (f"{part.section}.{q.name}" for q in part.states(loop.sensed_signal, loop.command))
         at |= dict(zip(named, map(ca.SX, part.start(loop.sensed_signal, seen)), strict=True))
-    given: Mapping[str, ca.SX] = {**at, "pid.integral": ca.SX(0)}
+    given: Mapping[str, ca.SX] = {**at, "pid.integral": ca.SX(0), **{n: ca.SX(0) for n in _COMMANDS}}
     own = without_prefix(given, "pid")
     wanted = pid_reference(loop, {"reference": y[loop.feedback.name]}, y[loop.feedback.name], p)["reference"]
     at["pid.integral"] = v - loop.pid.output(own, wanted, measured, without_prefix(p, "pid"))

@@ -64,7 +64,7 @@ class Feedforward:
         lead = r - x["filter"]
         return {"filter": lead / p["time"]}, p["gain"] * lead
 
-    def update(self, x: Symbols, r: ca.SX, p: Symbols, sample_time: float) -> tuple[dict[str, ca.SX], ca.SX]:
-        """The sampled law at a sample: the next r_f, and u_ff [output unit]."""
-        slow = (p["time"] * x["filter"] + sample_time * r) / (p["time"] + sample_time)
+    def update(self, x: Symbols, r: ca.SX, p: Symbols, elapsed: ca.SX | float) -> tuple[dict[str, ca.SX], ca.SX]:
+        """The sampled law at a sample, `elapsed` [s] after the last good one: the next r_f, and u_ff [output unit]."""
+        slow = (p["time"] * x["filter"] + elapsed * r) / (p["time"] + elapsed)
         return {"filter": slow}, p["gain"] * (r - slow)

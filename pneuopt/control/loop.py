@@ -28,7 +28,7 @@ from pneuopt.control.loop_equations import continuous_rates, held_rates
 from pneuopt.control.loop_start import start_state
 from pneuopt.control.pid import PID
 from pneuopt.control.position_loop import PositionLoop
-from pneuopt.control.sampled import controller_update
+from pneuopt.control.sampled import controller_readings, controller_update
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag
 from pneuopt.control.wiring import Signals, check_algebraic_loop, check_cascade, evaluate_plant, select_signal
 from pneuopt.dynamics.hooks import Axis
@@ -199,10 +199,7 @@ class ClosedLoop:
     @cached_property
     def readings(self) -> tuple[str, ...]:
         """The plant's outputs that the controller reads beside what its PID controls, in the plant's order."""
-        used = {n for part in self.compensators for n in part.reads(self.sensed_signal)}
-        if not isinstance(self.sensor, Encoder):  # which has the position itself
-            used |= {self.feedback.name} if self.outer else set()
-            used |= {self.schedule.position} - {self.pid_signal.name} if self.schedule else set()
+        used = controller_readings(self)
         return tuple(n for n in names(self.plant.outputs) if n in used)
 
     @property

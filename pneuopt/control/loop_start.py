@@ -45,7 +45,7 @@ def start_state(
     p = np.array([float(v) for v in value.values()])
     wanted = float(pid_reference(loop, {"reference": reference}, y[loop.feedback.name], value)["reference"])
     v = float(uncompensated_command(loop, p, wanted, seen, command, [y[n] for n in loop.readings])[0])
-    own = loop.pid.start(wanted, seen, v, {**without_prefix(value, "pid"), "Kp": float(loop.gains(p)[0])})
+    own = [float(state) for state in loop.pid.start(wanted, seen, v, without_prefix(value, "pid"))]
     known = Instant(0.0, wanted, seen, v, loop.pid.sample_time, {}, y)
     others = [float(remembered) for part in loop.compensators for remembered in part.start(loop.sensed_signal, known)]
     return np.concatenate([x, sensor, own, [reference] if loop.feedforward else [], others])

@@ -18,6 +18,11 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
 
+BAD_SAMPLES = "bad_samples"  # the state that counts them
+FAULT_SAMPLES = 5.0  # default: fewer stop a drive for a disturbed telegram, more leave it longer on an old output
+LEAST_KI = 1e-20  # [any unit] below it there is no integral action: a Ti of 1e30 s, "infinite" where no such literal is
+MOST_EMPTYING = 10.0  # of Tt's default: a Tt that is to switch back-calculation off must not keep a transfer for ever
+
 
 class AntiWindup(Enum):
     """What keeps the integral from growing while the command is at a limit."""
@@ -39,8 +44,20 @@ class PID:
 
         D = Tf/(Tf + h) D_ + Kd/(Tf + h) ((c r - y) - (c r - y)_)
         I = I_ + Ki h (r - y)
-        w = Kp (b r - y) + I + D + added,  u = min(max(w, lower), upper)
-        I = I + h/Tt (u - w)
+        w = Kp (b r - y) + I + D + T_ + added,  u = min(max(w, lower), upper)
+        I = I + h/Tt (u - w),  T = T_/(1 + h/Tt)
+
+    T is the transfer, zero but after a start without a bump far from the set point: there the integral begins with the
+    command of a set point that equals the measurement, and T with what the distance takes from it,
+    ``-Kp b (r - y)``. So the output does not jump, and its proportional term follows as if the set point went from the
+    measurement to its value with the time constant Tt; a slow integral alone would hold the loop while it moves on.
+
+    Where Ki = 0, nothing fills the integral, and nothing would empty it: it takes nothing back at a limit, and what it
+    holds, of a start or of earlier gains, goes with Tt, ``I = I_/(1 + h/Tt)``. Without a Tt, the time of both is its
+    default; a Tt that switches back-calculation off counts as ten times that at most.
+
+    After samples that were no numbers (`controller_update`), the h of the derivative is the time since the last good
+    one.
 
     With a dead band, what is integrated is ``e - min(max(e, -dead_band), dead_band)`` instead of e = r - y: nothing
     while |e| < dead_band, and beyond it what exceeds it, so that nothing jumps at its edge. That is against windup by
@@ -113,8 +130,8 @@ class PID:
         Returns
         -------
         ParameterSet
-            The form's gains, b, c [1], with a dead band dead_band [input_unit], and with limits lower and upper
-            [output_unit] and, for back-calculation, Tt [s].
+            The form's gains, b, c [1], with a dead band dead_band [input_unit], with limits lower and upper
+            [output_unit] and, for back-calculation, Tt [s], and sampled fault_samples [1], fault_output [output_unit].
 
         Examples
         --------
@@ -152,7 +169,7 @@ class PID:
             core["dead_band"] = Parameter(0.0, difference_unit(input_unit), lower=0.0, meaning=band)
         saturation = {
             "Tt": Parameter(
-                max(0.1, 10 * h), "s", lower=shortest, meaning="time in which the integral unwinds at a limit"
+                _default_Tt(h), "s", lower=shortest, meaning="time in which the integral unwinds at a limit"
             ),
             "lower": Parameter(-inf, output_unit, meaning="least command"),
             "upper": Parameter(inf, output_unit, meaning="largest command"),
@@ -160,7 +177,13 @@ class PID:
         if self.anti_windup is AntiWindup.CLAMPING:
             del saturation["Tt"]
         found = ParameterSet(core | saturation if self.limits else core)
+        found = found | _fault_parameters(output_unit) if h else found
         return found | reset_parameters(reference_unit or input_unit) if self.reset else found
+
+    @property
+    def fixed_parameters(self) -> tuple[str, ...]:
+        """Parameters that nothing tunes: what a fault makes of the output is decided by who knows the machine."""
+        return ("fault_samples", "fault_output") if self.sample_time else ()
 
     @property
     def positive_parameters(self) -> tuple[str, ...]:
@@ -194,9 +217,13 @@ class PID:
             Tt, least = p["Tt"], h or 0.0
             told = f"anti-windup needs Tt > 0, and with sampling at least one sample ({least:g} s)"
             require(Tt > 0 and Tt >= least, f"pid.Tt = {Tt:g} s: {told}")
+        if h is not None:
+            count, safe = p["fault_samples"], p["fault_output"]
+            require(0 < count < inf, f"pid.fault_samples must be positive and finite, got {count:g}")
+            require(abs(safe) < inf, f"pid.fault_output must be finite, got {safe:g} {unit}")
 
     def states(self, measured: Quantity, command: Quantity) -> tuple[Quantity, ...]:
-        """The controller's states: integral and filter; sampled, also the held command and, delayed, the next one."""
+        """The controller's states: integral and filter; sampled, what the law and the handling of faults remember."""
         integral = Quantity("integral", command.unit, command.nominal)
         if self.sample_time is None:
             return integral, Quantity("filter", measured.unit, measured.nominal)
@@ -208,6 +235,8 @@ class PID:
             Quantity("command", command.unit, command.nominal),
             *(pending for _ in range(self.delay)),
             *(reset_quantities(measured) if self.reset else ()),
+            Quantity("transfer", command.unit, command.nominal),
+            Quantity(BAD_SAMPLES, "1"),
         )
 
     def start(self, r: Any, y: Any, command: Any, p: Mapping[str, Any]) -> list[Any]:
@@ -218,12 +247,15 @@ class PID:
         r, y, command : float or casadi.SX
             So far [input unit], [output unit].
         p : mapping of str to float or casadi.SX
-            Kp of the parallel form, b and c.
+            The form's gains, b and c.
         """
-        integral, error = command - p["Kp"] * (p["b"] * r - y), p["c"] * r - y
+        Kp, Ki, _, _ = parallel_gains(self.form, p)
+        integral, error = command - Kp * (p["b"] * r - y), p["c"] * r - y
         if self.sample_time is None:
             return [integral, error]
-        return [integral, 0.0, error, *[command] * (1 + self.delay), *[0.0] * (len(RESET_STATES) * self.reset)]
+        transfer = Kp * p["b"] * (y - r) * integrates(Ki)
+        reset = [0.0] * (len(RESET_STATES) * self.reset)
+        return [integral - transfer, 0.0, error, *[command] * (1 + self.delay), *reset, transfer, 0.0]
 
     def rates(self, x: Symbols, r: ca.SX, y: ca.SX, added: ca.SX, p: Symbols) -> tuple[dict[str, ca.SX], ca.SX]:
         """The continuous law.
@@ -245,14 +277,14 @@ class PID:
         _, Ki, _, Tf = parallel_gains(self.form, p)
         v = self.output(x, r, y, p)
         u = self.clip(v + added, p)
-        windup = (u - v - added) / p["Tt"] if self.limits else 0.0
+        windup = (u - v - added) / p["Tt"] if self.limits else ca.SX(0)
+        windup = ca.if_else(integrates(Ki), windup, -x["integral"] / self.emptying_time(p))
         return {"integral": Ki * self._integrand(r - y, p) + windup, "filter": (p["c"] * r - y - x["filter"]) / Tf}, u
 
     def update(self, x: Symbols, r: ca.SX, y: ca.SX, added: ca.SX, p: Symbols) -> dict[str, ca.SX]:
         """The sampled law at a sample: the next value of each state, "command" being what is held.
 
-        Parameters as for `rates`; the states are "integral", "derivative", "previous_error", "command", and with a
-        delay "pending", the command that the next sample holds; with a reset as `reset_integral` leaves them.
+        Parameters as for `rates`; the states are those of `states`, with a reset as `reset_integral` leaves them.
         """
         terms = self.terms(x, r, y, p)
         w = self.output(x, r, y, p) + added
@@ -260,7 +292,24 @@ class PID:
         sent = {"command": x["pending"], "pending": u} if self.delay else {"command": u}
         remembered = {"derivative": terms["derivative"], "previous_error": p["c"] * r - y}
         own = {n: x[n] for n in RESET_STATES if self.reset}
-        return {"integral": self._unwind(x["integral"], terms["integral"], w, u, p), **remembered, **sent, **own}
+        transfer = x["transfer"] / (1 + (self.sample_time or 0.0) / self.emptying_time(p))
+        integral = self._unwind(x["integral"], terms["integral"], w, u, p)
+        return {"integral": integral, **remembered, **sent, **own, "transfer": transfer, BAD_SAMPLES: ca.SX(0)}
+
+    def hold(self, x: Symbols, count: ca.SX, p: Symbols) -> dict[str, ca.SX]:
+        """The next value of each state at a bad sample, the `count`-th in a row: as it was, and the output's own."""
+        safe = self.clip(p["fault_output"], p)
+        sent = ca.if_else(count >= p["fault_samples"], safe, self.sent(x))
+        moved = {"command": x["pending"], "pending": sent} if self.delay else {"command": sent}
+        return {**x, **moved, BAD_SAMPLES: count}
+
+    def sent(self, x: Symbols) -> ca.SX:
+        """What was computed last, whether it acts at once or at the next sample [output unit]."""
+        return x["pending" if self.delay else "command"]
+
+    def elapsed_time(self, x: Symbols) -> ca.SX | float:
+        """The time since the last good sample [s]: a sample's, and those of the bad ones in between."""
+        return (self.sample_time or 0.0) * (1 + x[BAD_SAMPLES])
 
     def terms(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> dict[str, ca.SX]:
         """The sampled law's terms at a sample: "proportional", "integral" before back-calculation, "derivative"."""
@@ -268,14 +317,15 @@ class PID:
         return {
             "proportional": Kp * (p["b"] * r - y),
             "integral": x["integral"] + Ki * h * self._integrand(r - y, p),
-            "derivative": (Tf * x["derivative"] + Kd * (p["c"] * r - y - x["previous_error"])) / (Tf + h),
+            "derivative": (Tf * x["derivative"] + Kd * (p["c"] * r - y - x["previous_error"]))
+            / (Tf + self.elapsed_time(x)),
         }
 
     def output(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> ca.SX:
         """The command v of the law itself, before anything is added to it; at a sample that of a sampled one."""
         if self.sample_time is not None:
             terms = self.terms(x, r, y, p)
-            return terms["proportional"] + terms["integral"] + terms["derivative"]
+            return terms["proportional"] + terms["integral"] + terms["derivative"] + x["transfer"]
         Kp, _, Kd, Tf = parallel_gains(self.form, p)
         return Kp * (p["b"] * r - y) + x["integral"] + Kd / Tf * (p["c"] * r - y - x["filter"])
 
@@ -284,15 +334,43 @@ class PID:
         return ca.fmin(ca.fmax(w, p["lower"]), p["upper"]) if self.limits else w
 
     def _unwind(self, before: ca.SX, integral: ca.SX, w: ca.SX, u: ca.SX, p: Symbols) -> ca.SX:
-        """The integral after a sample, by what the clip has taken from the command."""
-        if not self.limits:
-            return integral
-        if self.anti_windup is AntiWindup.BACK_CALCULATION:
-            return integral + (self.sample_time or 0.0) / p["Tt"] * (u - w)
-        step, excess = integral - before, w - u
-        return integral - ca.fmax(0, ca.fmin(step, excess)) - ca.fmin(0, ca.fmax(step, excess))
+        """The integral after a sample, by what the clip has taken from the command, or where Ki = 0 by its time."""
+        h, kept = self.sample_time or 0.0, integral
+        if self.limits and self.anti_windup is AntiWindup.BACK_CALCULATION:
+            kept = integral + h / p["Tt"] * (u - w)
+        elif self.limits:
+            step, excess = integral - before, w - u
+            kept = integral - ca.fmax(0, ca.fmin(step, excess)) - ca.fmin(0, ca.fmax(step, excess))
+        emptied = integral - before * (h / (h + self.emptying_time(p)))
+        return ca.if_else(integrates(parallel_gains(self.form, p)[1]), kept, emptied)
+
+    def emptying_time(self, p: Mapping[str, Any]) -> Any:
+        """In which a transfer goes, and an integral that nothing fills [s]."""
+        usual = _default_Tt(self.sample_time or 0.0)
+        unwinds = self.limits and self.anti_windup is AntiWindup.BACK_CALCULATION
+        return ca.fmin(p["Tt"], MOST_EMPTYING * usual) if unwinds else usual
 
     def _integrand(self, error: ca.SX, p: Symbols) -> ca.SX:
         if not self.dead_band:
             return error
         return error - ca.fmin(ca.fmax(error, -p["dead_band"]), p["dead_band"])
+
+
+def integrates(Ki: Any) -> Any:
+    """Whether there is an integral action."""
+    return abs(Ki) > LEAST_KI
+
+
+def _default_Tt(h: float) -> float:
+    return max(0.1, 10 * h)
+
+
+def _fault_parameters(unit: str) -> ParameterSet:
+    count = "samples in a row that are no numbers, after which the output goes to its safe value"
+    safe = "output after that many, as the command counts: 0 is the centre"
+    return ParameterSet(
+        {
+            "fault_samples": Parameter(FAULT_SAMPLES, "1", lower=0.0, meaning=count),
+            "fault_output": Parameter(0.0, unit, meaning=safe),
+        }
+    )

@@ -79,7 +79,7 @@ class PressureFeedback:
 
     def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The slow part's rate or next value, and u_p [the command's unit]."""
-        d, h, time = _difference(seen), seen.sample_time, p["time"]
+        d, h, time = _difference(seen), seen.elapsed, p["time"]
         if h is None:
             return {"slow": (d - x["slow"]) / time}, p["gain"] * (x["slow"] - d)
         slow = (time * x["slow"] + h * d) / (time + h)

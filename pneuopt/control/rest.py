@@ -8,6 +8,7 @@ import numpy as np
 
 from pneuopt.control.command import CommandParts, pid_reference
 from pneuopt.control.gain_schedule import ScheduledParts, schedule_gains
+from pneuopt.control.pid import integrates
 from pneuopt.control.wiring import JoinedSignals, Signals, evaluate_plant
 from pneuopt.dynamics.system import FRICTION_DIRECTION, Symbols, System, define, names, parameter_vector
 from pneuopt.quantities.arrays import Array
@@ -132,7 +133,7 @@ def _no_rest(loop: WiredLoop, reference: float, error: ConvergenceError) -> Conv
 
 def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSet) -> System:
     """The loop with the integral as its controller's only state, and without the plant's free ones."""
-    plant, acts = loop.plant, bool(loop.gains(parameter_vector(loop.parameters, parameters))[1])
+    plant, acts = loop.plant, integrates(float(loop.gains(parameter_vector(loop.parameters, parameters))[1]))
     integral = [Quantity(INTEGRAL_STATE, loop.command.unit, loop.command.nominal)] if acts else []
     states = [*(q for q in plant.states if q.name not in free), *integral]
 

@@ -110,7 +110,9 @@ class SensorLag:
         """Time derivatives of the states; y are the plant's outputs."""
         return {"reading": (y[on.measured.name] - x["reading"]) / p["lag"]}
 
-    def update(self, x: Symbols, _y: Symbols, _on: SensedSignal, _p: Symbols) -> dict[str, ca.SX]:
+    def update(
+        self, x: Symbols, _y: Symbols, _on: SensedSignal, _p: Symbols, _elapsed: ca.SX | float
+    ) -> dict[str, ca.SX]:
         """The states after a sample: as before."""
         return dict(x)
 
@@ -201,13 +203,17 @@ class Encoder:
         """Nothing moves between two samples."""
         return {n: ca.SX(0) for n in x}
 
-    def update(self, x: Symbols, y: Symbols, on: SensedSignal, p: Symbols) -> dict[str, ca.SX]:
-        """The states after a sample; y are the plant's outputs."""
+    def update(self, x: Symbols, y: Symbols, on: SensedSignal, p: Symbols, elapsed: ca.SX | float) -> dict[str, ca.SX]:
+        """The states after a sample; y are the plant's outputs, `elapsed` is the time since the last good one [s]."""
         now = self._quantise(y[self.position], p)
         if not self.differentiates(on):
             return {"reading": now}
-        step = on.h / (on.h + p["filter"]) * ((now - x["count"]) / on.h - x["reading"])
+        step = elapsed / (elapsed + p["filter"]) * ((now - x["count"]) / elapsed - x["reading"])
         return {"reading": x["reading"] + step, "count": now}
+
+    def rest(self, y: Symbols, on: SensedSignal, p: Symbols) -> dict[str, ca.SX]:
+        """The states of a body that has stood still: all that a position alone says of a speed."""
+        return {"reading": ca.SX(0), "count": self._quantise(y[self.position], p)} if self.differentiates(on) else {}
 
     def time_constant(self, on: SensedSignal, p: Mapping[str, Any]) -> Any:
         """Of the loop linearised [s]; half a sample of it is the difference's."""

@@ -1,5 +1,7 @@
 """The controller in C99: header, source, and a test that compares it with the library; no allocation, math.h alone."""
 
+import math
+
 import casadi as ca
 
 from pneuopt.export.expression_writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix, unary_calls
@@ -48,7 +50,8 @@ def _comment(header: Header) -> list[str]:
 
 
 def _members(variables: tuple[Variable, ...]) -> list[str]:
-    return [f"    double {v.name}; /* {comment_text(f'[{v.unit}] {v.meaning}')} */" for v in variables]
+    kinds = ("double", "int")
+    return [f"    {kinds[v.is_flag]} {v.name}; /* {comment_text(f'[{v.unit}] {v.meaning}')} */" for v in variables]
 
 
 def _prototypes(program: ControllerProgram, name: str) -> tuple[str, str, str]:
@@ -115,7 +118,7 @@ def _reads(assignments: tuple[tuple[str, str], ...], name: str) -> bool:
 def _test(program: ControllerProgram, header: Header, run: ReferenceRun) -> str:
     name, columns = header.name, len(program.inputs) + 1
     rows = [
-        "    {" + ", ".join(C99.literal(v) for v in (*given, out)) + "},"
+        "    {" + ", ".join(_number(v) for v in (*given, out)) + "},"
         for given, out in zip(run.inputs, run.outputs, strict=True)
     ]
     read = ", ".join(f"run[k][{i}]" for i in range(columns - 1))
@@ -130,8 +133,13 @@ def _test(program: ControllerProgram, header: Header, run: ReferenceRun) -> str:
     lines += ["    for (k = 0; k < sizeof run / sizeof run[0]; ++k) {"]
     lines += [f"        const double wanted = run[k][{columns - 1}];"]
     lines += [f"        const double off = fabs({name}_step(&c, {read}) - wanted);"]
-    lines += ["        worst = off > worst ? off : worst;"]
+    lines += ["        worst = off <= worst ? worst : off;", "        if (!(off < INFINITY))", "            return 1;"]
     lines += ["        largest = fabs(wanted) > largest ? fabs(wanted) : largest;", "    }"]
     lines += ['    printf("largest difference %.3g of %.3g\\n", worst, largest);']
     lines += [f"    return worst <= {C99.literal(RUN_TOLERANCE)} * largest ? 0 : 1;", "}"]
     return "\n".join(lines) + "\n"
+
+
+def _number(value: float) -> str:
+    """A number of the test's run, or none."""
+    return "NAN" if math.isnan(value) else C99.literal(value)

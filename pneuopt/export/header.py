@@ -2,12 +2,14 @@
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from pneuopt.control.forms import to_series, to_standard
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import integrates
+from pneuopt.control.sampled import LARGEST_SIGNAL
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
@@ -144,6 +146,7 @@ def _notes(loop: ClosedLoop, parameters: ParameterSet, centre: float) -> list[st
         low, high = (write_value(value[n] + centre, unit) for n in ("pid.lower", "pid.upper"))
         about = "; lower and upper count from the centre" if centre else ""
         notes += [f"The output runs from {low} to {high}{about}."]
+    notes += [*_start_notes(loop, parameters, value), *_fault_notes(loop, value, centre)]
     if loop.pid.delay:
         notes += ["The design counts on one sample from reading to acting."]
     if loop.dither is not None and loop.dither.analogue:
@@ -163,3 +166,31 @@ def _notes(loop: ClosedLoop, parameters: ParameterSet, centre: float) -> list[st
     if loop.pid.limits and math.isinf(value["pid.lower"]) and math.isinf(value["pid.upper"]):
         notes += ["The output has no limits; set lower and upper."]
     return notes
+
+
+def _start_notes(loop: ClosedLoop, parameters: ParameterSet, value: Mapping[str, float]) -> list[str]:
+    """What a start does with the output so far, and why."""
+    time = write_value(float(loop.pid.emptying_time({n.removeprefix("pid."): v for n, v in value.items()})), "s")
+    if not integrates(loop.parallel_form(parameters).Ki):
+        return [
+            "A start, or restart, does not make the output jump: the output so far passes to the controller's own",
+            f"with a time constant of {time}. Without an integral gain nothing is kept there, at a limit neither.",
+        ]
+    return [
+        "A start, or restart, does not make the output jump, and does not leave the axis waiting for a slow integral:",
+        f"the setpoint counts as if it moved from the measurement to its value with a time constant of {time}.",
+    ]
+
+
+def _fault_notes(loop: ClosedLoop, value: Mapping[str, float], centre: float) -> list[str]:
+    """What happens at a sample that is no number, after how many, and how the controller recovers."""
+    count, h = math.ceil(value["pid.fault_samples"]), loop.pid.sample_time or 0.0
+    inside = min(max(value["pid.fault_output"], value.get("pid.lower", -math.inf)), value.get("pid.upper", math.inf))
+    safe, time = write_value(inside + centre, loop.command.unit), write_value(count * h, "s", 3)
+    return [
+        f"A sample is bad where an input is no number, or larger than {LARGEST_SIGNAL:g}: the output stays as it was,",
+        "fault is set, and the next good sample goes on from there, its differences taken over the whole gap.",
+        f"After {count} bad samples in a row (fault_samples), {time}, the output goes to {safe} (fault_output); "
+        "the next good sample then begins anew from it, as at a start.",
+        "Where the first sample is bad, the output is the safe one until a good sample begins.",
+    ]

@@ -35,7 +35,7 @@ class Page:
     start_locals, locals : tuple of Assignment
         Values on the way.
     outputs, states : mapping of str to str
-        What each becomes, in terms of the locals; no state is read here that has been written.
+        What each becomes, in terms of the locals; no state is read here that has been written. A flag's is a condition.
     operations : frozenset of int
         CasADi's operations in all of them.
     """
@@ -85,7 +85,7 @@ def write_page(program: ControllerProgram, syntax: Syntax, places: Places, taken
         (*started.coefficients, *started.statements),
         tuple(Assignment(n, started.results[begun]) for n, begun in zip(states, first, strict=True)),
         tuple(own),
-        {n: found[made] for n, made in zip(outputs, now, strict=True)},
+        {v.name: found[made] + (" > 0.0" if v.is_flag else "") for v, made in zip(program.outputs, now, strict=True)},
         {n: found[made] for n, made in zip(states, after, strict=True)},
         frozenset(started.operations | step.operations),
     )

@@ -7,15 +7,14 @@ from typing import NamedTuple
 import casadi as ca
 
 from pneuopt.control.command import pid_reference
-from pneuopt.control.compensation import Compensator, Instant
+from pneuopt.control.compensation import Compensator
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form, parallel_gains
 from pneuopt.control.gain_schedule import GainSchedule, schedule_gains
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
+from pneuopt.control.pid import BAD_SAMPLES, PID
 from pneuopt.control.position_loop import PositionLoop
-from pneuopt.control.sampled import controller_update
+from pneuopt.control.sampled import begin_controller, controller_update, signals_are_good
 from pneuopt.control.sensor import Encoder, SensedSignal
 from pneuopt.control.wiring import Signals
 from pneuopt.dynamics.system import Symbols, symbols
@@ -40,7 +39,10 @@ STATE_MEANINGS: Mapping[str, str] = {
     "pid.previous_error": "weighted error of the sample before",
     "pid.side": "side on which the error was last",
     "pid.excursion": "how far the error has gone since it changed sides",
+    "pid.command": "command that was sent last",
     "pid.pending": "command that acts at the next sample",
+    "pid.transfer": "what a start takes back for the distance to the setpoint, until it has passed",
+    "pid.bad_samples": "samples in a row that were no numbers",
     "feedforward.filter": "reference, filtered",
     "pressure_feedback.slow": "differential pressure, its slow part",
     "acceleration_feedback.position": "filtered position",
@@ -55,6 +57,8 @@ STATE_MEANINGS: Mapping[str, str] = {
     "impulsive_control.before": "error at the last pulse's onset",
     "impulsive_control.ceiling": "peak of the last pulse towards this side that went too far; 0: none",
 }
+FAULT = "fault"
+_NOT_READ = ("measured_read", "output_read")
 _UNNAMED_CONSTANTS = (0.5, 1.0, 2.0)  # sample times [s] that are found in many formulas, where their name would mislead
 
 
@@ -69,6 +73,8 @@ class Variable:
         Of a parameter; of another 0.
     origin : str
         What the loop calls it ("pid.Kp"), where it has it; `name` is an identifier in every language.
+    is_flag : bool
+        Whether it is on or off, 1 or 0.
     """
 
     name: str
@@ -76,6 +82,10 @@ class Variable:
     meaning: str
     value: float = 0.0
     origin: str = ""
+    is_flag: bool = False
+
+
+FAULT_FLAG = Variable(FAULT, "1", "whether this sample had a signal that is no number", is_flag=True)
 
 
 @dataclass(frozen=True)
@@ -87,7 +97,7 @@ class ControllerProgram:
     sample_time : float
         [s]
     parameters, inputs, states, outputs : tuple of Variable
-        The first output is what the actuator gets.
+        The first output is what the actuator gets, the last one the flag of a fault.
     start_inputs : tuple of Variable
     start : casadi.Function
         ``(start_inputs, parameters) -> states``: at rest, or from another controller's output without a bump.
@@ -222,16 +232,11 @@ def _law(loop: ClosedLoop) -> _Law:
     t = (loop.pid.sample_time or 0.0) * x[SAMPLE]
     shown = {n: u[_reading(n)] for n in loop.readings} | {measured.name: u["measured"]}
     found = controller_update(parts, t, x, u, shown, p)
-    given: Signals = {"count": u["measured"]} if encoder else {}
-    frozen = schedule_gains(parts, p, u["measured"], given, shown)
-    own = without_prefix(frozen, "pid")
-    gains = dict(zip(Form.PARALLEL.gains, parallel_gains(loop.pid.form, own), strict=True))
-    converted = {} if loop.pid.form is Form.PARALLEL else {f"{n}_parallel": value for n, value in gains.items()}
     after = {**found.states, SAMPLE: x[SAMPLE] + 1}
-    terms = {f"{n}_term" if n in ADDED_TERMS else n: v for n, v in found.terms.items()} | converted
-    inner = pid_reference(parts, u, shown[loop.feedback.name], frozen) if loop.outer else u
-    begun = _start(parts, inner, shown, {**own, "Kp": gains["Kp"]}, p[CENTRE])
-    return _Law(u, x, p, measured, after, begun, terms)
+    renamed = {"reference_read": "setpoint_read", f"{measured.name}_read": "measured_read"}
+    renamed |= {n: f"{n}_term" for n in ADDED_TERMS}
+    terms = {renamed.get(n, n): v for n, v in found.terms.items() if n not in _NOT_READ}
+    return _Law(u, x, p, measured, after, _start(parts, u, measured.name, loop.readings, p), terms)
 
 
 def _reading(name: str) -> str:
@@ -239,19 +244,24 @@ def _reading(name: str) -> str:
     return f"reading {name}"
 
 
-def _start(parts: _ComputedParts, u: Signals, shown: Signals, p: Symbols, centre: ca.SX) -> Signals:
-    """The first states, as `ClosedLoop.initial` has them, from what the actuator has got so far."""
-    command, unit = u["output"] - centre, Quantity("command", "1")
+def _start(parts: _ComputedParts, u: Signals, measured: str, readings: Iterable[str], p: Signals) -> Signals:
+    """The first states, as `ClosedLoop.initial` has them, from what the actuator has got so far.
+
+    Where a signal is bad, nothing is known: the controller begins anew with the first good sample, and its output is
+    the safe one until then.
+    """
+    signals = [n for n in u if n != "output"]
+    good, told = signals_are_good([u[n] for n in signals]), signals_are_good([u["output"]])
+    u = {n: ca.if_else(good, u[n], 1) for n in signals} | {"output": u["output"]}
+    own, shown = without_prefix(p, "pid"), {n: u[_reading(n)] for n in readings} | {measured: u["measured"]}
+    command = ca.if_else(told, u["output"] - p[CENTRE], parts.pid.clip(own["fault_output"], own))
+    given: Signals = {"count": u["measured"]} if parts.sensor else {}
+    frozen = schedule_gains(parts, p, u["measured"], given, shown)
+    inner = pid_reference(parts, u, shown[parts.feedback.name], frozen) if parts.outer else u
     seen = ca.SX(0) if parts.sensor else u["measured"]  # a position says no speed: the start is at rest
     begun: Signals = {"sensor.reading": seen, "sensor.count": u["measured"]}
-    pid = parts.pid.start(u["reference"], seen, command, p)
-    begun |= {f"pid.{q.name}": v for q, v in zip(parts.pid.states(unit, unit), pid, strict=True)}
-    begun["feedforward.filter"] = u["reference"]
-    for part in parts.compensators:
-        known = Instant(ca.SX(0), u["reference"], seen, command, parts.pid.sample_time, {}, shown)
-        own = zip(part.states(parts.sensed_signal, unit), part.start(parts.sensed_signal, known), strict=True)
-        begun |= {f"{part.section}.{q.name}": v for q, v in own}
-    return {**begun, SAMPLE: ca.SX(0)}
+    begun |= begin_controller(parts, inner, seen, shown, command, frozen)
+    return {**begun, f"pid.{BAD_SAMPLES}": ca.if_else(good, 0, own["fault_samples"]), SAMPLE: ca.SX(0)}
 
 
 def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: float) -> ControllerProgram:
@@ -280,7 +290,7 @@ def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: flo
         tuple(Variable(names.parameters[n], *declared[n], value[n], n) for n in given),
         inputs,
         tuple(Variable(names.states[n], units[n], STATE_MEANINGS.get(n, n), 0.0, n) for n in states),
-        tuple(Variable(n, unit, what) for n, (_, what) in outputs.items()),
+        (*(Variable(n, unit, what) for n, (_, what) in outputs.items() if n != FAULT), FAULT_FLAG),
         (*inputs, Variable("start_output", unit, "what the actuator has got so far, from which it goes on")),
         ca.Function("start", [begin, p], [first]),
         ca.Function("step", [signals, x, p], [ca.densify(results), ca.densify(ca.vertcat(*terms.values()))]),
@@ -342,6 +352,7 @@ def _outputs(law: _Law, loop: ClosedLoop, centre: float) -> dict[str, tuple[ca.S
     if delayed:
         held = law.after["pid.command"] + wire
         found["output_delayed"] = (held, "output of the sample before: for hardware on which an output acts at once")
+    found[FAULT] = (law.after[f"pid.{BAD_SAMPLES}"] > 0, FAULT_FLAG.meaning)
     return found
 
 
@@ -358,4 +369,6 @@ def _needed_states(results: ca.SX, states: Signals, after: Signals) -> list[str]
 
 def _short_name(name: str) -> str:
     """A parameter's or state's name in a program where it is free: "pid.Kp" is Kp, "dither.offset" dither_offset."""
+    if name == "pid.command":
+        return "last_command"  # an output is called command
     return name.removeprefix("pid.").replace(".", "_")

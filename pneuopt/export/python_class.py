@@ -51,7 +51,7 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     lines += ['    """', "", "    def __init__(", "        self,", "        *,"]
     lines += [f"        {v.name}: float = {PYTHON.literal(v.value)}," for v in program.parameters]
     lines += ["    ) -> None:", *(f"        self.{v.name} = {v.name}" for v in program.parameters)]
-    lines += [f"        self.{v.name} = 0.0  # {comment_text(_told(v))}" for v in (*program.states, *program.outputs)]
+    lines += [_first_value(v) for v in (*program.states, *program.outputs)]
     zeros = ", ".join("0.0" for _ in program.start_inputs[:-1])
     lines += ["        self.prepare()", f"        self.start({zeros})", ""]
     lines += ["    def prepare(self) -> None:", '        """Take over parameters that were changed."""']
@@ -72,6 +72,10 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     lines += [f"        {a.name} = {a.text}" for a in page.locals]
     lines += [f"        self.{n} = {text}" for n, text in {**page.outputs, **page.states}.items()]
     return {f"{header.name}.py": "\n".join([*lines, f"        return self.{out.name}"]) + "\n"}
+
+
+def _first_value(v: Variable) -> str:
+    return f"        self.{v.name} = {'False' if v.is_flag else '0.0'}  # {comment_text(_told(v))}"
 
 
 def _told(v: Variable) -> str:

@@ -11,6 +11,7 @@ RUN_SAMPLES = 200
 """Of a test's run: fewer than some 50 pass no limit and no pulse, many more make a long file."""
 RUN_TOLERANCE = 1e-12
 """Of the largest output: what sums in another order may differ by, after a run of `RUN_SAMPLES`."""
+_DROPOUT, _GAP, _LONGEST_GAP = 60, 100, 30  # samples: while the measured signal rises, and after
 _RISE = 25.0  # samples in which the measured signal follows: fewer hide the integral, more hide the approach
 
 
@@ -32,13 +33,16 @@ class ReferenceRun:
 def make_reference_run(program: ControllerProgram) -> ReferenceRun:
     """A step of the reference, half of which drives the output to its limits, with a measured signal that swings in.
 
-    What else the controller gets, rates of the reference and further readings, are waves.
+    What else the controller gets, rates of the reference and further readings, are waves. One sample of the measured
+    signal is no number, and then so many in a row that the controller begins anew.
     """
     k = np.arange(RUN_SAMPLES)
     size = _step_size(program)
     reference = np.where((k >= 5) & (k < 150), size, -0.3 * size)
     measured = size * (1 - np.exp(-np.maximum(k - 5, 0) / _RISE)) + 0.02 * size * np.sin(0.9 * k)
     others = [size * np.sin(0.1 * (n + 1) * k) for n in range(len(program.inputs) - 2)]
+    count = {v.name: v.value for v in program.parameters}["fault_samples"]
+    measured[_DROPOUT] = measured[_GAP : _GAP + int(min(count, _LONGEST_GAP)) + 1] = np.nan
     inputs = np.column_stack([reference, measured, *others])
     return ReferenceRun(inputs, run_program(program, inputs)[:, 0])
 

@@ -1,7 +1,7 @@
 """The controller as one function block in IEC 61131-3 structured text, of standard functions alone.
 
 Type conversions and functions are those of IEC 61131-3:2013, 6.6.2.5; it has neither tanh nor floor, which are made of
-EXP and of a rounding. All numbers are LREAL.
+EXP and of a rounding. All numbers are LREAL, flags BOOL.
 """
 
 import math
@@ -99,8 +99,9 @@ def _declare(variables: tuple[Variable, ...], initial: bool) -> list[str]:
     for v in variables:
         _check_size(v.value, v.origin or v.name)
         value = f" := {STRUCTURED_TEXT.literal(v.value)}" if initial else ""
-        told = f"{v.unit}: {v.meaning}" + (f"; {STRUCTURED_TEXT.infinity}: infinite" if math.isinf(v.value) else "")
-        lines.append(f"    {v.name} : LREAL{value}; (* {comment_text(told)} *)")
+        kind, told = ("BOOL", v.meaning) if v.is_flag else (f"LREAL{value}", f"{v.unit}: {v.meaning}")
+        told += f"; {STRUCTURED_TEXT.infinity}: infinite" if math.isinf(v.value) else ""
+        lines.append(f"    {v.name} : {kind}; (* {comment_text(told)} *)")
     return lines
 
 

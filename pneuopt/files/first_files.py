@@ -171,6 +171,7 @@ def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, 
     stated["minimise.settling_time"] = f'{{ band = "{BAND}", weight = 1.0 }}'
     stated |= {"limits.overshoot": _quote(OVERSHOOT), "limits.max_sensitivity": f"{SENSITIVITY:g}"}
     examples = {"loop.measured": _quote(loop.feedback.name), "loop.actuated": _quote(loop.command.name)}
+    examples["pid.fault_output"] = _quote(write_value(0.5 * sum(ends), command))
     horizon = _quote(write_value(first.horizon, "s"))
     steps = [{"step": _quote(write_value(step, measured)), "horizon": horizon} for step in first.steps]
     title = (

@@ -14,7 +14,7 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID, AntiWindup
+from pneuopt.control.pid import FAULT_SAMPLES, PID, AntiWindup
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.hooks import Axis
@@ -206,6 +206,7 @@ def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centr
     read = _read_limits(table["pid"], own, centre, f"{path}: [pid] limits")
     for section in TUNABLE_SECTIONS:
         read |= _section_parameters(table.get(section, {}), section, own, f"{path}: [{section}]")
+    read = _fault_values(read, loop, centre, f"{path}: [pid]")
     for name in (n for n, p in read.items() if p.free):
         section, _, key = name.partition(".")
         finite = abs(read[name].lower) < float("inf") and abs(read[name].upper) < float("inf")
@@ -213,6 +214,19 @@ def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centr
     parameters = own | ParameterSet(read)
     construct_at(lambda: loop.check(parameters), str(path))
     return parameters
+
+
+def _fault_values(read: dict[str, Parameter], loop: ClosedLoop, centre: float, where: str) -> dict[str, Parameter]:
+    """The parameters with the safe output about the valve's centre, from that on the wire; none of a fault is free."""
+    for key in loop.pid.fixed_parameters:
+        given = read.get(f"pid.{key}")
+        told = f"{where} {key} says what the machine does in a fault, which no search decides; take free = true out"
+        require(given is None or not given.free, told)
+    count = read.get("pid.fault_samples")
+    whole = count is None or (count.value >= 1 and count.value == round(count.value))
+    require(whole, f"{where} fault_samples is a whole number of samples, 1 at least; the default is {FAULT_SAMPLES:g}")
+    safe = read.get("pid.fault_output")
+    return read | ({"pid.fault_output": replace(safe, value=safe.value - centre)} if safe else {})
 
 
 def _section_parameters(

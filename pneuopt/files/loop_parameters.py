@@ -12,7 +12,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import SensedSignal
 from pneuopt.files.tuning_keys import TUNING_KEYS
-from pneuopt.quantities.keys import Key, parameter_key
+from pneuopt.quantities.keys import Key, Takes, parameter_key
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 
 SAMPLE_TIME = 1e-3
@@ -23,6 +23,7 @@ _SECTION_CONDITIONS = {
     GainSchedule.section: "with low, high and a coefficient",
     "pressure_feedback": "where the plant shows both pressures",
 }
+_SAMPLED = "with sample_time; never free"
 _LIMITS = ("lower", "upper")  # parameters that a file states as a pair, limits
 
 
@@ -63,7 +64,10 @@ def _pid_keys(command: str, measured: str) -> dict[str, Key]:
             forms = [f'"{f.value}"' for f in Form if name in f.gains]
             own = f"form = {' or '.join(forms)}" if 0 < len(forms) < len(Form) else ""
             found[name] = parameter_key(pid[name], own or _CONDITIONS.get(name, ""))
-    return found
+    fixed = {n: replace(found[n], takes=Takes.NUMBER, condition=_SAMPLED) for n in ("fault_samples", "fault_output")}
+    centre = "safe output after that many, on the wire as limits are; default: where the valve is closed, its centre"
+    fixed["fault_output"] = replace(fixed["fault_output"], meaning=centre, usual=None, example='"0 V"')
+    return found | fixed
 
 
 def _parameter_keys(parameters: ParameterSet, required: str) -> dict[str, Key]:

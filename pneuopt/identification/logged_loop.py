@@ -29,6 +29,7 @@ from pneuopt.quantities.trajectories import Trajectory
 
 MOTION = ("speed", "position")  # signals of which one follows from the other where a log lacks it
 REFERENCE_CHANNELS = {"speed": "speed_reference", "position": "position_reference"}
+UNSEEN_STATES = ("pid.command", "pid.previous_error", "pid.transfer", "pid.bad_samples")
 CONTROLLER_ACTS = "controller_acts"  # 1 at the log's samples at which the controller computes, 0 in between
 # difference of a log's time from the controller's, in sample times [1]: smaller refuses rounded times, larger takes
 # samples of another moment
@@ -139,7 +140,7 @@ class LoggedLoop:
         The command is computed anew at the first sample; of previous error and derivative only a sum counts, and what
         a compensator remembers soon passes.
         """
-        held = {"pid.command", "pid.previous_error", *(f"pid.{n}" for n in RESET_STATES)}
+        held = {*UNSEEN_STATES, *(f"pid.{n}" for n in RESET_STATES)}
         held |= {
             f"{c.section}.{q.name}"
             for c in self.loop.compensators
@@ -244,8 +245,7 @@ class LoggedLoop:
         shown = {n: first[f"logged.{n}"] for n in self._seen}
         measured, position = shown[alone.pid_signal.name], shown[alone.feedback.name]
         wanted = float(pid_reference(alone, {"reference": first["reference"]}, position, known)["reference"])
-        own = {**without_prefix(known, "pid"), "Kp": alone.parallel_form(log.parameters).Kp}
-        begun = pid.start(wanted, measured, 0.0, own)
+        begun = [float(state) for state in pid.start(wanted, measured, 0.0, without_prefix(known, "pid"))]
         x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.pid_signal, alone.command), begun, strict=True)}
         x0 |= {"sensor.reading": measured, "feedforward.filter": wanted}
         for part in alone.compensators:
@@ -253,7 +253,8 @@ class LoggedLoop:
             states = part.states(alone.sensed_signal, alone.command)
             remembered = zip(states, part.start(alone.sensed_signal, seen), strict=True)
             x0 |= {f"{part.section}.{q.name}": v for q, v in remembered}
-        return x0 | ({} if was_at_rest else {"pid.integral": 0.0})
+        rested = x0["pid.integral"] + x0["pid.transfer"]  # noise keeps the error of a rest from being zero
+        return x0 | {"pid.integral": rested if was_at_rest else 0.0, "pid.transfer": 0.0}
 
     def _plant_log(self, log: Log, replayed: Trajectory) -> Log:
         plant = self.loop.plant

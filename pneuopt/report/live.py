@@ -25,8 +25,8 @@ LIVE_METRICS = ("SettlingTime", "Overshoot", "PeakControl")
 """Metrics that the script reads off a response."""
 PLANT_SECTIONS = ("load", "supply", "friction")
 """Sections of a plant's parameters that have sliders."""
-NOT_MOVED = ("pid.Tt", "pid.lower", "pid.upper", "friction.smoothing")
-"""Parameters without a slider: limits of hardware, and what makes a loop too stiff for a page."""
+NOT_MOVED = ("pid.Tt", "pid.lower", "pid.upper", "pid.fault_samples", "pid.fault_output", "friction.smoothing")
+"""Parameters without a slider: limits of hardware, what only a fault shows, and what makes a loop too stiff here."""
 RANGE = 3.0
 """A slider goes from a third to three times its value where no bounds say more: less hides what changes."""
 RANGES = {"supply.pressure": 1.5}

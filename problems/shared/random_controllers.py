@@ -113,7 +113,7 @@ def run_library(seed: int) -> Run:
     more = g.normal(size=(SAMPLES, len(loop.motion_inputs))) * 0.1
     air = 5e5 + 1e4 * np.cumsum(g.normal(size=(SAMPLES, len(loop.readings))), axis=0)
     air[:, [n == "position" for n in loop.readings]] = motion[:, :1]
-    shown = np.array([_shown(loop, row) for row in motion])
+    shown = np.array([shown_signal(loop, row) for row in motion])
     inputs, outputs = np.column_stack([reference, shown, more, air]), np.empty(SAMPLES)
     begun = program.start([*inputs[0], centre], program.values).full().ravel()
     first = dict(zip((v.origin for v in program.states), begun, strict=True))
@@ -129,7 +129,7 @@ def run_library(seed: int) -> Run:
     return Run(loop, parameters, centre, inputs, outputs)
 
 
-def _shown(loop: ClosedLoop, motion: Array) -> float:
+def shown_signal(loop: ClosedLoop, motion: Array) -> float:
     """What the hardware shows the controller: a position in counts, or the signal itself."""
     if isinstance(loop.sensor, Encoder):
         size = loop.sensor.resolution

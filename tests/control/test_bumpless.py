@@ -75,5 +75,5 @@ def test_a_form_takes_over_in_its_own_gains() -> None:
 
 def test_a_state_of_another_loop_is_refused() -> None:
     loop = LOOPS["sampled"]
-    with pytest.raises(InputError, match=r"x has shape \(3,\), the loop has 6 states"):
+    with pytest.raises(InputError, match=r"x has shape \(3,\), the loop has 8 states"):
         bumpless_transfer(loop, np.zeros(3), loop.parameters, loop.parameters)

@@ -335,7 +335,7 @@ def test_several_act_one_on_the_others_command(section: str) -> None:
     sizes = {f"{c.section}.{c.size}": 0.3 for c in parts}
     values = {
         "pid.Kp": 2.0,
-        "pid.Ki": 0.0,
+        "pid.Ki": 1e-9,
         "pid.Tt": 0.02,
         "pid.lower": -0.9,
         "pid.upper": 0.9,

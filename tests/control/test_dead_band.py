@@ -38,7 +38,7 @@ def test_nothing_is_integrated_within_it(second_order: System, error: float) -> 
     assert float(rates[2]) == pytest.approx(3.0 * beyond)
     loop = ClosedLoop(second_order, PID(2e-3, dead_band=True))
     p = loop.parameter_vector(loop.parameters.with_values(values))
-    after = np.array(loop.update(0.0, [-error, 0, 0, 0, 0, 0], [0.0], p)).ravel()
+    after = np.array(loop.update(0.0, [-error, *[0] * 7], [0.0], p)).ravel()
     assert after[2] == pytest.approx(2e-3 * 3.0 * beyond)
 
 
@@ -46,7 +46,7 @@ def test_a_clipped_command_unwinds_the_integral_within_it(second_order: System) 
     loop = ClosedLoop(second_order, PID(1e-3, dead_band=True), Dither(60.0))
     values = {"pid.dead_band": 0.1, "pid.Ki": 3.0, "pid.Kp": 0.0, "pid.upper": 1.0, "pid.lower": -1.0, "pid.Tt": 0.1}
     p = loop.parameter_vector(loop.parameters.with_values(values))
-    after = np.array(loop.update(0.0, [0.05, 0, 2.0, 0, 0, 0], [0.0], p)).ravel()
+    after = np.array(loop.update(0.0, [0.05, 0, 2.0, *[0] * 5], [0.0], p)).ravel()
     assert after[2] == pytest.approx(2.0 + 1e-3 / 0.1 * (1.0 - 2.0))
 
 

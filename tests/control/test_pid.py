@@ -54,7 +54,7 @@ def test_sampled_law_is_the_documented_difference_equation() -> None:
     h, rng = 2e-3, np.random.default_rng(3)
     r, y = np.repeat(rng.normal(size=20), 25), np.cumsum(rng.normal(size=500)) * 0.05
     law = sampled_function(PID(sample_time=h))
-    x, sent = np.zeros(4), []
+    x, sent = np.zeros(6), []
     for rk, yk in zip(r, y, strict=True):
         x = np.array(law(x, rk, yk, 0.0, list(GAINS.values()))).ravel()
         sent.append(x[3])
@@ -67,9 +67,9 @@ def test_sampled_law_is_the_documented_difference_equation() -> None:
 def test_anti_windup_sees_command_plus_dither() -> None:
     pid = PID(sample_time=1e-3)
     law = sampled_function(pid)
-    p = list({**GAINS, "Kp": 0.0, "Ki": 0.0, "Kd": 0.0}.values())
-    free = np.array(law([1.0, 0, 0, 0], 0.0, 0.0, 0.4, p)).ravel()
-    stopped = np.array(law([1.0, 0, 0, 0], 0.0, 0.0, 0.8, p)).ravel()
+    p = list({**GAINS, "Kp": 0.0, "Ki": 1e-9, "Kd": 0.0}.values())
+    free = np.array(law([1.0, *[0] * 5], 0.0, 0.0, 0.4, p)).ravel()
+    stopped = np.array(law([1.0, *[0] * 5], 0.0, 0.0, 0.8, p)).ravel()
     assert free[[0, 3]] == pytest.approx([1.0, 1.4])
     assert stopped[[0, 3]] == pytest.approx([1.0 - 1e-3 / 0.06 * 0.3, 1.5])
 

@@ -13,7 +13,7 @@ from pneuopt.control.friction_feedforward import FrictionFeedforward
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.position_loop import PositionLoop
-from pneuopt.export.header import comment_text
+from pneuopt.export.header import comment_text, make_header
 from pneuopt.export.targets import Language, export_controller
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
@@ -43,17 +43,6 @@ def test_a_hostile_text_ends_no_comment(text: str) -> None:
     assert plain.isascii()
     assert plain.isprintable()
     assert not any(mark in plain for mark in ("*/", "/*", "(*", "*)", '"""', "'''", "\\", "??", "//"))
-
-
-@pytest.mark.parametrize("language", Language)
-def test_a_design_that_counts_on_a_delay_says_so_and_no_other_does(language: Language) -> None:
-    told = "The design counts on one sample from reading to acting."
-    for delay in (0, 1):
-        loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, limits=False, delay=delay))
-        first = next(
-            text for name, text in export_controller(loop, loop.parameters, language).items() if "test" not in name
-        )
-        assert (told in first) == bool(delay)
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler on the path")
@@ -135,3 +124,17 @@ def test_a_header_names_every_number_of_the_controller(language: Language) -> No
         section, _, name = n.partition(".")
         assert f"{section}: " in header
         assert f"{name} = {write_value(value, loop.parameters[n].unit)}" in header
+
+
+@pytest.mark.parametrize(
+    ("Ki", "told"), [(0.0, "the output so far passes"), (50.0, "the setpoint counts as if it moved")]
+)
+def test_the_header_tells_of_starts_and_faults(Ki: float, told: str) -> None:
+    """With their time, count and safe output, on the wire and within the limits."""
+    loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-2))
+    values = {"pid.Ki": Ki, "pid.Tt": 0.25, "pid.lower": -5.0, "pid.upper": 5.0}
+    p = loop.parameters.with_values({**values, "pid.fault_samples": 7.0, "pid.fault_output": -9.0})
+    text = " ".join(make_header("pid", loop, p, 5.0, []).lines)
+    assert told in text
+    assert "a time constant of 250 ms" in text
+    assert "After 7 bad samples in a row (fault_samples), 70 ms, the output goes to 0 V (fault_output)" in text

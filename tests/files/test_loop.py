@@ -166,3 +166,34 @@ def test_limits_beside_the_valves_centre_are_refused(tmp_path: Path) -> None:
     )
     assert said in str(error.value)
     assert read_tuning(path, VALVE_DRIVE.system()).parameters.value("pid.lower") == -5
+
+
+FAULTS = 'fault_samples = 8\nfault_output = "6 V"\n'
+SAFE = LIMITED.replace("limits =", f"{FAULTS}limits =")
+
+
+def test_the_safe_output_is_the_wires_and_the_centre_by_default(tmp_path: Path) -> None:
+    task = read_tuning(written(tmp_path, SAFE), VALVE_DRIVE.system(), AT_5_06_V)
+    assert task.parameters.value("pid.fault_output") == pytest.approx(0.94)
+    assert task.parameters.value("pid.fault_samples") == 8
+    plain = written(tmp_path, SAFE.replace('fault_samples = 8\nfault_output = "6 V"\n', ""))
+    usual = read_tuning(plain, VALVE_DRIVE.system(), AT_5_06_V).parameters
+    assert [usual.value(f"pid.{n}") for n in ("fault_output", "fault_samples")] == [0.0, 5.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"6 V"', '{ value = "6 V", lower = "5 V", upper = "7 V", free = true }', "fault_output says what the machine"),
+        ("= 8", "= { value = 8, lower = 1, upper = 9, free = true }", "fault_samples says what the machine"),
+        ("= 8", "= 0", "fault_samples"),
+        ("= 8", "= 2.5", "fault_samples is a whole number"),
+        ('sample_time = "2 ms"\n', "", "unknown key 'fault_"),
+    ],
+)
+def test_a_search_does_not_decide_on_faults(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in SAFE
+    with pytest.raises(InputError) as error:
+        read_tuning(written(tmp_path, SAFE.replace(old, new, 1)), VALVE_DRIVE.system(), AT_5_06_V)
+    assert "[pid]" in str(error.value) or "pid." in str(error.value)
+    assert said in str(error.value)

@@ -10,6 +10,8 @@ PUBLIC = {"pneuopt", "pneuopt.plotting"}
 SEARCH = "runs a search's own simulator and merit, to compare what finds the better design with them, and how fast"
 INSIDE = {
     "problems/shared/live_page.py": "runs the script of a page, which no public name gives apart from its page",
+    "problems/demo/faulty_samples.py": "compares the languages' writers with the loop's own update, sample by sample",
+    "problems/demo/restart_tables.py": "runs the exported program on the plants and restarts it",
     "problems/demo/export_controllers.py": "puts the library's run into the exported test, and asks for its parts",
     "problems/demo/exported_names.py": "asks a controller for its parts, and the table of names for what is reserved",
     "problems/shared/exported_words.py": "asks the table of names for what is reserved",
