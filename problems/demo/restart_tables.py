@@ -1,13 +1,14 @@
 """Restarts of exported controllers: does the output jump, and does the axis arrive?
 
-    python problems/demo/restart_tables.py [--quick] [--json FILE]
+    python problems/demo/restart_tables.py [--quick | --every] [--json FILE]
 
 A speed and a position loop on a force-driven axis, a cascade on a pneumatic drive and a position loop on a rotary axis;
 without an integral, with a slow one (Ti = 8 s) and with a usual one (Ti = 0.5 s); without limits, with back-calculation
-and with clamping; the three forms and a delay of one sample in turn. Each begins in four ways: at rest on its setpoint;
-at rest 50 mm, 30 deg or 0.2 m/s away from it; away, and moved by hand with a tenth of the full output; and running, at
-rest, with a step of 200 mm, 120 deg or 0.8 m/s that drives the output to its limits. C99, Python and structured text
-get the inputs of a loop closed with the library's program, and are restarted as their users would.
+and with clamping; the three forms and a delay of one sample in turn, or with --every each with each. Each begins in
+four ways: at rest on its setpoint; at rest 50 mm, 30 deg or 0.2 m/s away from it; away, and moved by hand with a tenth
+of the full output; and running, at rest, with a step of 200 mm, 120 deg or 0.8 m/s that drives the output to its
+limits. C99, Python and structured text get the inputs of a loop closed with the library's program, and are restarted as
+their users would.
 
 Rows bump.*: the largest jump of the output at the restart, over the full output. Rows error.*: how far the axis is 5 s
 later from where the same loop is that was running all along, without limits, over the distance. From a hand's output, a
@@ -109,13 +110,14 @@ class Run(NamedTuple):
     measured: Array
 
 
-def trials() -> Iterator[Trial]:
-    """All combinations, with forms and delays in turn."""
-    turn = itertools.cycle(itertools.product(Form, (0, 1)))
+def trials(every: bool) -> Iterator[Trial]:
+    """All combinations, with forms and delays in turn or all of them, too."""
+    kinds = list(itertools.product(Form, (0, 1)))
+    turn = itertools.cycle(kinds)
     for structure, integral, windup in itertools.product(STRUCTURES, INTEGRALS, WINDUPS):
-        form, delay = next(turn)
-        for situation in SITUATIONS:
-            yield Trial(structure, integral, windup, form, delay, situation)
+        for form, delay in kinds if every else [next(turn)]:
+            for situation in SITUATIONS:
+                yield Trial(structure, integral, windup, form, delay, situation)
 
 
 def make_loop(trial: Trial) -> tuple[ClosedLoop, ParameterSet]:
@@ -254,10 +256,10 @@ def try_restart(trial: Trial, text: bool) -> tuple[float, float, float]:
     return abs(run.outputs[0] - run.start_output) / own.full, error, difference
 
 
-def main(quick: bool = False) -> "pd.DataFrame":
+def main(quick: bool = False, every: bool = False) -> "pd.DataFrame":
     """The claims."""
     bumps, errors, differences = dict[str, float](), dict[str, float](), [0.0]
-    for k, trial in enumerate(trials()):
+    for k, trial in enumerate(trials(every)):
         if quick and (trial.structure.name != "cascade" or trial.windup != "back_calculation"):
             continue
         bump, error, difference = try_restart(trial, text=k % 8 == 1)
@@ -275,5 +277,6 @@ def main(quick: bool = False) -> "pd.DataFrame":
 if __name__ == "__main__":
     parser = arguments(__doc__)
     parser.add_argument("--quick", action="store_true", help="the cascade with back-calculation alone")
+    parser.add_argument("--every", action="store_true", help="every form with and without a delay: six times as long")
     options = parser.parse_args()
-    sys.exit(finish(main(options.quick), options))
+    sys.exit(finish(main(options.quick, options.every), options))
