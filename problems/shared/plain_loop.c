@@ -104,7 +104,7 @@ static double command(const Loop *l, double t, const double *x, double held, dou
     if (l->sample > 0) return l->analogue ? clip(l, held + wave(l, t)) : held;
     w = l->Kp * (l->b * l->r - y) + x[n] + l->Kd / l->Tf * (error - x[n + 1]) + l->offset + wave(l, t);
     u = clip(l, w);
-    rates[0] = l->Ki * (l->r - y) + (l->limited ? (u - w) / l->Tt : 0);
+    rates[0] = l->Ki == 0 ? -x[n] / l->Tt : l->Ki * (l->r - y) + (l->limited ? (u - w) / l->Tt : 0);
     rates[1] = (error - x[n + 1]) / l->Tf;
     return u;
 }
@@ -137,7 +137,8 @@ long run_loop(int kind, int position, const double *p, const double *c, double r
     double x[MAX_STATES] = {0}, scratch[2], y;
     for (int i = 0; i < plant_states[kind]; i++) x[i] = x0[i];
     y = measured(&l, x);
-    double integral = u0 - l.Kp * (l.b * r0 - y), derivative = 0, previous = l.c * r0 - y, held = u0;
+    double transfer = l.Ki == 0 || l.sample <= 0 ? 0 : -l.Kp * l.b * (r0 - y);
+    double integral = u0 - l.Kp * (l.b * r0 - y) - transfer, derivative = 0, previous = l.c * r0 - y, held = u0;
     if (l.sample <= 0) x[n - 2] = integral, x[n - 1] = previous;
     for (long k = 0; k < count * every; k++) {
         double t = k * h;
@@ -146,9 +147,11 @@ long run_loop(int kind, int position, const double *p, const double *c, double r
             y = measured(&l, x), error = l.c * l.r - y;
             derivative = (l.Tf * derivative + l.Kd * (error - previous)) / (l.Tf + l.sample);
             integral += l.Ki * l.sample * (l.r - y);
-            w = l.Kp * (l.b * l.r - y) + integral + derivative + dither;
+            w = l.Kp * (l.b * l.r - y) + integral + derivative + transfer + dither;
             held = clip(&l, w);
-            if (l.limited) integral += l.sample / l.Tt * (held - w);
+            if (l.Ki == 0) integral *= l.Tt / (l.Tt + l.sample);
+            else if (l.limited) integral += l.sample / l.Tt * (held - w);
+            transfer *= l.Tt / (l.Tt + l.sample);
             previous = error;
         }
         if (k % every == 0) {

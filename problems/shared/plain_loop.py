@@ -126,7 +126,9 @@ def _controller(loop: po.ClosedLoop, given: po.ParameterSet) -> tuple[Array, flo
         [given.value(f"dither.{n}") for n in ("amplitude", "offset", "frequency")] if loop.dither else [0.0, 0.0, 1.0]
     )
     gains = [given.value(f"pid.{n}") for n in ("Kp", "Ki", "Kd", "Tf", "b", "c")]
-    Tt = given.value("pid.Tt") if pid.limits else 1.0
+    usual = max(0.1, 10 * sample)
+    Tt = given.value("pid.Tt") if pid.limits else usual
+    Tt = Tt if given.value("pid.Ki") else min(Tt, 10 * usual)  # in which an integral empties that nothing fills
     analogue = float(loop.dither is not None and loop.dither.analogue)
     return np.array([*gains, *limits, float(pid.limits), Tt, sample, *dither, analogue]), sample
 
