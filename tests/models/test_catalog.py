@@ -309,7 +309,7 @@ def test_t32_starts_as_its_text_says() -> None:
 
 
 def test_b32_runs_as_its_log_was_made() -> None:
-    """It sticks, slips and moves both ways under the benchmark's law, ``u = clip(4 (r - x) - 0.15 v)``, done by hand."""
+    """It sticks, slips and moves both ways under its own law, ``u = clip(4 (r - x) - 0.15 v)``, by hand."""
     drive, p = catalog.b32()
     plant = drive.system()
     loop = ClosedLoop(plant, PID(sample_time=1e-3), measured="position")
