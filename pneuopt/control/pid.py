@@ -37,7 +37,7 @@ class PID:
 
     ``v = Kp (b r - y) + I + D``, ``D = Kd s/(Tf s + 1) (c r - y)``, ``dI/dt = Ki (r - y) + (u - w)/Tt``, where
     ``w = v + added`` (feedforward and dither) and ``u = min(max(w, lower), upper)``: a hard clip, because that is what
-    runs. The integral is kept in the unit of the command, so that ``Ki = 0`` needs no special case.
+    runs. The integral is kept in the unit of the command.
 
     A sampled controller computes once a sample, h = `sample_time`, and holds u until the next one (backward Euler:
     s becomes ``(1 - 1/z)/h``); the suffix _ marks the previous sample::
