@@ -57,7 +57,7 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     tables = {"certified": records(metrics.T), "provenance": file_hashes(fit, tuning)}
     tables |= {} if found is None else {"certificate": {"holds": found.holds, "reasons": list(found.reasons)}}
     view, limits = loop_view(task, parameters), metric_limits(task.specification.limits)
-    report = standing + report_metrics(metrics, relevant_units(task.loop), limits=limits)
+    report = standing + report_metrics(metrics, relevant_units(task.loop), title="simulated", limits=limits)
     page = partial(_simulation_page, fit, tuning, task, view, parameters, standing)
     return finish(outputs, writers, tables, None, figures=view.figures, report=report, page=page)
 

@@ -49,6 +49,7 @@ def test_a_simulation_and_its_page_say_first_what_was_changed(place: Path, name:
     shown = run(f"simulate fit.toml {file}.toml --json shown.json --report shown.html")
     assert shown.stdout.startswith("NOT CERTIFIED: ")
     assert told in shown.stdout
+    assert not re.search(r"(?m)^certified\b", shown.stdout)  # the figures are those of a simulation
     said = json.loads(Path("shown.json").read_text("utf-8"))["certificate"]
     assert not said["holds"]
     assert any(told in reason for reason in said["reasons"])
