@@ -111,7 +111,7 @@ class FastSimulator:
         x = self._starts[key].copy()
         if self.loop.outer is None:  # the integral holds what the set-point's weight takes away
             value = dict(zip(self._names, p.tolist(), strict=True))
-            own = {n: value[f"pid.{n}"] for n in ("Kp", "b", "c")}
+            own = {n.removeprefix("pid."): v for n, v in value.items() if n.startswith("pid.")}
             first = [q.name for q in self.loop.states].index("pid.integral")
             states = self.loop.pid.start(begin, begin, 0.0, own)
             x[first : first + len(states)] = states
