@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -19,7 +20,7 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.on_rig import _watch_rest, certify_on_rig
+from pneuopt.tuning.on_rig import _remedies, _watch_rest, certify_on_rig
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.tune import TuningResult, prepare_search, prepare_task, tune
 
@@ -70,6 +71,19 @@ def test_a_design_that_breaks_a_limit_there_is_not_converged_and_the_room_it_nee
     assert result.parameters.value("pid.Kp") == given().value("pid.Kp")
     assert result.best["pid.Kp"] == 300.0
     assert result.on_rig is not None
+
+
+def test_a_limit_is_relaxed_only_where_the_loop_settles_on_the_rig() -> None:
+    """It would not help where the loop never settles."""
+    spec = specify(SettlingTime(), [Overshoot(0.02)])
+    search = prepare_search(prepare_task(LOOP, STEP, given(), spec))
+    design = search.certify_point(search.space.start)
+    settles = design.certified.copy()
+    settles.loc["Overshoot"] = design.certified.loc["Overshoot"] + 50.0
+    never = settles.copy()
+    never.loc["SettlingTime"] = np.nan
+    told = [list(_remedies(search.task, design, found)) for found in (settles, never)]
+    assert [[line.endswith("relax its limit") for line in lines] for lines in told] == [[True], []]
 
 
 def test_tune_takes_the_rig() -> None:
