@@ -26,8 +26,7 @@ from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.marks import Mark
-from pneuopt.identification.report import report_agreement
-from pneuopt.identification.result import IdentificationResult, Verdict
+from pneuopt.identification.result import IdentificationResult, Verdict, report_agreement
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.checks.findings import LogFinding
 from pneuopt.logs.doctor import CHECKS

@@ -13,12 +13,11 @@ from pneuopt.identification.checks import as_experiments, check_logs
 from pneuopt.identification.clusters import t_quantile
 from pneuopt.identification.identify import identify
 from pneuopt.identification.problem import as_estimation_model
-from pneuopt.identification.report import report_comparison
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report
+from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.shown import Result
 from pneuopt.shooting.least_squares import LeastSquares
 
@@ -56,7 +55,14 @@ class LogComparison(Result):
 
     def summary(self) -> Report:
         """Whether the logs agree, and each log's estimates."""
-        return report_comparison(self)
+        rows = []
+        for row in self.table.reset_index().to_dict(orient="records"):
+            figures = format_number(row["value"], 5), format_number(row["stderr"], 2), format_number(row["others"], 5)
+            name, log = str(row["parameter"]), str(row["log"])
+            rows.append((name, log, *figures, format_number(row["deviation"], 3), str(row["unit"])))
+        heads = number_columns("value", "stderr", "others", "deviation")
+        table = Table((*text_columns("parameter", "log"), *heads, *text_columns("unit")), tuple(rows))
+        return Report((Line(self.reason, Tone.GOOD if self.agree else Tone.DOUBTFUL), *([table] if rows else [])))
 
 
 def compare_logs(

@@ -1,6 +1,7 @@
 """`IdentificationResult`: estimates with intervals; `Verdict`: which parameters the logs identify, and how well."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -9,11 +10,10 @@ from pneuopt.identification.excitation import remedy
 from pneuopt.identification.marks import AT_BOUND_NOTE as AT_BOUND_NOTE  # noqa: PLC0414 - beside what bears them
 from pneuopt.identification.marks import UNIDENTIFIABLE_NOTE as UNIDENTIFIABLE_NOTE  # noqa: PLC0414
 from pneuopt.identification.marks import Mark as Mark  # noqa: PLC0414
-from pneuopt.identification.report import report_fit
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Line, Report
+from pneuopt.quantities.report import TIED, Column, Line, Report, Table, format_number, number_columns, text_columns
 from pneuopt.quantities.shown import Result, Shown
-from pneuopt.quantities.status import Status
+from pneuopt.quantities.status import Status, report_status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 # inflation of a standard deviation [1] from which "nothing separates them" is shown: lower hides useful figures, higher
 # shows rounding
 INFINITE_INFLATION = 1e5
+MAX_FIT_ROWS = 12
+"""Rows of a table of logs: of more, the median and the worst are easier to read."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -196,7 +198,46 @@ class IdentificationResult(Result):
 
     def summary(self) -> Report:
         """How the fit ended, estimates with intervals and marks, what is unidentifiable, agreement with the logs."""
-        return report_fit(self)
+        sentences = tuple(map(Line, self.verdict.sentences if self.verdict else ()))
+        estimates = report_estimates(self.estimates, self.widths)
+        return report_status(self.status) + estimates + Report(sentences) + report_agreement(self.fit)
+
+
+def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> Report:
+    """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen.
+
+    Parameters
+    ----------
+    estimates : DataFrame
+        Of an `IdentificationResult`.
+    widths : sequence of ChosenWidth
+    """
+    rows = [_estimate_row(str(n), row) for n, row in estimates.to_dict(orient="index").items()]
+    rows += [(w.name, format_number(w.value, 3), "-", w.unit, "chosen") for w in widths]
+    columns = *text_columns("parameter"), *number_columns("value", f"95{TIED}% interval"), *text_columns("unit", "mark")
+    table = (Table(columns, tuple(rows)),) if rows else ()
+    return Report((*table, *(Line(str(width)) for width in widths)))
+
+
+def report_agreement(fit: "pd.DataFrame") -> Report:
+    """Agreement of each log and channel; of many logs the median and the worst.
+
+    Parameters
+    ----------
+    fit : DataFrame
+        Of an `IdentificationResult`, or from `validate`.
+    """
+    if fit.empty:  # no channel was compared
+        return Report()
+    if len(fit) > MAX_FIT_ROWS:
+        return Report((_agreement_in_short(fit),))
+    rows = []
+    for row in fit.reset_index().to_dict(orient="records"):
+        shares = [format_number(100 * row[n], 4) for n in ("nrmse", "free_run_nrmse")]
+        figures = [*shares, *(format_number(row[n], 4) for n in ("rmse", "free_run_rmse"))]
+        rows.append((str(row["log"]), str(row["channel"]), *figures, str(row["unit"])))
+    figures_heads = number_columns("NRMSE [%]", "free run", "RMSE", "free run")
+    return Report((Table((*text_columns("log", "channel"), *figures_heads, *text_columns("unit")), tuple(rows)),))
 
 
 def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:
@@ -212,3 +253,55 @@ def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitat
 def join_names(names: Sequence[str]) -> str:
     """Names in a sentence: "a, b and c"."""
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def _agreement_in_short(fit: "pd.DataFrame") -> Table:
+    rows, flat = [], fit.reset_index()
+    for channel in flat["channel"].unique():
+        own = flat[flat["channel"] == channel].sort_values("nrmse", na_position="first")
+        worst, middle = own.iloc[-1], own[["nrmse", "rmse"]].median()
+        figures = [format_number(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"], worst["free_run_nrmse"])]
+        rmse = format_number(middle["rmse"], 4)
+        rows.append((str(channel), str(len(own)), *figures, str(worst["log"]), rmse, str(worst["unit"])))
+    columns = (
+        *(Column("channel", is_text=True), *number_columns("logs", "NRMSE [%]: median", "worst", "free")),
+        *(Column("in log", is_text=True), Column("RMSE: median"), Column("unit", is_text=True)),
+    )
+    return Table(columns, tuple(rows))
+
+
+def _estimate_row(name: str, row: Mapping[Hashable, Any]) -> tuple[str, str, str, str, str]:
+    value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
+    if math.isnan(row["ci_low"]) and math.isfinite(row["range_low"]):
+        interval = _format_range(float(row["range_low"]), float(row["range_high"]))
+    value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
+    mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
+    return name, value, interval, str(row["unit"]), str(mark)
+
+
+def _format_interval(value: float, spread: float, low: float, high: float) -> tuple[str, str]:
+    if math.isfinite(low) and math.isinf(high):
+        return format_number(value, 4), f"above{TIED}{format_number(low, 4)}"
+    if math.isinf(low) and math.isfinite(high):
+        return format_number(value, 4), f"below{TIED}{format_number(high, 4)}"
+    if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
+        return format_number(value, 4), "not determined"
+    return _format_to_stderr(value, spread), _join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))
+
+
+def _format_range(low: float, high: float) -> str:
+    """A range, which is no confidence interval, with the digits that show a fiftieth of it."""
+    spread = (high - low) / 4
+    return f"range{TIED}{_join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))}"
+
+
+def _join_ends(low: str, high: str) -> str:
+    return f"{low}{TIED}to {high}"
+
+
+def _format_to_stderr(value: float, spread: float) -> str:
+    """The value with the digits that show two of its standard error."""
+    if not 0 < spread < math.inf or value == 0 or not spread < abs(value):
+        return format_number(value, 4)
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(spread)) + 2
+    return f"{value:#.{min(digits, 12)}g}".rstrip(".")

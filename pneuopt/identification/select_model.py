@@ -13,7 +13,6 @@ from pneuopt.identification.candidates import Candidate, Refutation, fit_candida
 from pneuopt.identification.checks import as_experiments
 from pneuopt.identification.excitation import remedy
 from pneuopt.identification.identify import validate
-from pneuopt.identification.report import report_selection
 from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.logs.experiments import Experiment
@@ -21,7 +20,7 @@ from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.quantities.report import Report
+from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.shown import Result
 from pneuopt.shooting.least_squares import LeastSquares
 
@@ -66,7 +65,19 @@ class ModelSelection(Result):
 
     def summary(self) -> Report:
         """The recommendation and its reason, then a row a candidate."""
-        return report_selection(self)
+        rows = []
+        for row in self.table.reset_index(names="model").to_dict(orient="records"):
+            unidentifiable = row["unidentifiable"]
+            missing = f"{UNIDENTIFIABLE_NOTE}: {unidentifiable}" if unidentifiable else ""
+            why = str(row["message"]).partition(";")[0]
+            note = "" if row["converged"] else f"refuted: {why}" if row["refuted"] else f"not converged: {why}"
+            bound = f"{AT_BOUND_NOTE}: {row['at_bound']}" if row["at_bound"] else ""
+            figures = str(row["free"]), format_number(row["bic_above"], 4), str(row["contains"])
+            remark = note or row["unphysical"] or bound or missing
+            rows.append((str(row["model"]), *figures, format_number(row["p_value"], 2), str(remark)))
+        free, contains = number_columns("free", "BIC above best"), text_columns("contains")
+        columns = *text_columns("model"), *free, *contains, *number_columns("p of chance"), *text_columns("")
+        return Report((Line(self.reason, Tone.GOOD), Table(columns, tuple(rows))))
 
 
 def select_model(

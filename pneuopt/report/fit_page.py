@@ -10,8 +10,7 @@ from pneuopt.dynamics.runnable import HasSystem, as_runnable
 from pneuopt.dynamics.system import System
 from pneuopt.identification.identify import predict, validate
 from pneuopt.identification.marks import Mark
-from pneuopt.identification.report import report_agreement, report_estimates
-from pneuopt.identification.result import IdentificationResult, join_names
+from pneuopt.identification.result import IdentificationResult, join_names, report_agreement, report_estimates
 from pneuopt.logs.checks.findings import LogFinding
 from pneuopt.logs.experiments import Experiment
 from pneuopt.plotting import (

@@ -2,7 +2,7 @@ import math
 
 import pandas as pd
 
-from pneuopt.identification.report import report_agreement, report_estimates
+from pneuopt.identification.result import report_agreement, report_estimates
 
 
 def test_open_ends_and_what_is_unidentifiable_are_no_numbers() -> None:
