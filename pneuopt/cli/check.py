@@ -14,8 +14,7 @@ from pneuopt.dynamics.system import System
 from pneuopt.files.assumptions import read_option_assumptions
 from pneuopt.files.drive import ambient_pressure, read_drive
 from pneuopt.identification.checks import check_logs
-from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check
-from pneuopt.identification.checkup_report import finding_line, headline
+from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check, finding_line
 from pneuopt.identification.mending import mend_findings
 from pneuopt.identification.problem import as_estimation_model
 from pneuopt.logs.doctor import CHECKS
@@ -98,8 +97,7 @@ def _fix(places: Mapping[Path, Path], system: System, parameters: ParameterSet, 
     if not mended:
         return EXIT_BAD_INPUT
     left = check(system, _read_all([places[path] for path in mended], system, parameters, accept)[0], parameters)
-    verdict = headline(left)
-    verdict = replace(verdict, text=f"the mended logs: {verdict.text}")
+    verdict = replace(left.headline, text=f"the mended logs: {left.headline.text}")
     show_report(make_console(), Report((verdict, *map(finding_line, left.findings))))
     return EXIT_BAD_INPUT if errors else EXIT_FAILURE if left.is_refused else EXIT_SUCCESS
 
