@@ -38,7 +38,7 @@ from pneuopt.report.fit_page import Source
 from pneuopt.report.gains import report_exports
 from pneuopt.report.page import Page
 from pneuopt.report.tuning_page import LoopView, tuning_page
-from pneuopt.tuning.report import report_tuning
+from pneuopt.tuning.result import report_tuning
 from pneuopt.tuning.tune import TuningResult, certify, tune
 from pneuopt.tuning.without_dither import tune_without_dither
 

@@ -21,15 +21,8 @@ from pneuopt.report.gains import report_forms, report_settings
 from pneuopt.report.live import live_script
 from pneuopt.report.loop_figures import diagram_picture, loop_figures, loop_pictures
 from pneuopt.report.page import Page, Picture, Section
-from pneuopt.tuning.report import (
-    report_active,
-    report_certificate_status,
-    report_gains,
-    report_refusal,
-    report_validation,
-    report_validation_verdict,
-)
-from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.result import TuningResult, report_active, report_certificate_status, report_gains, report_refusal
+from pneuopt.tuning.validation import report_validation, report_validation_verdict
 
 if TYPE_CHECKING:
     import pandas as pd

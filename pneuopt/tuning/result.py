@@ -2,15 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import isfinite, nan
+from math import isfinite, isnan, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.evaluation.certificate import Certificate
 from pneuopt.evaluation.metric import Requirement, Sense
+from pneuopt.evaluation.report import report_margins, report_metrics, report_notes
 from pneuopt.evaluation.requirements import (
     metric_name,
+    percent_factor,
     requirement_values,
     upper_limit,
     user_limit,
@@ -19,12 +22,12 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.rest_check import RestCheck
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report
+from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.shown import Result
-from pneuopt.quantities.status import Code, Status
+from pneuopt.quantities.status import Code, Status, report_status
+from pneuopt.quantities.units import write_value
 from pneuopt.tuning.relaxation import describe_relaxations
-from pneuopt.tuning.report import report_tuning
-from pneuopt.tuning.validation import DesignValidation
+from pneuopt.tuning.validation import DesignValidation, report_validation, report_validation_verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,6 +37,8 @@ if TYPE_CHECKING:
 ACTIVE_ROOM = 0.02
 REQUIREMENT_COLUMNS = ("claimed", "certified", "allowed", "room", "case")
 RELAXATION_COLUMNS = ("asked", "needed", "share")
+MIN_DERIVATIVE_RATIO = 0.01
+"""Td/Tf below which a derivative adds less than 1 % to Kp at any frequency: its time would be a riddle."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -192,3 +197,137 @@ def _requirement_row(requirement: Requirement, claimed: "pd.DataFrame", certifie
         "room": room,
         "case": str(certified.columns[k[1]]),
     }
+
+
+def report_tuning(
+    result: TuningResult, *, was: "pd.DataFrame | None" = None, source: str = "the given gains"
+) -> Report:
+    """How a tuning ended, and its design; of one that failed what was refused, and how far limits have to give way.
+
+    Parameters
+    ----------
+    result : TuningResult
+    was : DataFrame, optional
+        Metrics with the gains before, to stand beside the certified ones.
+    source : str
+        What stands where the tuning failed; empty where nothing was sought.
+    """
+    head = report_status(result.status) if source else report_certificate_status(result.status)
+    return head + (_report_design(result, was) if result.status.converged else report_refusal(result, source))
+
+
+def _report_design(result: TuningResult, was: "pd.DataFrame | None") -> Report:
+    tried, certificate = result.validation, result.certificate
+    beside = ("was", was) if result.on_rig is None else ("on rig", result.on_rig)
+    found = report_validation_verdict(tried) if tried else Report()
+    found += report_gains(result.given, result.parameters)
+    found += report_metrics(result.certified, result.units, beside=beside, limits=result.limits)
+    found += report_active(result.requirements, result.active, result.parameters)
+    if certificate is not None:
+        found += report_margins(certificate.margins) + report_notes(certificate.notes)
+    return found + report_validation(tried) if tried else found
+
+
+def report_certificate_status(status: Status) -> Report:
+    """Whether gains are certified that nobody has sought, then why not, a line each."""
+    good = status.converged
+    lead = f"{'certified' if good else 'NOT CERTIFIED'}: {status.verdict}"
+    details = (Line(text, indent=2) for text in status.sentences[1:])
+    return Report((Line(lead, Tone.GOOD if good else Tone.BAD), *details))
+
+
+def report_refusal(result: TuningResult, source: str) -> Report:
+    """The gains that stand, and what was refused, or is the best so far, with its figures.
+
+    Parameters
+    ----------
+    result : TuningResult
+    source : str
+        What stands; empty where nothing was sought.
+    """
+    word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected" if source else "simulated"
+    tried = ", ".join(f"{n} {write_value(v, result.parameters[n].unit)}" for n, v in result.best.items())
+    lead = Report((Line(f"{source} stand; {word}: {tried or 'none was found'}"),)) if source else Report()
+    beside = "on rig", result.on_rig
+    figures = report_metrics(result.certified, result.units, title=word, beside=beside, limits=result.limits)
+    return lead + figures + report_relaxations(result.relaxations)
+
+
+def report_gains(given: Mapping[str, float], tuned: ParameterSet) -> Report:
+    """Each free parameter before and after tuning, within its bounds, and the gains in another form.
+
+    Parameters
+    ----------
+    given : mapping of str to float
+        Values before; empty where they are unknown.
+    tuned : ParameterSet
+    """
+    rows = []
+    for n in tuned.free_names:
+        p, before = tuned[n], [write_value(given[n], tuned[n].unit)] if n in given else [""] * bool(given)
+        bounds = f"{format_number(p.lower, 4)} to {format_number(p.upper, 4)}"
+        mark = "at its bound" if p.value in (p.lower, p.upper) else ""
+        rows.append((n, *before, write_value(p.value, p.unit), bounds, mark))
+    figures = number_columns(*(["before", "tuned"] if given else ["value"]), "bounds")
+    table = Table((*text_columns("parameter"), *figures, *text_columns("")), tuple(rows))
+    form = _other_form(tuned)
+    return Report((*([table] if rows else []), *([Line(form)] if form else [])))
+
+
+def _other_form(parameters: ParameterSet) -> str:
+    """The gains in another form in a sentence; empty where there are none."""
+    given = next((f for f in Form if all(f"pid.{n}" in parameters for n in f.gains)), None)
+    if given is None:
+        return ""
+    own = [parameters.value(f"pid.{n}") for n in given.gains]
+    if given is not Form.PARALLEL:
+        same = to_parallel(StandardForm(*own) if given is Form.STANDARD else SeriesForm(*own))
+        derivative = f"Kd {same.Kd:.4g}, Tf {same.Tf:.4g} s" if same.Kd else "no derivative"
+        return f"parallel form: Kp {same.Kp:.4g}, Ki {same.Ki:.4g}, {derivative}"
+    gains = ParallelForm(*own)
+    return f"standard form: {_standard_form(gains)}" if gains.Kp else "no standard form: Kp is zero"
+
+
+def _standard_form(gains: ParallelForm) -> str:
+    form = to_standard(gains)
+    integral = f", Ti {form.Ti:.4g} s" if gains.Ki else ", no integral"
+    derivative = f", Td {form.Td:.4g} s, N {form.N:.4g} (ISA's ratio Td/Tf)" if gains.Kd else ", no derivative"
+    if 0 < abs(form.N) < MIN_DERIVATIVE_RATIO:
+        derivative = f", next to no derivative (Kd/Tf is {100 * abs(form.N):.2g} % of Kp)"
+    return f"Kp {form.Kp:.4g}{integral}{derivative}"
+
+
+def report_active(requirements: "pd.DataFrame", active: Sequence[str], parameters: ParameterSet) -> Report:
+    """What keeps the objective from being smaller: limits with the room that is left, and bounds of the gains.
+
+    Parameters
+    ----------
+    requirements : DataFrame
+    active : sequence of str
+        As of a `TuningResult`.
+    parameters : ParameterSet
+        The tuned ones.
+    """
+    limits = [f"{n} ({100 * row['room']:.2g} % of room left)" for n, row in requirements.iterrows() if row["active"]]
+    at_bounds = [n for n in parameters.free_names if parameters.value(n) in (parameters[n].lower, parameters[n].upper)]
+    others = (*at_bounds, *(a for a in active if a not in requirements.index))
+    bounds = [f"{n} (at its bound)" for n in dict.fromkeys(others)]
+    return Report((Line(f"held back by: {', '.join((*limits, *bounds))}"),) if limits or bounds else ())
+
+
+def report_relaxations(table: "pd.DataFrame") -> Report:
+    """How far limits that no design found keeps must be relaxed; nothing where there is no such table."""
+    if table.empty:
+        return Report()
+    rows = []
+    for row in table.reset_index(names="limit").to_dict(orient="records"):
+        share = "-" if isnan(row["share"]) else f"{100 * row['share']:.3g} %"
+        factor = percent_factor(row["limit"])
+        unit = " %" if factor == 100 else ""
+        asked, needed = (format_number(factor * row[n], 4) + unit for n in ("asked", "needed"))
+        would_do = "none found" if isnan(row["needed"]) else needed
+        rows.append(
+            ("all together", "", "", share) if row["limit"] == "all" else (row["limit"], asked, would_do, share)
+        )
+    columns = *text_columns("relaxed alone"), *number_columns("asked", "would do", "by")
+    return Report((Table(columns, tuple(rows)),))

@@ -29,7 +29,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.quantities.report import Line, Report, Table, Tone, text_columns
-from pneuopt.tuning.report import report_active, report_gains
+from pneuopt.tuning.result import report_active, report_gains
 from pneuopt.tuning.validation import validate_design
 
 
