@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pneuopt.evaluation.report import metric_cell
+from pneuopt.evaluation.evaluate import metric_cell
 from pneuopt.evaluation.requirements import larger_is_better
 from pneuopt.quantities.output import format_table, write_bytes, write_text
 from pneuopt.quantities.report import Column, Line, Report, Table, Tone, format_number

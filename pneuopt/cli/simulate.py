@@ -16,8 +16,7 @@ from pneuopt.cli.shared import (
 )
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.certificate import certificate
-from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.report import metric_limits, relevant_units, report_metrics
+from pneuopt.evaluation.evaluate import evaluate, metric_limits, relevant_units, report_metrics
 from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import Response

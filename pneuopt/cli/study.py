@@ -23,7 +23,7 @@ from pneuopt.cli.study_pages import MAX_MAP_AXES, case_page
 from pneuopt.cli.study_sensitivity import run_sensitivity
 from pneuopt.cli.terminal import progress
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.evaluation.report import metric_units
+from pneuopt.evaluation.evaluate import metric_units
 from pneuopt.evaluation.requirements import (
     METRICS,
     larger_is_better,

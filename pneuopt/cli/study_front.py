@@ -17,8 +17,8 @@ from pneuopt.cli.shared import (
 from pneuopt.cli.show_studies import lead_report, report_front, table_writer
 from pneuopt.cli.study_pages import front_page
 from pneuopt.cli.terminal import progress
+from pneuopt.evaluation.evaluate import metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
-from pneuopt.evaluation.report import metric_units
 from pneuopt.evaluation.requirements import (
     SettlingTime,
     StepEnvelope,

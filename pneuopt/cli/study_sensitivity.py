@@ -10,8 +10,7 @@ from pneuopt.cli.shared import Outputs, Writers, file_hashes, finish, read_fit_a
 from pneuopt.cli.show_studies import lead_report, table_writer
 from pneuopt.cli.study_pages import Design, sensitivity_page
 from pneuopt.cli.terminal import progress
-from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.report import metric_units
+from pneuopt.evaluation.evaluate import evaluate, metric_units
 from pneuopt.evaluation.scenarios import axis_labels
 from pneuopt.files.study import Study
 from pneuopt.files.study_cases import read_sensitivity

@@ -28,6 +28,7 @@ python-control.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import isnan, nan
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
@@ -38,17 +39,19 @@ from pneuopt.evaluation.continuation import continue_response
 from pneuopt.evaluation.counts import describe_counts
 from pneuopt.evaluation.defects import Defect as Defect  # noqa: PLC0414 - who reads a certificate finds it here
 from pneuopt.evaluation.defects import Ending, Finding, correct_metrics, describe_ending, find_defects
-from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
+from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, relevant_units, report_metrics, tabulate_metrics
 from pneuopt.evaluation.metrics import Envelope
-from pneuopt.evaluation.report import relevant_units, report_certificate
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report
+from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.shown import Result
 
 if TYPE_CHECKING:
     import pandas as pd
+
+MAX_NOTES = 4
+"""Notes of a certificate that are shown: fewer hide kinds of notes; more repeat one of them for each case."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,7 +80,14 @@ class Certificate(Result):
 
     def summary(self) -> Report:
         """The defects, or that there is none, then metrics, margins and notes."""
-        return report_certificate(self)
+        count = len(self.findings)
+        word = f"{count} defect{'s' if count > 1 else ''}" if count else "no defect"
+        cases = len(self.metrics.columns)
+        lead = Line(f"{word} in {cases} case{'s' if cases != 1 else ''}", Tone.BAD if count else Tone.GOOD)
+        defects = Report((lead, *(Line(finding.sentence, indent=2) for finding in self.findings)))
+        return (
+            defects + report_metrics(self.metrics, self.units) + report_margins(self.margins) + report_notes(self.notes)
+        )
 
 
 def certificate(
@@ -149,3 +159,27 @@ def judge_evaluations(
 def _find_instability(row: dict[str, Any]) -> Iterator[Finding]:
     if not row["stable"]:
         yield Finding(Defect.UNSTABLE, row["case"], f"the linear loop is unstable {row['point']} in {row['case']}")
+
+
+def report_margins(margins: "pd.DataFrame") -> Report:
+    """Where the loop's sensitivity is largest, operating point by operating point.
+
+    Parameters
+    ----------
+    margins : DataFrame
+        Of a `Certificate`.
+    """
+    if margins.empty:
+        return Report()
+    worst = margins.groupby("point", sort=False)["MaxSensitivity"].max().to_dict()
+    parts = ", ".join(f"{value:.4g} {point}" for point, value in worst.items())
+    phase = margins["PhaseMargin"].min() if "PhaseMargin" in margins else nan
+    also = "" if isnan(phase) else f"; phase margin at least {phase:.3g} deg"
+    return Report((Line(f"MaxSensitivity, the worst of all cases: {parts}{also}"),))
+
+
+def report_notes(notes: Sequence[str]) -> Report:
+    """What a certificate notes beside its figures, the first few in full."""
+    more = len(notes) - MAX_NOTES
+    rest = f"{more} more notes of this kind on other cases; --json FILE holds all, and so does `Certificate.notes`"
+    return Report((*map(Line, notes[:MAX_NOTES]), *([Line(rest)] if more > 0 else [])))

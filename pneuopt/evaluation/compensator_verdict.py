@@ -15,11 +15,10 @@ from pneuopt.evaluation.dither_verdict import (
     weigh_changes,
     worst_metrics,
 )
-from pneuopt.evaluation.report import report_verdict
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report
+from pneuopt.quantities.report import Report, report_verdict
 from pneuopt.quantities.shown import Result
 
 if TYPE_CHECKING:

@@ -14,12 +14,11 @@ from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.dither_effect import DitherEffect, dither_effect, explain_effect, format_with_prefix
 from pneuopt.evaluation.dithered_ending import DitheredEnding, read_ending
 from pneuopt.evaluation.evaluate import evaluate_cases
-from pneuopt.evaluation.report import report_verdict
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report, Tone
+from pneuopt.quantities.report import Report, Tone, report_verdict
 from pneuopt.quantities.shown import Result
 
 if TYPE_CHECKING:

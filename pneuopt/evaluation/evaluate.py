@@ -1,8 +1,8 @@
 """`evaluate`: the metrics of a loop's gains, by a simulation that no search takes part in; or those of a rig."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf, nan
+from math import inf, isnan, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,9 +16,11 @@ from pneuopt.evaluation.budget import POINTS_PER_READING, check_steps
 from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
 from pneuopt.evaluation.meter import meter_metrics
+from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.operating_points import margin_rows, worst_margins
 from pneuopt.evaluation.record import record
+from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, percent_factor, user_limit
 from pneuopt.evaluation.resolution import MAX_REFINEMENTS, refine_instants
 from pneuopt.evaluation.response import loop_inputs, measure, readings_a_sample, sample_spacing
 from pneuopt.evaluation.rig import Rig
@@ -27,12 +29,20 @@ from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import TIED, Report, Table, format_number, number_columns, text_columns
 from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd
 
 LIMIT_CYCLE_METRICS = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
+DITHER_METRICS = ("Ripple", "SettlingTimeRaw")
+"""Metrics that say something of a loop with dither only."""
+TIMES_OR_NEVER = ("SettlingTime", "SettlingTimeRaw")
+MAX_REFERENCE_COLUMNS, MAX_COMPARED_COLUMNS = 3, 2
+"""References beside each other, alone and with other figures: more do not fit 80 columns; their worst is shown."""
+MIN_SHOWN_PERCENT = 1e-3
+"""Least figure in percent that is shown as it is: below, digits of rounding errors hide the others."""
 
 
 def evaluate(
@@ -248,3 +258,91 @@ def _loop_and_rig(model: ClosedLoop | Rig, references: Sequence[Reference]) -> t
         raise ModelError("this rig has no controller, so it follows no reference; make it of a ClosedLoop")
     loop = add_disturbances(model.loop, references)
     return loop, replace(rig, model=loop) if rig is not None else None
+
+
+def metric_units(loop: ClosedLoop) -> dict[str, str]:
+    """The metrics that are shown, in that order, with their units."""
+    units = (loop.command.unit, loop.feedback.unit)
+    return {metric.name: metric.shown_unit(*units) for metric in METRICS.values() if metric.shown}
+
+
+def relevant_units(loop: ClosedLoop) -> dict[str, str]:
+    """As `metric_units`, less those of a dither or a position that the loop has not; the step's size has the key ""."""
+    left_out = {n for n, metric in METRICS.items() if metric.positions and loop.sensed_signal.order != 0}
+    left_out |= set() if loop.dither is not None else set(DITHER_METRICS)
+    units = {n: unit for n, unit in metric_units(loop).items() if n not in left_out}
+    return {"": loop.feedback.unit, **units}
+
+
+def metric_limits(limits: Sequence[Requirement]) -> dict[str, float]:
+    """Each limit by its metric, in the unit in which that is shown; those without a bound are left out."""
+    bounds = {metric_name(q): (user_limit(q), q.metric.factor) for q in limits}
+    return {n: factor * bound for n, (bound, factor) in bounds.items() if bound is not None}
+
+
+def report_metrics(
+    metrics: "pd.DataFrame",
+    units: Mapping[str, str],
+    *,
+    title: str = "certified",
+    beside: tuple[str, "pd.DataFrame | None"] = ("", None),
+    limits: Mapping[str, float] | None = None,
+) -> Report:
+    """Metrics, a column a reference, or their worst where there are many.
+
+    Parameters
+    ----------
+    metrics : DataFrame
+        Of `evaluate`, or a `TuningResult`: a row a metric, a column a reference.
+    units : mapping of str to str
+        Of `relevant_units`.
+    title : str
+        What the figures are.
+    beside : (str, DataFrame or None)
+        Figures of the same references that stand beside them, and their heading: "was", with the gains before.
+    limits : mapping of str to float, optional
+        Of `metric_limits`.
+    """
+    (heading, other), allowed = beside, {n: _format_limit(n, limit) for n, limit in (limits or {}).items()}
+    several = len(metrics.columns) > (MAX_REFERENCE_COLUMNS if other is None else MAX_COMPARED_COLUMNS)
+    unit = units.get("", "")
+    names = [f"worst of {len(metrics.columns)}"] if several else [f"{c}\n{unit}" if unit else str(c) for c in metrics]
+    figures = [word for name in names for word in ((name,) if other is None else (name, heading))]
+    rows = []
+    for metric in (m for m in units if m in metrics.index and _is_relevant(m, metrics)):
+        now, then = (_metric_values(frame, metric, several) for frame in (metrics, other))
+        cells = [metric_cell(metric, v) for v in now]
+        if other is not None:
+            beside_cells = [metric_cell(metric, v, 3) for v in then] or [""] * len(cells)
+            cells = [cell for pair in zip(cells, beside_cells, strict=True) for cell in pair]
+        rows.append((metric, *cells, *([allowed.get(metric, "")] if allowed else []), units[metric]))
+    limit = number_columns(*(["limit"] if allowed else []))
+    columns = *text_columns(title), *number_columns(*figures), *limit, *text_columns("unit")
+    return Report((Table(columns, tuple(rows)),) if rows else ())
+
+
+def metric_cell(metric: str, value: float, digits: int = 4) -> str:
+    """A metric's figure in a table."""
+    if metric in TIMES_OR_NEVER and isnan(value):
+        return "never"
+    if percent_factor(metric) == 100 and 0 < abs(value) < MIN_SHOWN_PERCENT:
+        return f"<{TIED}{MIN_SHOWN_PERCENT:g}"
+    return format_number(value, digits)
+
+
+def _format_limit(metric: str, limit: float) -> str:
+    return f"{'>=' if larger_is_better(metric) else '<='}{TIED}{format_number(limit, 4)}"
+
+
+def _is_relevant(metric: str, metrics: "pd.DataFrame") -> bool:
+    """A limit cycle only where there is one."""
+    return metric not in LIMIT_CYCLE_METRICS or bool((metrics.loc[LIMIT_CYCLE_METRICS[0]] > 0).any())
+
+
+def _metric_values(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float]:
+    if frame is None or metric not in frame.index:
+        return []
+    values: list[float] = frame.T[metric].tolist()
+    worst = min if larger_is_better(metric) else max
+    unknown = any(isnan(v) for v in values)
+    return [nan if unknown else worst(values)] if several else values

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import tomlkit
 
 from pneuopt.evaluation.cases import cases
-from pneuopt.evaluation.report import metric_limits
+from pneuopt.evaluation.evaluate import metric_limits
 from pneuopt.files.certificate import CHECKSUM, checksum_section
 from pneuopt.files.drive import read_drive
 from pneuopt.files.loop import TUNABLE_SECTIONS

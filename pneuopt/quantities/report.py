@@ -157,6 +157,12 @@ def number_columns(*headings: str) -> tuple[Column, ...]:
     return tuple(Column(heading) for heading in headings)
 
 
+def report_verdict(text: str, tone: Tone) -> Report:
+    """A verdict in its first line, and a reason in each further line."""
+    head, *reasons = text.splitlines()
+    return Report((Line(head, tone), *(Line(reason.strip(), indent=2) for reason in reasons)))
+
+
 def format_number(value: float, digits: int) -> str:
     """A number for a table, "-" where there is none."""
     return "-" if math.isnan(value) else f"{value:.{digits}g}"

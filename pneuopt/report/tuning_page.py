@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.evaluation.band import Band
-from pneuopt.evaluation.certificate import Certificate
-from pneuopt.evaluation.report import metric_cell, report_metrics, report_notes
+from pneuopt.evaluation.certificate import Certificate, report_notes
+from pneuopt.evaluation.evaluate import metric_cell, report_metrics
 from pneuopt.evaluation.requirements import larger_is_better
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns

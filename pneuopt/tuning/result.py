@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
-from pneuopt.evaluation.certificate import Certificate
+from pneuopt.evaluation.certificate import Certificate, report_margins, report_notes
+from pneuopt.evaluation.evaluate import report_metrics
 from pneuopt.evaluation.metric import Requirement, Sense
-from pneuopt.evaluation.report import report_margins, report_metrics, report_notes
 from pneuopt.evaluation.requirements import (
     metric_name,
     percent_factor,

@@ -20,8 +20,8 @@ from pneuopt.evaluation.budget import check_steps
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.dither_effect import describe_swing
+from pneuopt.evaluation.evaluate import metric_limits, relevant_units
 from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
-from pneuopt.evaluation.report import metric_limits, relevant_units
 from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTime
 from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.rig import Rig

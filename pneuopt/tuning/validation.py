@@ -13,9 +13,9 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.certificate import Defect, certificate
+from pneuopt.evaluation.evaluate import metric_cell, metric_units
 from pneuopt.evaluation.expected_plants import ExpectedPlants, PlantAxis
 from pneuopt.evaluation.metric import Requirement
-from pneuopt.evaluation.report import metric_cell, metric_units
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, user_limit
 from pneuopt.evaluation.scenarios import Scenarios, apply_scenario
 from pneuopt.evaluation.specification import Objective, Specification, specify

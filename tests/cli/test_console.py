@@ -13,10 +13,11 @@ from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.certificate import report_margins
 from pneuopt.evaluation.dither_effect import DitherEffect
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
+from pneuopt.evaluation.evaluate import metric_limits, metric_units, relevant_units, report_metrics
 from pneuopt.evaluation.expected_plants import expected_plants
-from pneuopt.evaluation.report import metric_limits, metric_units, relevant_units, report_margins, report_metrics
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     MaxComplementarySensitivity,

@@ -14,8 +14,7 @@ from pneuopt.cli import tune as tune_module
 from pneuopt.cli.app import app
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.report import relevant_units
+from pneuopt.evaluation.evaluate import evaluate, relevant_units
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
