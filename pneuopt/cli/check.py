@@ -30,7 +30,7 @@ from pneuopt.report.page import Page, Picture
 from pneuopt.report.summary_page import summary_page, title_of
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from pneuopt.plotting.canvas import Figure
 
 
 def run_check(

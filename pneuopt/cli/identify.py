@@ -55,7 +55,7 @@ from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.studies.bootstrap import bootstrap
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from pneuopt.plotting.canvas import Figure
 
 REFUSAL_FIGURE = "refused"
 """What the name of a refusal's figure ends in: fit.png and fit_refused.png."""

@@ -28,7 +28,7 @@ from pneuopt.report.page import Page, write_page
 from pneuopt.tuning.tune import TuningResult
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from pneuopt.plotting.canvas import Figure
 
 Columns = Mapping[str, tuple[str, str]]
 Writers = dict[Path, Callable[[Path], None]]

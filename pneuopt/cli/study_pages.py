@@ -13,7 +13,7 @@ from pneuopt.report.page import Page
 from pneuopt.report.study_page import study_page
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from pneuopt.plotting.canvas import Figure
 
 Design: TypeAlias = tuple[ClosedLoop, ParameterSet]
 """The loop of all cases, and its parameters."""

@@ -14,7 +14,7 @@ from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Figure  # noqa: PLC0414 - rooms above name the type, and no more of matplotlib
 
 FIGURE_SUFFIXES = ("png", "pdf", "svg")
 GREY, BLUE, ORANGE, RED = "0.55", "#1f6fb2", "#e07b00", "#c0392b"

@@ -20,7 +20,7 @@ from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.report.page import Picture
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from pneuopt.plotting.canvas import Figure
 
 
 def simulate_responses(

@@ -14,7 +14,7 @@ from pneuopt.quantities.output import write_text
 from pneuopt.quantities.report import Line, Report, Table, Tone
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from pneuopt.plotting.canvas import Figure
 
 _SEVERITY = [tone.value for tone in (Tone.PLAIN, Tone.HEADING, Tone.GOOD, Tone.DOUBTFUL, Tone.BAD)]
 

@@ -12,7 +12,7 @@ from pneuopt.report.gains import report_settings
 from pneuopt.report.page import Page, Picture, Section
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from pneuopt.plotting.canvas import Figure
 
 
 def study_page(

@@ -26,7 +26,8 @@ from pneuopt.tuning.validation import report_validation, report_validation_verdi
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
+
+    from pneuopt.plotting.canvas import Figure
 
 MARGINS = {
     "MaxSensitivity": "Ms",
