@@ -191,6 +191,42 @@ def validate_design(
     )
 
 
+def report_validation_verdict(found: DesignValidation) -> Report:
+    """On how many plants a design holds, and what breaks on the others."""
+    breaks = ", ".join(
+        f"{word} breaks on {count}" if word in METRICS else f"it {word} on {count}"
+        for word, count in found.breaks.items()
+    )
+    text = f"{found.verdict}: {breaks}" if breaks else found.verdict
+    return Report((Line(text, Tone.DOUBTFUL if found.broken else Tone.GOOD),))
+
+
+def report_validation(found: DesignValidation) -> Report:
+    """What the plants differ by, the figures on them, and what would help."""
+    rows = []
+    for row in found.figures.reset_index(names="metric").to_dict(orient="records"):
+        metric = str(row["metric"])
+        figures = [metric_cell(metric, row[n]) for n in ("median", "p95", "certified")]
+        limit = "" if math.isnan(row["limit"]) else format_number(row["limit"], 4)
+        rows.append((metric, *figures, limit, str(row["violations"]), found.units.get(metric, "")))
+    figures_heads = number_columns("median", "95 %", "worst", "limit", "broken by")
+    table = Table((*text_columns("new plants"), *figures_heads, *text_columns("unit")), tuple(rows))
+    lead = Line(f"tried on {found.count} plants that no search has seen, each off by")
+    suggestion = f"to do so, add to the tuning's file: {'; '.join(_scenario_lines(found.suggested))}"
+    advice = (*found.advice, *([suggestion] if found.suggested else []))
+    return Report((lead, *(Line(text, indent=2) for text in found.varied), table, *map(Line, advice)))
+
+
+def _scenario_lines(axes: Sequence[PlantAxis]) -> list[str]:
+    """What to write under [scenarios] to tune over these: [scenarios.corners] "load.mass" = "5 %"."""
+    kinds = {"corners": [a for a in axes if not a.is_gain], "tolerances": [a for a in axes if a.is_gain]}
+    return [
+        f"[scenarios.{kind}] " + ", ".join(f'"{n}" = "{100 * a.share:.2g} %"' for a in own for n in a.names)
+        for kind, own in kinds.items()
+        if own
+    ]
+
+
 def _simulate_plants(
     loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, spec: Specification, scenarios: Scenarios
 ) -> tuple["pd.DataFrame", list[str]]:
@@ -313,39 +349,3 @@ def _keeps_limit(values: Array, limit: float, metric: str) -> NDArray[np.bool_]:
     if math.isnan(limit):
         return np.isfinite(values)
     return np.asarray(values >= limit if larger_is_better(metric) else values <= limit)
-
-
-def report_validation_verdict(found: DesignValidation) -> Report:
-    """On how many plants a design holds, and what breaks on the others."""
-    breaks = ", ".join(
-        f"{word} breaks on {count}" if word in METRICS else f"it {word} on {count}"
-        for word, count in found.breaks.items()
-    )
-    text = f"{found.verdict}: {breaks}" if breaks else found.verdict
-    return Report((Line(text, Tone.DOUBTFUL if found.broken else Tone.GOOD),))
-
-
-def report_validation(found: DesignValidation) -> Report:
-    """What the plants differ by, the figures on them, and what would help."""
-    rows = []
-    for row in found.figures.reset_index(names="metric").to_dict(orient="records"):
-        metric = str(row["metric"])
-        figures = [metric_cell(metric, row[n]) for n in ("median", "p95", "certified")]
-        limit = "" if math.isnan(row["limit"]) else format_number(row["limit"], 4)
-        rows.append((metric, *figures, limit, str(row["violations"]), found.units.get(metric, "")))
-    figures_heads = number_columns("median", "95 %", "worst", "limit", "broken by")
-    table = Table((*text_columns("new plants"), *figures_heads, *text_columns("unit")), tuple(rows))
-    lead = Line(f"tried on {found.count} plants that no search has seen, each off by")
-    suggestion = f"to do so, add to the tuning's file: {'; '.join(_scenario_lines(found.suggested))}"
-    advice = (*found.advice, *([suggestion] if found.suggested else []))
-    return Report((lead, *(Line(text, indent=2) for text in found.varied), table, *map(Line, advice)))
-
-
-def _scenario_lines(axes: Sequence[PlantAxis]) -> list[str]:
-    """What to write under [scenarios] to tune over these: [scenarios.corners] "load.mass" = "5 %"."""
-    kinds = {"corners": [a for a in axes if not a.is_gain], "tolerances": [a for a in axes if a.is_gain]}
-    return [
-        f"[scenarios.{kind}] " + ", ".join(f'"{n}" = "{100 * a.share:.2g} %"' for a in own for n in a.names)
-        for kind, own in kinds.items()
-        if own
-    ]
