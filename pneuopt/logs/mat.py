@@ -62,6 +62,7 @@ def _load(path: Path, raw: bytes) -> list[tuple[str, Any]]:
     with foreign_code(path, "a .mat file"):
         if has_elements(raw):
             return read_elements(raw)
+        require(0 in raw[:4], "its head names no version from 4 to 7")  # SciPy would read it as version 5
         from scipy.io import loadmat
 
         file: Any = io.BytesIO(raw)  # which the types do not know
