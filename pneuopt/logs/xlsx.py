@@ -33,27 +33,10 @@ class _Date(float):
 
 
 def read_table(path: Path, raw: bytes) -> Table:
-    """Read a workbook.
+    """Read a workbook; rows have Excel's numbers.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    raw : bytes
-        An empty cell is a missing sample; a formula counts by its last value. Above the names may stand metadata, below
-        them a row of units. Dates and times are read to the microsecond, as Excel keeps them.
-
-    Returns
-    -------
-    Table
-        Its rows have Excel's numbers.
-
-    Raises
-    ------
-    LogError
-        If the file is not such a workbook, or no sheet holds samples.
-    InputError
-        If openpyxl is not installed.
+    An empty cell is a missing sample; a formula counts by its last value. Above the names may stand metadata, below
+    them a row of units. Dates and times are read to the microsecond, as Excel keeps them.
     """
     openpyxl = import_extra("openpyxl", "openpyxl", path, "an Excel workbook", "xlsx")
     with foreign_code(path, "an Excel workbook"):
