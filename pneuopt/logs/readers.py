@@ -36,10 +36,6 @@ def read_table(path: Path, raw: bytes) -> Table:
     raw : bytes
         What the file holds.
 
-    Returns
-    -------
-    Table
-
     Raises
     ------
     LogError
