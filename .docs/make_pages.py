@@ -58,11 +58,12 @@ CONTENTS = {  # the site's pages by what a reader comes for
     "Learn": ["tutorial", "jobs", "concepts", "theory", "validated"],
     "Look up": ["commands", "keys", "outputs", "api/index"],
     "Results": ["gallery", "paper", "data"],
-    "Project": ["contributing", "changelog"],
+    "Project": ["contributing", "decisions", "changelog"],
 }
 HAND_WRITTEN: Mapping[str, Callable[[], str]] = {  # the pages beside this file, and the tables at their ends
     "theory.md": str,
     "validated.md": str,
+    "decisions.md": str,
     "keys.md": lambda: format_markdown(list_keys()),
     "outputs.md": describe_outputs,
 }

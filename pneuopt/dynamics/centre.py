@@ -18,10 +18,6 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet
 def count_from_centre(system: System) -> System:
     """A system whose command is the deviation from the centre of its final element.
 
-    Parameters
-    ----------
-    system : System
-
     Returns
     -------
     System

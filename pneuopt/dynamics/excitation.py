@@ -26,7 +26,6 @@ class LoggedMotion:
         The speed [m/s] that a tenth of the moving samples stay below, and a tenth exceed.
     forward : float
         Share of the moving samples, 0 to 1.
-    reversals : int
     acceleration : float
         Root mean square [m/s^2] of slopes over a hundredth of a log.
     speed : ndarray
@@ -76,7 +75,6 @@ class SeparatingRun:
     ----------
     some, others : frozenset of str
         It suits a group that holds one of each, or one of `some` alone.
-    words : str
     """
 
     some: frozenset[str]
@@ -118,7 +116,6 @@ class Excitation:
         By parameter.
     runs : tuple of SeparatingRun
         The first that suits a group counts.
-    widths : tuple of Width
     at_least : mapping of str to str
         Parameters that no plant has below another one: static friction below Coulomb friction.
     """

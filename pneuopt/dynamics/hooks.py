@@ -35,7 +35,6 @@ class Start:
         States along each log, by the log's name.
     parameters : mapping of str to float
         By name; a `per_log` one as "name[log]".
-    label : str
     trial_parameters : tuple of str
         Those of the parameters that the logs do not determine: each candidate tries one value of them.
     """
@@ -121,7 +120,6 @@ class ValidityLimit:
 
     Attributes
     ----------
-    state : str
     limit : callable
         From the plant's parameters, all of them, to the value [the state's unit].
     side : int
@@ -149,8 +147,6 @@ class Contact:
         When, for the first time [s].
     value, rate : float
         The state there and its rate [its unit, and that over s].
-    state : Quantity
-    validity_limit : ValidityLimit
     """
 
     t: float

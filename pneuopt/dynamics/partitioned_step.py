@@ -58,7 +58,6 @@ def partitioned_step(rate: Rate, own: OwnRate, t: ca.SX, h: ca.SX, z: ca.SX) -> 
     ----------
     rate : callable
         ``(t, z) -> dz/dt``: the first column f, the others linear in the sensitivities.
-    own : OwnRate
     t, h : SX
         Instant and step [s].
     z : SX

@@ -70,10 +70,6 @@ def from_control(
     inputs, outputs : sequence of Quantity
         What its signals are: ``[Quantity("valve_voltage", "V")]``, ``[Quantity("speed", "m/s")]``.
 
-    Returns
-    -------
-    System
-
     Raises
     ------
     InputError

@@ -14,7 +14,6 @@ def rk4(rate: Callable[[ca.SX, ca.SX], ca.SX], t: ca.SX, h: ca.SX, x: ca.SX) -> 
 
     Parameters
     ----------
-    rate : callable
     t, h : SX
         Instant and step [s].
     x : SX

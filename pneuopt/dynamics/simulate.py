@@ -132,10 +132,6 @@ def simulate_stick_slip(
 ) -> StickSlipResult:
     """Integrate a model with Karnopp's friction, and report its events; parameters and errors as for `simulate`.
 
-    Returns
-    -------
-    StickSlipResult
-
     Examples
     --------
     >>> from pneuopt.models.drive import ForceDrive
@@ -187,7 +183,6 @@ def contacts(trajectory: Trajectory, model: Runnable | HasSystem, parameters: Pa
     trajectory : Trajectory
         With the plant's states.
     model : drive, System, ClosedLoop or another Runnable
-    parameters : ParameterSet
 
     Returns
     -------

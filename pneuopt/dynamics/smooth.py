@@ -113,10 +113,8 @@ class LimitMonitor:
 
         Parameters
         ----------
-        run : Integration
         instants : ndarray, shape (n,)
             [s]
-        recorded : int
         stops : bool
             Whether the run ends before the first instant to be recorded by which a limit was met.
 

@@ -45,7 +45,6 @@ class Event:
     ----------
     t : float
         When [s].
-    kind : EventKind
     direction : int
         Of the motion afterwards: 1, -1, or 0 where the mass sticks.
     """

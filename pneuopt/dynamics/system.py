@@ -204,11 +204,6 @@ class System:
         ----------
         x : array_like, shape (n_states,)
         u : mapping of input name to value; absent ones are zero
-        p : ParameterSet
-
-        Returns
-        -------
-        Linearisation
 
         Raises
         ------
@@ -237,7 +232,6 @@ class Motion:
 
     Attributes
     ----------
-    system : System
     update : casadi.Function, optional
         ``(t, x, u, p) -> x``: the state after a sampled controller has acted.
     sample_time : float, optional
@@ -316,15 +310,9 @@ def define(
 
     Parameters
     ----------
-    states, inputs, outputs : sequence of Quantity
-    parameters : ParameterSet
     rhs : callable
         ``rhs(t, x, u, p) -> (xdot, y)``: t an SX, the others mappings from name to SX.
     start_hook, rest_hook : StartHook, RestHook, optional
-
-    Returns
-    -------
-    System
 
     Raises
     ------

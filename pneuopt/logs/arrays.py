@@ -26,7 +26,6 @@ def array_table(
         By name. Those of dates or durations are read as seconds from the first.
     units : mapping of str to str
         Those that the file states.
-    remarks : sequence of str
 
     Returns
     -------

@@ -20,13 +20,8 @@ def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
 
     Parameters
     ----------
-    path : Path
     most : int
         Its size [byte] may be.
-
-    Returns
-    -------
-    bytes
 
     Raises
     ------

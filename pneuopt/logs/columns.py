@@ -56,7 +56,6 @@ def read_channels(
 
     Parameters
     ----------
-    table : Table
     entries : mapping
         Channel to column, as in a sidecar's [columns]; false leaves a channel out. The other columns' names say what
         they are.
@@ -64,10 +63,6 @@ def read_channels(
         Where the entries come from, for messages.
     channels : mapping of str to str
         The channels that a column may be, and their SI units.
-
-    Returns
-    -------
-    ReadChannels
 
     Raises
     ------
@@ -89,7 +84,6 @@ class ReadChannels(NamedTuple):
     ----------
     samples : dict of str to ndarray, each of shape (n,)
         In SI units, "time" among them, strictly increasing; NaN where a sample is missing.
-    columns : mapping of str to ChannelColumn
     remarks : tuple of str
         What the table says of itself, and the columns that are not read although their names nearly are channels.
     """
@@ -126,7 +120,6 @@ class ChannelColumn(NamedTuple):
     ----------
     name : str
         Of the column.
-    factor, offset : float
     unit : str
         Of the column; empty for time stamps.
     unit_from : str

@@ -13,25 +13,10 @@ _DELIMITERS = (";", "\t", ",", " ")
 
 
 def read_table(path: Path, raw: bytes) -> Table:
-    """Read a text file of which a row names the columns.
+    """Read a text file of which a row names the columns: UTF-8, UTF-16 with its mark, or Windows-1252.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    raw : bytes
-        UTF-8, UTF-16 with its mark, or Windows-1252. An empty cell or NaN is a missing sample. One decimal mark holds
-        for all columns that are read. Above the names may stand metadata, below them a row of units (`find_layout`).
-
-    Returns
-    -------
-    Table
-        Its rows have the numbers that an editor shows.
-
-    Raises
-    ------
-    LogError
-        If the file is not text, or its rows are not of one length.
+    An empty cell or NaN is a missing sample. One decimal mark holds for all columns that are read. Above the names may
+    stand metadata, below them a row of units (`find_layout`). Rows have the numbers that an editor shows.
     """
     return read_text(path, decode(path, raw))
 

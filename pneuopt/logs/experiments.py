@@ -116,10 +116,6 @@ class Experiment:
         name : str
             What tables and messages call it.
 
-        Returns
-        -------
-        Experiment
-
         Raises
         ------
         LogError, UnitError, UnknownNameError
@@ -180,7 +176,6 @@ def experiment_from_table(
 
     Parameters
     ----------
-    table : Table
     columns : mapping
         Channel to column, as in a sidecar's [columns]; the table's names say the others.
     where : str
@@ -189,10 +184,6 @@ def experiment_from_table(
         Its signals are channels, too.
     name : str
         Of the experiment.
-
-    Returns
-    -------
-    Experiment
 
     Raises
     ------
@@ -214,7 +205,6 @@ def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
 
     Parameters
     ----------
-    experiment : Experiment
     duration : float
         Of a window [s]: each has exactly ``round(duration / median step)`` samples, and keeps its times.
 
@@ -254,7 +244,6 @@ def resample(experiment: Experiment, step: float) -> Experiment:
 
     Parameters
     ----------
-    experiment : Experiment
     step : float
         Of the new grid [s]. Nothing is filtered, so a step much longer than the log's aliases its noise.
 
@@ -284,7 +273,6 @@ def differentiate(experiment: Experiment, *, window: float, position: str = "pos
 
     Parameters
     ----------
-    experiment : Experiment
     window : float
         Width of the fit [s]; noise falls with its power 1.5, the bandwidth with its first.
     position : str

@@ -109,7 +109,6 @@ def guess_log(table: Table, channels: Mapping[str, str], ask: Ask, has_centre: b
 
     Parameters
     ----------
-    table : Table
     channels : mapping of str to str
         Those of the drive, and their SI units.
     ask : callable

@@ -60,10 +60,6 @@ def find_layout(rows: Sequence[Sequence[str]], where: str, first_row: int = 1) -
     first_row : int
         The number that messages give to the first row.
 
-    Returns
-    -------
-    Layout
-
     Raises
     ------
     LogError

@@ -19,24 +19,9 @@ _TIME = "X_Value"
 
 
 def read_table(path: Path, raw: bytes) -> Table:
-    """Read a measurement file of one segment.
+    """Read a measurement file of one segment; one without a head is read as text.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    raw : bytes
-        Its time is the column X_Value, or, with X_Columns "No", X0 and Delta_X. Without a head it is read as text.
-
-    Returns
-    -------
-    Table
-        Its rows have the numbers that an editor shows.
-
-    Raises
-    ------
-    LogError
-        If the file is not of this format, has several segments, or its channels have times of their own.
+    Its time is the column X_Value, or, with X_Columns "No", X0 and Delta_X. Rows have the numbers that an editor shows.
     """
     text = decode(path, raw)
     lines = text.rstrip("\n ").split("\n")

@@ -26,26 +26,11 @@ class _Column(NamedTuple):
 
 
 def read_table(path: Path, raw: bytes) -> Table:
-    """Read a .mat file.
+    """Read a .mat file; its first sample is row 1, MATLAB's index 1.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    raw : bytes
-        Its vectors of real numbers are columns, and so are those in its structures, by the name of their field. In a
-        structure array, as Simulink's ("Structure With Time") and dSPACE's, each element is a column by its `label` or
-        `Name`, and their time is in seconds. NaN is a missing sample. Whatever else the file holds is left alone.
-
-    Returns
-    -------
-    Table
-        Its first sample is row 1, MATLAB's index 1.
-
-    Raises
-    ------
-    LogError
-        If the file is not a .mat file of these versions, or holds no vector.
+    Its vectors of real numbers are columns, and so are those in its structures, by the name of their field. In a
+    structure array, as Simulink's ("Structure With Time") and dSPACE's, each element is a column by its `label` or
+    `Name`, and their time is in seconds. NaN is a missing sample. Whatever else the file holds is left alone.
     """
     variables = (_flatten(_Column(name, value), 0) for name, value in _load(path, raw))
     columns = [column for found in variables for column in found if _is_vector(column.values)]
@@ -62,6 +47,7 @@ def _load(path: Path, raw: bytes) -> list[tuple[str, Any]]:
     with foreign_code(path, "a .mat file"):
         if has_elements(raw):
             return read_elements(raw)
+        require(0 in raw[:4], "its head names no version from 4 to 7")  # SciPy would read it as version 5
         from scipy.io import loadmat
 
         file: Any = io.BytesIO(raw)  # which the types do not know

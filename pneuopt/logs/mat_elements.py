@@ -38,7 +38,6 @@ class Structure(NamedTuple):
     ----------
     elements : list of dict
         A field's value by its name.
-    fields : tuple of str
     """
 
     elements: list[dict[str, Any]]

@@ -21,27 +21,10 @@ TIME = "time"
 
 
 def read_table(path: Path, raw: bytes) -> Table:
-    """Read an MDF file.
+    """Read an MDF file; its first sample is row 1.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    raw : bytes
-        A column is a channel, by its name, or as "name (group 2)" where two groups have one of that name; "time" is the
-        master of the group that the channels are of.
-
-    Returns
-    -------
-    Table
-        Its first sample is row 1.
-
-    Raises
-    ------
-    LogError
-        If the file is not MDF, or its channels are of groups with different times.
-    InputError
-        If asammdf is not installed.
+    A column is a channel, by its name, or as "name (group 2)" where two groups have one of that name; "time" is the
+    master of the group that the channels are of. Channels of groups with different times are refused.
     """
     import_extra("asammdf", "asammdf", path, "MDF", "mdf")
     log = run_apart(_read_log, path, raw, kind="MDF")

@@ -38,7 +38,6 @@ class MendedLog:
 
     Attributes
     ----------
-    log : Experiment
     rows : ndarray of int, shape (n,)
         The number of each sample's row in the file.
     changes : tuple of str
@@ -59,13 +58,8 @@ def mend_log(path: str | Path, *, plant: Plant | None = None, ambient_pressure: 
 
     Parameters
     ----------
-    path : str or Path
     plant, ambient_pressure
         As for `read_log`.
-
-    Returns
-    -------
-    MendedLog
 
     Raises
     ------
@@ -189,7 +183,6 @@ def write_mended(mended: MendedLog, path: Path, units: Mapping[str, str]) -> dic
 
     Parameters
     ----------
-    mended : MendedLog
     path : Path
         Of the new log, a .csv; its sidecar stands beside it.
     units : mapping of str to str

@@ -89,10 +89,6 @@ def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstima
         NaN where a sample is missing.
     t : array_like, shape (n,), optional
         Time [s], where the samples are not evenly spaced.
-
-    Returns
-    -------
-    NoiseEstimate
     """
     y = np.asarray(column, dtype=float)
     time = np.arange(y.size, dtype=float) if t is None else _without_rounding(np.asarray(t, dtype=float))

@@ -20,27 +20,10 @@ if TYPE_CHECKING:
 
 
 def read_table(path: Path, raw: bytes) -> Table:
-    """Read a Parquet file.
+    """Read a Parquet file; its first sample is row 1.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    raw : bytes
-        Its columns that are used hold integers, floats or decimals, or, for the time, stamps or durations; a null or
-        NaN is a missing sample.
-
-    Returns
-    -------
-    Table
-        Its first sample is row 1.
-
-    Raises
-    ------
-    LogError
-        If the file is not Parquet.
-    InputError
-        If pyarrow is not installed.
+    Its columns that are used hold integers, floats or decimals, or, for the time, stamps or durations; a null or NaN is
+    a missing sample.
     """
     with _parquet_file(path, raw) as file:
         fields = list(file.schema_arrow)

@@ -53,10 +53,6 @@ def read_log(
     ambient_pressure : float
         What gauge pressures, bar(g), count from [Pa]: the drive's "ambient.pressure".
 
-    Returns
-    -------
-    Experiment
-
     Raises
     ------
     LogError, UnitError, UnknownNameError
@@ -74,7 +70,6 @@ class Sidecar(NamedTuple):
     ----------
     path : Path
         For messages; there may be no such file.
-    sections : mapping
     columns : mapping
         Channel to column.
     columns_from : str

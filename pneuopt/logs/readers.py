@@ -1,4 +1,7 @@
-"""The registry of log formats: one reader a suffix. A new format is a file with a `read_table`, and a row here."""
+"""The registry of log formats: one reader a suffix. A new format is a file with a `read_table`, and a row here.
+
+Each reader takes what `read_table` takes, and raises what it raises.
+"""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -29,18 +32,16 @@ def read_table(path: Path, raw: bytes) -> Table:
     Parameters
     ----------
     path : Path
-        Its suffix says the format.
+        Its suffix says the format, and messages name it.
     raw : bytes
         What the file holds.
-
-    Returns
-    -------
-    Table
 
     Raises
     ------
     LogError
-        If no reader has that suffix, or the file is not of that format.
+        If no reader has that suffix, or the file is not of that format, is damaged, or holds no samples.
+    InputError
+        If the library that reads the format is not installed.
     """
     suffix = path.suffix.lower()
     shown = f"{suffix!r} files" if suffix else "a name without suffix"

@@ -22,27 +22,10 @@ _Grid = tuple[str, float, float]  # when the first sample was taken, its time an
 
 
 def read_table(path: Path, raw: bytes) -> Table:
-    """Read a TDMS file.
+    """Read a TDMS file; its first sample is row 1.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    raw : bytes
-        A column is a channel, by its name, or as "group/channel" where two groups have one of that name. Without a
-        channel "time", the time of the waveforms is.
-
-    Returns
-    -------
-    Table
-        Its first sample is row 1.
-
-    Raises
-    ------
-    LogError
-        If the file is not TDMS, or its waveforms have different rates.
-    InputError
-        If npTDMS is not installed.
+    A column is a channel, by its name, or as "group/channel" where two groups have one of that name. Without a channel
+    "time", the time of the waveforms is; waveforms of different rates are refused.
     """
     nptdms = import_extra("nptdms", "npTDMS", path, "TDMS", "tdms")
     with foreign_code(path, "TDMS"):

@@ -28,12 +28,10 @@ class TextBlock:
 
     Attributes
     ----------
-    path : Path
     names : sequence of str
         Of the columns.
     lines : sequence of str
         A row each; " " as the delimiter stands for any white space.
-    delimiter : str
     first_row : int
         The number of the first line.
     stamps : frozenset of str
@@ -74,7 +72,6 @@ def mend_cells(block: TextBlock, used: Sequence[str]) -> tuple[TextBlock, dict[s
 
     Parameters
     ----------
-    block : TextBlock
     used : sequence of str
         The columns whose cells have to be numbers.
 

@@ -2,7 +2,7 @@
 
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,27 +33,10 @@ class _Date(float):
 
 
 def read_table(path: Path, raw: bytes) -> Table:
-    """Read a workbook.
+    """Read a workbook; rows have Excel's numbers.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    raw : bytes
-        An empty cell is a missing sample; a formula counts by its last value. Above the names may stand metadata, below
-        them a row of units. Dates and times are read to the microsecond, as Excel keeps them.
-
-    Returns
-    -------
-    Table
-        Its rows have Excel's numbers.
-
-    Raises
-    ------
-    LogError
-        If the file is not such a workbook, or no sheet holds samples.
-    InputError
-        If openpyxl is not installed.
+    An empty cell is a missing sample; a formula counts by its last value. Above the names may stand metadata, below
+    them a row of units. Dates and times are read to the microsecond, as Excel keeps them.
     """
     openpyxl = import_extra("openpyxl", "openpyxl", path, "an Excel workbook", "xlsx")
     with foreign_code(path, "an Excel workbook"):
@@ -86,12 +69,13 @@ def _read_sheets(path: Path, raw: bytes, openpyxl: Any) -> dict[str, list[list[A
     require(size <= MAX_BYTES, f"{path}: holds {size / 2**20:.0f} MiB of cells; export it as CSV", LogError)
     book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
     # openpyxl rounds dates to milliseconds; as numbers they keep all digits.
+    date_styles = book._date_formats | book._timedelta_formats
     book._date_formats.clear()
     book._timedelta_formats.clear()
-    return {sheet.title: _read_cells(path, sheet) for sheet in book.worksheets}
+    return {sheet.title: _read_cells(path, sheet, date_styles) for sheet in book.worksheets}
 
 
-def _read_cells(path: Path, sheet: Any) -> list[list[Any]]:
+def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]]:
     sheet.reset_dimensions()  # which some programs write wrong
     rows: list[list[Any]] = []
     width = empty = 0
@@ -101,7 +85,7 @@ def _read_cells(path: Path, sheet: Any) -> list[list[Any]]:
         require(
             empty <= MAX_EMPTY_ROWS, f"{path}: {empty} rows are empty; delete them, or what is below them", LogError
         )
-        rows.append([_Date(cell.value) if _is_date(cell) else cell.value for cell in row])
+        rows.append([_Date(cell.value) if _is_date(cell, date_styles) else cell.value for cell in row])
         require(
             len(rows) <= MAX_SHEET_ROWS and width <= MAX_COLUMNS, f"{path}: the sheet is too large; cut it", LogError
         )
@@ -111,8 +95,9 @@ def _read_cells(path: Path, sheet: Any) -> list[list[Any]]:
     return [_without_tail(row) for row in rows]
 
 
-def _is_date(cell: Any) -> bool:
-    return isinstance(cell.value, int | float) and not isinstance(cell.value, bool) and bool(cell.is_date)
+def _is_date(cell: Any, date_styles: Set[int]) -> bool:
+    # not by the cell's own `is_date`, which searches the style's text again for each cell: a quarter of the time
+    return cell.data_type == "n" and cell.value is not None and cell._style_id in date_styles
 
 
 def _without_tail(row: list[Any]) -> list[Any]:

@@ -23,11 +23,6 @@ def with_rest(system: System, push: Quantity, axis: Axis) -> System:
         Its states: position, speed and those of friction ("friction.*").
     push : Quantity
         The input that drives the body.
-    axis : Axis
-
-    Returns
-    -------
-    System
 
     Examples
     --------

@@ -33,7 +33,6 @@ class Alias:
 
     Parameters
     ----------
-    section, key : str
     parameter : str
         The parameter that it gives; a file has either this parameter or the alias.
     uses : tuple of str
@@ -166,7 +165,6 @@ class DriveKind:
         Sections that such a file may have, with their keys; a section of parameters alone has no keys.
     build : callable
         Builds the drive from a `Structure`.
-    aliases : tuple of Alias
     any_friction : bool
         Whether ``replace(drive, friction=...)`` works with every friction law.
     first : FirstFiles, optional

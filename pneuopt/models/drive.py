@@ -30,11 +30,6 @@ class ForceDrive:
     """A load with friction, pushed by a known force: any servo axis, or a cylinder whose chamber pressures are logged.
 
     M dv/dt = F - F_f(v) - F_L. Inputs: force [N], and the chambers' absolute pressures where friction depends on them.
-
-    Parameters
-    ----------
-    friction : FrictionModel
-    load : Load
     """
 
     kind: ClassVar[str] = "force"
@@ -75,7 +70,6 @@ class MotionDrive:
 
     Parameters
     ----------
-    friction : FrictionModel
     chamber : bool
         Whether the pressure of a chamber acts on the piston; input pressure_a [Pa(a)].
     """

@@ -30,10 +30,6 @@ DRIVE_KINDS: Mapping[str, DriveKind] = {
 def stick_slip_drive(drive: Drive) -> Drive:
     """The drive with Karnopp's friction where its own is a static map with a Coulomb level; else as it is.
 
-    Parameters
-    ----------
-    drive : drive
-
     Returns
     -------
     drive

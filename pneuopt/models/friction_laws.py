@@ -28,7 +28,6 @@ class Wrapper:
     ----------
     wrap : callable
         Builds the law from the inner law and, where there are options, a tuple of them.
-    meaning : str
     option : str
         Name of an option in messages, "chamber"; empty without options.
     options : tuple of str

@@ -19,7 +19,6 @@ class FrictionSamples:
         pulls.
     level_speed : ndarray
         The speed at which the friction level applies [m/s]: zero just before break-away.
-    inputs : mapping of str to ndarray
     values : mapping of str to float
         The law's parameters as given; for a scanned one, the value that is tried.
     """

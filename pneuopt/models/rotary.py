@@ -47,10 +47,6 @@ class RotaryDrive:
     laws are those of sliding with newtons read as newton metres and metres as radians; the force that a law depends on
     (`LoadDependent`) is the torque.
 
-    Parameters
-    ----------
-    friction : FrictionModel
-
     Raises
     ------
     ModelError

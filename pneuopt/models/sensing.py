@@ -38,7 +38,6 @@ def with_sensors(
 
     Parameters
     ----------
-    system : System
     offset : sequence of str
         Outputs with a parameter "sensor.<name>.offset" [the output's unit], 0 by default.
     delay : sequence of str
@@ -88,7 +87,6 @@ def coarse_delay(log: Trajectory, late: str, other: str, longest: float = MAX_SE
 
     Parameters
     ----------
-    log : Trajectory
     late, other : str
         Two measurements of the same motion: two speeds, or a position and a speed; the position is differentiated.
     longest : float

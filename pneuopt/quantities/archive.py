@@ -55,7 +55,6 @@ def decode(kind: Any, data: Any, where: str = "result") -> Any:
     Parameters
     ----------
     kind : type, or what stands in annotations
-    data : object
     where : str
         What the message of an error begins with.
 

@@ -18,7 +18,6 @@ def as_tuple(argument: str, given: T | Iterable[T], kind: type[T], meant: str) -
     argument : str
         Its name, for the message.
     given : object of `kind`, or an iterable of them
-    kind : type
     meant : str
         What the argument takes, for the message.
 

@@ -50,12 +50,7 @@ class ModelError(InputError):
 
 
 class HardwareError(InputError):
-    """A value that no hardware has; the message says which values are possible.
-
-    Attributes
-    ----------
-    parameter, remedy : str
-    """
+    """A value that no hardware has; the message says which values are possible."""
 
     def __init__(self, message: str, parameter: str = "", remedy: str = "") -> None:
         super().__init__(message)

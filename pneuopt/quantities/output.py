@@ -25,7 +25,6 @@ def write_text(path: str | Path, text: str) -> None:
 
     Parameters
     ----------
-    path : str or Path
     text : str
         Lines end with a newline character on every system.
 
@@ -44,7 +43,6 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     ----------
     path : str or Path
         A link is followed: the file that it names is replaced. A file that is there keeps its mode and owner.
-    content : bytes
 
     Raises
     ------
@@ -72,7 +70,6 @@ def write_records(path: str | Path, frame: "pd.DataFrame") -> None:
 
     Parameters
     ----------
-    path : str or Path
     frame : DataFrame
         An index that is more than a count goes into each record, as "name" if it has no name of its own.
     """
@@ -80,13 +77,7 @@ def write_records(path: str | Path, frame: "pd.DataFrame") -> None:
 
 
 def write_json(path: str | Path, document: Mapping[str, Any]) -> None:
-    """Write a mapping as JSON; what is not finite becomes null, a list of records is a table (`records`).
-
-    Parameters
-    ----------
-    path : str or Path
-    document : mapping
-    """
+    """Write a mapping as JSON; what is not finite becomes null, a list of records is a table (`records`)."""
     write_text(path, _to_json(plain_value(document)))
 
 
@@ -159,7 +150,6 @@ def check_output_paths(outputs: Iterable[Path | None], inputs: Iterable[Path]) -
     ----------
     outputs : iterable of Path or None
         None is an output that is not wanted.
-    inputs : iterable of Path
 
     Raises
     ------

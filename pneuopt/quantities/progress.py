@@ -47,7 +47,6 @@ class ProgressReporter:
     ----------
     receive : callable or None
         Takes a `Progress`; None: nobody listens.
-    job : str
     """
 
     def __init__(self, receive: Callable[[Progress], None] | None, job: str) -> None:

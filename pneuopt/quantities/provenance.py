@@ -12,10 +12,6 @@ def provenance(*options: object) -> dict[str, str]:
     ----------
     *options : dataclass instances
         Their repr is recorded.
-
-    Returns
-    -------
-    dict of str to str
     """
     return {
         "pneuopt": _version("pneuopt"),

@@ -38,8 +38,6 @@ class Line:
 
     Parameters
     ----------
-    text : str
-    tone : Tone
     indent : int
         Blanks before it; where it goes on in a second line, two more.
     """
@@ -67,13 +65,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells, the first of which names its row.
-
-    Parameters
-    ----------
-    columns : tuple of Column
-    rows : tuple of tuple of str
-    """
+    """Rows of cells, the first of which names its row."""
 
     columns: tuple[Column, ...]
     rows: tuple[tuple[str, ...], ...]

@@ -20,11 +20,6 @@ FORMAT = 1
 def write_result(path: str | Path, result: object) -> None:
     """Write a result's file.
 
-    Parameters
-    ----------
-    path : str or Path
-    result : dataclass
-
     Raises
     ------
     InputError
@@ -41,7 +36,6 @@ def read_result(path: str | Path, kinds: dict[str, type]) -> Any:
 
     Parameters
     ----------
-    path : str or Path
     kinds : dict of str to type
         The results that it may hold, by name.
 

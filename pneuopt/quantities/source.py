@@ -25,17 +25,12 @@ def read_source(path: str | Path, most: int, remedy: str, error: type[InputError
 
     Parameters
     ----------
-    path : str or Path
     most : int
         Its size [byte] may be.
     remedy : str
         What to do where it is larger, or no file: "cut it".
     error : type
         What is raised.
-
-    Returns
-    -------
-    bytes
 
     Raises
     ------

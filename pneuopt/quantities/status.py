@@ -30,7 +30,6 @@ class Status:
 
     Attributes
     ----------
-    code : Code
     sentences : tuple of str
         The verdict first, in less than 100 characters; then details with figures; the remedy last.
     """

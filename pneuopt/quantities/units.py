@@ -57,10 +57,6 @@ def read_value(text: str | float, unit: str, *, where: str = "") -> float:
     where : str
         What the message of an error begins with: file, key.
 
-    Returns
-    -------
-    float
-
     Raises
     ------
     UnitError
@@ -92,10 +88,6 @@ def read_si(text: str | float, *, where: str = "") -> float:
         "5 kg"; a pressure has to be a level, "6.3 bar(g)".
     where : str
         What the message of an error begins with.
-
-    Returns
-    -------
-    float
 
     Raises
     ------
@@ -200,10 +192,6 @@ def write_value(value: float, unit: str, digits: int = 6) -> str:
         SI unit.
     digits : int
         Significant digits.
-
-    Returns
-    -------
-    str
 
     Examples
     --------

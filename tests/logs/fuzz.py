@@ -206,6 +206,10 @@ def _head(rng: random.Random, base: bytes) -> Case:
 
 
 def _bytes(rng: random.Random, base: bytes) -> Case:
+    return Case(damage_bytes(rng, base))
+
+
+def damage_bytes(rng: random.Random, base: bytes) -> bytes:
     """Bytes changed, cut out, put in, repeated, or the file cut."""
     raw = bytearray(base)
     for _ in range(rng.choice([1, 1, 2, 8])):
@@ -223,7 +227,7 @@ def _bytes(rng: random.Random, base: bytes) -> Case:
             raw[i : i + 8] = rng.choice([b"\xff" * 8, b"\0" * 8, b"\x7f" + b"\xff" * 7, b"\0\0\0\x40" * 2])
         else:
             del raw[i:]
-    return Case(bytes(raw))
+    return bytes(raw)
 
 
 def _members(rng: random.Random, base: bytes) -> Case:
@@ -246,7 +250,7 @@ def _xml(rng: random.Random, text: bytes) -> bytes:
             value = rng.choice([b"", b"1e999", b"-1", b"99999999", b"12.5", b"40.25", b"abc", b"0", b"1e300", b"3"])
             text = text[:start] + value + text[stop:]
         else:
-            text = _bytes(rng, text).raw
+            text = damage_bytes(rng, text)
     return text
 
 

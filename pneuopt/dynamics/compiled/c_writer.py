@@ -39,7 +39,6 @@ class CFunction(NamedTuple):
 
     Parameters
     ----------
-    name : str
     function : casadi.Function
         SX, with dense results.
     inputs, outputs : sequence of str
@@ -73,7 +72,6 @@ def write_c(c_function: CFunction, rates: Mapping[str, int]) -> tuple[str, int]:
 
     Parameters
     ----------
-    c_function : CFunction
     rates : mapping of str to int
         How often each input changes: an index into `RATES`.
 

@@ -50,7 +50,6 @@ def find_library(folder: Path, identity: str) -> Path | None:
 
     Parameters
     ----------
-    folder : Path
     identity : str
         All that the library was made of.
     """
@@ -90,7 +89,6 @@ def trim_cache(folder: Path, keep: Path | None = None) -> None:
 
     Parameters
     ----------
-    folder : Path
     keep : Path, optional
         A library that stays in any case.
     """

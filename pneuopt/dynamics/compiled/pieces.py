@@ -35,7 +35,6 @@ def prepare_rollout(
 
     Parameters
     ----------
-    step : casadi.Function
     update, ode : casadi.Function or None
     wrt : sequence of int
         Positions in the parameter vector of which sensitivities are wanted.

@@ -135,15 +135,8 @@ def race(rollout: Rollout, course: RaceCourse, merit: RaceMerit, candidates: Rac
     ----------
     rollout : Rollout
         With machine code, and without sensitivities.
-    course : RaceCourse
-    merit : RaceMerit
-    candidates : RaceField
     y : ndarray, shape (m, n_cases, n, n_outputs)
         Where the outputs are put.
-
-    Returns
-    -------
-    RaceOutcome
     """
     m, cases = candidates.order.shape
     kept_states = np.empty((m, cases, -(-course.t.shape[1] // course.every), rollout.n_states))

@@ -123,7 +123,6 @@ class Rollout:
 
     Parameters
     ----------
-    pieces : Pieces
     wrt : sequence of int
         Positions in the parameter vector of which sensitivities are wanted.
     start : bool
@@ -189,10 +188,6 @@ class Rollout:
             Integration steps a sample.
         states : int
             Return the state at each so many samples, from the first one on: 1, or True, at each sample; 0: none.
-
-        Returns
-        -------
-        RolloutResult
         """
         _check.get()()
         return self._run(*self._check_arrays(x0, u, p, t, h, substeps), substeps, states)
@@ -219,10 +214,6 @@ class Rollout:
             NaN: no residual.
         weight : array_like, shape (m, n, n_outputs)
             One over the standard deviation of the noise.
-
-        Returns
-        -------
-        Gram
         """
         _check.get()()
         given = self._check_arrays(x0, u, p, t, h, substeps)

@@ -50,7 +50,6 @@ def check_machine_code(pieces: Pieces, x0: Array, u: Array, p: Array, step: floa
 
     Parameters
     ----------
-    pieces : Pieces
     x0 : ndarray, shape (n_states,)
     u : ndarray, shape (n_inputs,)
         The largest inputs; segments get them from -1 to 1 times.

@@ -24,7 +24,6 @@ class StatedAxis(NamedTuple):
 
     Attributes
     ----------
-    position, speed : str
     push : str
         The force or torque that drives the axis, positive in the direction of positive speed.
     forces : mapping of str to float
@@ -34,7 +33,6 @@ class StatedAxis(NamedTuple):
         The force that no channel gives, as of a weight; NaN where a free parameter stands in it.
     inertia : float
         As stated; NaN where it is free.
-    inertia_name, inertia_unit, force_unit : str
     offset_parameter : str
         The parameter that takes a constant force.
     stops : tuple of float
@@ -77,7 +75,6 @@ class Evidence:
     ----------
     t : ndarray, shape (n,)
         [s]
-    panels : tuple of Panel
     contradiction : ndarray of bool, shape (n,)
         Where they contradict each other.
     view : tuple of (float, float)
@@ -117,7 +114,6 @@ class LogFinding:
 
     Attributes
     ----------
-    channel : str
     message : str
         What is found, with figures, and the remedy.
     fault : bool
@@ -156,7 +152,6 @@ def evidence(
 
     Parameters
     ----------
-    experiment : Experiment
     *channels : str or Panel
         Each in a panel of its own.
     where : ndarray of bool, optional
@@ -167,10 +162,6 @@ def evidence(
         The speed, whose strokes say how much is to be seen.
     label : str
         What is seen there.
-
-    Returns
-    -------
-    Evidence
     """
     log = experiment.trajectory
     panels = [c if isinstance(c, Panel) else Panel(experiment.unit(c), {c: log[c]}) for c in channels if c]

@@ -59,13 +59,10 @@ class PneumaticDrive:
 
     Parameters
     ----------
-    valve : ProportionalValve
     friction : FrictionModel
         A law that depends on pressure gets both chambers' gauge pressures.
-    load : Load
     chamber : ChamberModel
         Model of both chambers.
-    cylinder : Cylinder
     """
 
     kind: ClassVar[str] = "pneumatic"
@@ -141,7 +138,6 @@ class PneumaticDrive:
 
         Parameters
         ----------
-        parameters : ParameterSet
         position : float, optional
             [m]; by default cylinder.start of the stroke.
         speed : float

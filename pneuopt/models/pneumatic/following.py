@@ -63,7 +63,6 @@ class AirSimulator:
         ----------
         given : Trajectory
             The drive's inputs, held over each sample, and the given states, linear in between.
-        sets : sequence of ParameterSet
 
         Returns
         -------

@@ -121,7 +121,6 @@ def clip_pressure_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoot
         Absolute pressures [Pa]; flow from 1 to 2 is positive.
     b : SX or float
         Critical pressure ratio [-], below 1.
-    smoothing : Smoothing
 
     Returns
     -------

@@ -48,11 +48,6 @@ def check_hardware(p: ParameterSet) -> None:
 def check_start(p: ParameterSet, start: Mapping[str, float]) -> None:
     """Refuse a start outside the stroke; a piston that presses on a stop is slightly outside.
 
-    Parameters
-    ----------
-    p : ParameterSet
-    start : mapping of state to value
-
     Raises
     ------
     InputError
@@ -68,7 +63,6 @@ def position_warning(p: ParameterSet, position: NDArray[np.float64]) -> str:
 
     Parameters
     ----------
-    p : ParameterSet
     position : ndarray
         [m]; NaN where it is missing.
 

@@ -26,8 +26,6 @@ class MotionBalance:
     ----------
     function : casadi.Function
         ``(position, speed, spool, pressure_a, pressure_b, p) -> (BALANCE_RATES; states)``.
-    p : ndarray
-    position, speed : float
     """
 
     function: ca.Function
@@ -71,7 +69,6 @@ def solve_steady_motion(glide: MotionBalance, p: ParameterSet, pressure_b: float
 
     Parameters
     ----------
-    glide : MotionBalance
     p : ParameterSet
         All parameters of the drive.
     pressure_b : float, optional

@@ -65,7 +65,6 @@ class PneumaticStarts:
     ----------
     system : callable
         Returns the drive's System, which holds this hook and is therefore not held here.
-    friction : FrictionModel
     air_force : callable
         Maps the parameters and both pressures [Pa] to the force of the air on the piston [N].
     """

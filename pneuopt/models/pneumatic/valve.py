@@ -48,12 +48,6 @@ class ProportionalValve:
 
     with x_0 the overlap (a dead zone; negative for underlap) and delta the edge's rounding, and passes
     C o(x) rho_0 sqrt(T_0/T) times the law's pressure. The command is clipped hard at the stops.
-
-    Parameters
-    ----------
-    law : FlowLaw
-    spool : Spool
-    smoothing : Smoothing
     """
 
     law: FlowLaw = field(default_factory=Iso6358)

@@ -139,7 +139,6 @@ def choose_filter_time(friction: FrictionModel, balances: Callable[[float], Mapp
 
     Parameters
     ----------
-    friction : FrictionModel
     balances : callable
         Returns the rows of the logs that are filtered with a window [s].
 

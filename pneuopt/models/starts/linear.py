@@ -61,7 +61,6 @@ class LinearStarts:
 
     Parameters
     ----------
-    shape : ResponseShape
     source, output : str
         Names of the plant's input and output.
     delay_line : tuple of str
