@@ -30,7 +30,7 @@ from pneuopt.identification.examination import check_content
 from pneuopt.identification.identifiability import foresee_unidentifiable, leans_on_prior, rests_on_prior
 from pneuopt.identification.long_logs import fit_logs
 from pneuopt.identification.losses import Loss, fit_robustly
-from pneuopt.identification.misfit import Misfit, diagnose_misfit
+from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
 from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
@@ -324,9 +324,8 @@ def _result(
     shared = [n for n in free if n in problem.parameters]
     values = {n: fit.parameters.value(n) for n in shared}
     runs = {e.name: t for e, t in zip(problem.experiments, fit.trajectories, strict=True)}
-    starts = len(problem.experiments) * len(problem.system.states)
     squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
-    dof = max(1, fit.count - len(free) - starts)
+    dof = degrees_of_freedom(problem, fit)
     variance = squares / dof
     diagnosed = replace(diagnose_misfit(problem, fit, variance, dof), restarts=restarts)
     misfit = suspect_widths(diagnosed, problem, fit, variance)
