@@ -129,6 +129,7 @@ def simulate_stick_slip(
     intersample: Mapping[str, Intersample] | None = None,
     rtol: float = 1e-10,
     atol: float = 1e-12,
+    max_steps: float = MAX_STEPS,
 ) -> StickSlipResult:
     """Integrate a model with Karnopp's friction, and report its events; parameters and errors as for `simulate`.
 
@@ -147,6 +148,7 @@ def simulate_stick_slip(
     >>> [(round(e.t, 4), e.kind.value) for e in run.events]
     [(0.1, 'breaks away'), (0.4364, 'sticks')]
     """
+    _check_samples(as_runnable(model, "model"), inputs, max_steps)
     run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol), intersample=intersample)
     if not isinstance(run, StickSlipIntegration):
         raise ModelError("the model has no Karnopp friction, say ForceDrive(Karnopp(Stribeck())); take simulate")

@@ -24,7 +24,7 @@ from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ConvergenceError, ModelError
+from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -345,3 +345,31 @@ def test_a_plant_without_a_speed_is_refused() -> None:
     )
     with pytest.raises(ModelError, match="needs a plant with a state 'speed'"):
         simulate(plant, Trajectory([0.0, 1.0], {}), ParameterSet())
+
+
+def test_an_endless_run_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mass sticks beside an oscillator of 160 kHz, which takes a million steps a second; none of them is an event."""
+    states = (Quantity("speed", "m/s"), Quantity("sine", "1"), Quantity("cosine", "1"))
+    plant = define(
+        states,
+        [],
+        [],
+        ParameterSet({FRICTION_DIRECTION: Parameter(0.0, "1")}),
+        lambda _t, x, _u, p: (
+            {"speed": -p[FRICTION_DIRECTION], "sine": 1e6 * x["cosine"], "cosine": -1e6 * x["sine"]},
+            {},
+        ),
+    )
+    start = {"cosine": 1.0}
+    short = simulate_stick_slip(plant, Trajectory([0.0, 1e-5], {}), ParameterSet(), initial=start).trajectory
+    assert short["sine"][-1] == pytest.approx(sin(10.0), abs=1e-6)
+    monkeypatch.setattr(stick_slip, "MAX_INTERNAL_STEPS", 2000)
+    with pytest.raises(ConvergenceError, match=r"stopped after t = .* s, where speed 0 m/s, .* too stiff"):
+        simulate_stick_slip(plant, Trajectory([0.0, 3600.0], {}), ParameterSet(), initial=start)
+
+
+def test_a_mistyped_sample_time_is_refused() -> None:
+    loop = ClosedLoop(ForceDrive(Karnopp(Coulomb())), PID(sample_time=1e-8))
+    steps = Trajectory([0.0, 1.0], {"reference": [0.1, 0.1]})
+    with pytest.raises(InputError, match=r"1e-08 s are 1e.08 samples.* raise max_steps"):
+        simulate_stick_slip(loop, steps, loop.parameters)
