@@ -110,21 +110,22 @@ def run_in_processes(
     InputError
         If the function cannot travel, or no process can start.
     """
-    warnings.filterwarnings("ignore", message="A worker was restarted")  # its chunk is given to its successor
     wanted = min(count, chosen.count or os.cpu_count() or 1, _MAX_PROCESSES)
     queue = CaseQueue(cases, count, wanted, _LIMIT_SHARE * chosen.seconds)
     crew = _Crew(pickle_function(fn, parameters, chosen), chosen)
-    try:
-        for _ in range(wanted):
-            crew.start()
-        while crew.busy:
-            for run, future in crew.wait():
-                yield from _receive(crew, queue, run, future)
-            yield from _stop_late(crew, queue)
-        while chunk := queue.take():
-            yield from ((name, Outcome(error="no process could be started for it")) for name in chunk.cases)
-    finally:
-        crew.shut_down()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="A worker was restarted")  # its chunk is given to its successor
+        try:
+            for _ in range(wanted):
+                crew.start()
+            while crew.busy:
+                for run, future in crew.wait():
+                    yield from _receive(crew, queue, run, future)
+                yield from _stop_late(crew, queue)
+            while chunk := queue.take():
+                yield from ((name, Outcome(error="no process could be started for it")) for name in chunk.cases)
+        finally:
+            crew.shut_down()
 
 
 @dataclass(frozen=True, eq=False)
