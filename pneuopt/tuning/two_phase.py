@@ -138,7 +138,8 @@ class TwoPhase:
 
     def shorten(self, margin: float) -> "TwoPhase":
         """The method for a short search from a point that is close."""
-        return replace(self, starts=2, margin=margin, solver=replace(self.solver, max_iterations=150))
+        solver = replace(self.solver, max_iterations=min(150, self.solver.max_iterations))
+        return replace(self, starts=min(2, self.starts), margin=margin, solver=solver)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> "TwoPhasePath":
         """The problem, prepared once, to be solved for moving limits and settling bands.

@@ -20,8 +20,10 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.methods import METHODS, choose_method
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import prepare_search, tune
+from pneuopt.tuning.two_phase import TwoPhase
 
 STEP, LIMITS = Step(1.0, horizon=1.0), (Overshoot(0.05),)
 SMALL: dict[str, dict[str, object]] = {  # options with which each one takes a second
@@ -106,6 +108,17 @@ def test_its_fields_say_margin_and_digits(kind: str) -> None:
     method = METHODS[kind]()
     assert 0 <= method.peak_margin <= 1
     assert 0 < method.shorten(0.01).margin == 0.01
+
+
+def test_a_short_search_keeps_what_was_chosen() -> None:
+    """The seed decides the answer; a search that is small already does not grow."""
+    chosen = Racing(members=10, trials=300, polish=0, seed=7, digits=None)
+    few = replace(TwoPhase().solver, max_iterations=20)
+    exact = TwoPhase(starts=1, seed=7, solver=few)
+    assert chosen.shorten(0.01) == replace(chosen, members=6, bands=(), margin=0.01)
+    assert Racing().shorten(0.01).members < Racing().members
+    assert Racing(members=5).shorten(0.01).members == 5
+    assert exact.shorten(0.01) == replace(exact, margin=0.01)
 
 
 def test_it_finds_a_certified_design_and_reports_progress(kind: str, tmp_path: Path) -> None:
