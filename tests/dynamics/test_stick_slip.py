@@ -25,6 +25,7 @@ from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -157,6 +158,33 @@ def test_a_sine_that_barely_exceeds_the_static_friction_is_not_stepped_over(anal
             assert not run.events
         else:
             assert run.events[0].t == pytest.approx(asin(45.0 / amplitude) / (2 * pi * 7.0), abs=1e-7)
+
+
+@pytest.mark.parametrize("depth", [1e-2, 1e-4, 1e-6])
+def test_a_speed_that_dips_to_zero_within_a_step_sticks_until_it_breaks_away(depth: float) -> None:
+    """A mass that a force F = k (t - 1) brakes and then drives; without sticking its speed would fall to -depth.
+
+    With Coulomb friction C the mass m sticks until F = C, at t' = 1 + C/k; from there on v = k (t - t')^2/2m. Speeds on
+    the way are those of a parabola, which an integrator of second order crosses in one step.
+    """
+    mass, level, slope = 2.0, 10.0, 40.0
+    drive = ForceDrive(Karnopp(Coulomb())).system()
+    p = given_values(drive, {"load.mass": mass, "friction.coulomb": level, "friction.viscous": 0.0})
+    leaves, begin = 1 + level / slope, slope / (2 * mass) * (1 + level / slope) ** 2 - depth
+    t, at = np.array([0.0, 2.0]), np.array([0.0, 0.5, leaves, 1.5, 2.0])
+    run = simulate_stick_slip(
+        drive,
+        Trajectory(t, {"force": slope * (t - 1)}),
+        p,
+        initial={"speed": begin, "position": 0.0},
+        t_out=at,
+        intersample={"force": Intersample.LINEAR},
+    )
+    assert [e.kind for e in run.events] == [STANDSTILL, BREAK_AWAY]
+    stops = leaves - sqrt(2 * mass * depth / slope)
+    assert [e.t for e in run.events] == pytest.approx([stops, leaves], abs=1e-6)
+    sliding = slope / (2 * mass) * (at - leaves) ** 2
+    assert run.trajectory["speed"] == pytest.approx(np.where(at < leaves, sliding - depth, sliding), abs=1e-8)
 
 
 def test_directions_and_pressures_raise_the_level() -> None:
