@@ -16,11 +16,12 @@ import numpy as np
 from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arguments import check_argument, check_number
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.tuning.merit import SIMULATION_PEAK_MARGIN, search_result
-from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.method import SearchResult, TuningTask, check_method_options
 from pneuopt.tuning.polish import Polish
 from pneuopt.tuning.race import Race, may_be_cut
 from pneuopt.tuning.shade import SuccessHistory, first_population
@@ -98,6 +99,14 @@ class Racing:
     parameters_without_effect: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
+        for option in ("members", "trials", "polish"):
+            check_number(f"Racing: {option}", getattr(self, option), "a whole number, as 40", whole=True)
+        meant = "multiples of the settling band, as (1.5, 2.5)"
+        check_argument("Racing: bands", self.bands, (tuple, list), meant)
+        for band in self.bands:
+            check_number("Racing: bands", band, meant)
+        object.__setattr__(self, "bands", tuple(self.bands))
+        check_method_options(self)
         require(self.members >= LEAST_MEMBERS, f"Racing: members must be at least {LEAST_MEMBERS}, got {self.members}")
         require(self.trials >= 1, f"Racing: trials must be at least 1, got {self.trials}")
         require(self.polish >= 0, f"Racing: polish must not be negative, got {self.polish}")

@@ -135,3 +135,12 @@ def test_the_users_filters_of_warnings_are_as_they_were(monkeypatch: pytest.Monk
     outcomes = dict(run_in_processes(Processes(), evaluate_case, RIG, [("a", RIG)], 1))
     assert "no process could be started" in outcomes["a"].error
     assert list(warnings.filters) == before
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("count", 2.5), ("count", "2"), ("count", math.inf), ("seconds", "60 s"), ("seconds", None), ("megabytes", [])],
+)
+def test_a_limit_that_is_no_number_is_named(option: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"^Processes: {option} takes .*; got "):
+        Processes(**{option: value})  # type: ignore[arg-type]

@@ -18,6 +18,7 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
+from pneuopt.shooting.full_space import FullSpace
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.methods import METHODS, choose_method
 from pneuopt.tuning.racing import Racing
@@ -182,3 +183,23 @@ def test_a_file_that_names_a_method_of_old_is_told_its_successor(gone: str, tmp_
     message = rf"tuning.toml: \[method\]: '{gone}' is gone; write kind = 'racing', whose options are members, trials"
     with pytest.raises(InputError, match=message):
         read(gone, tmp_path, {"generations": 3})
+
+
+@pytest.mark.parametrize(
+    ("method", "option", "value"),
+    [
+        *((method, "seed", value) for method in (Racing, TwoPhase) for value in (-1, 1.5, None, "1")),
+        *((method, "margin", value) for method in (Racing, TwoPhase) for value in (float("nan"), "1 %")),
+        *((method, "digits", value) for method in (Racing, TwoPhase) for value in (2.5, "4")),
+        *((Racing, "members", value) for value in (float("inf"), 40.5, "40", None)),
+        *((Racing, "bands", value) for value in (2.5, "abc", (float("nan"),), ("2",))),
+        *((TwoPhase, "nodes", value) for value in ((40,), 40, "ab", (40.5, 50), (40, 50, 60))),
+        (TwoPhase, "starts", 1.5),
+        (TwoPhase, "solver", FullSpace),
+    ],
+)
+def test_a_wrong_option_is_refused_where_the_method_is_made(
+    method: type[Racing | TwoPhase], option: str, value: object
+) -> None:
+    with pytest.raises(InputError, match=f"^{method.__name__}: {option} "):
+        method(**{option: value})  # type: ignore[arg-type]
