@@ -23,7 +23,7 @@ class WorkArrays:
             SciPy's. No public name leads to its arrays: one that does not show them where this one does keeps its own,
             with the same answer.
         """
-        integrator = getattr(getattr(solver, "_lsoda_solver", solver), "_integrator", None)
+        integrator: Any = getattr(getattr(solver, "_lsoda_solver", solver), "_integrator", None)
         fresh = [getattr(integrator, name, None) for name in ("rwork", "iwork")]
         handed = getattr(integrator, "call_args", [])[4:6]
         if len(handed) != len(fresh) or any(a is None or a is not b for a, b in zip(fresh, handed, strict=True)):

@@ -13,6 +13,7 @@ from pneuopt.evaluation.requirements import Overshoot, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.merit import compute_merits
 from pneuopt.tuning.method import TuningTask
@@ -132,18 +133,23 @@ def test_gradients_see_whole_responses_on_fine_samples(monkeypatch: pytest.Monke
     assert [end for end, _ in seen] == pytest.approx([whole] * len(seen), abs=fine)
 
 
-def test_a_best_point_of_responses_that_were_cut_is_proved_on_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trials see 3 of 200 ms, in which a loop that is late and one that leaves its band again look alike."""
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_best_point_of_responses_that_were_cut_is_proved_on_the_whole(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trials see 40 of 2000 ms, and an overshoot that passes through the band just then has settled, as they see it."""
     monkeypatch.setattr("pneuopt.tuning.racing.CUT_SETTLING_TIMES", 0.0)
-    monkeypatch.setattr("pneuopt.tuning.racing.LEAST_CUT", 0.015)
-    task, simulator = posed()
-    told = list[str]()
-    rng = np.random.default_rng(0)
-    race = _RacingSearch(simulator, SPEC, task.horizon, task.space.to_unit(task.space.start), rng, told.append)
-    population, merits = race.evolve(rng.random((8, 2)), _Phase("coarse samples", simulator.coarse(SPEC), 80))
-    whole = Race(simulator.coarse(SPEC), SPEC, task.horizon).merits(task.space.from_unit(population[:1]))[0]
+    monkeypatch.setattr("pneuopt.tuning.racing.LEAST_CUT", 0.02)
+    loop, spec = ClosedLoop(FirstOrder().system(), PID(limits=False)), specify(SettlingTime())
+    bounds = {"pid.Kp": (0.1, 5.0), "pid.Ki": (1.0, 200.0)}
+    space = search_space(loop, loop.parameters.with_bounds(bounds).freed(*bounds))
+    simulator = Simulator(loop, (Step(1.0, horizon=2.0),), space, {}, spec)
+    draws, told = np.random.default_rng(seed), list[str]()
+    search = _RacingSearch(simulator, spec, 2.0, space.to_unit(space.start), draws, told.append)
+    population, merits = search.evolve(draws.random((8, 2)), _Phase("fine samples", simulator, 160))
+    whole = Race(simulator, spec, 2.0).merits(space.from_unit(population[:1]))[0]
     assert merits[0] == pytest.approx(whole[0])
-    assert f"best {whole[0]:.4g}" in told[-1]
+    assert told[-1].endswith(f"best {whole[0]:.4g}")
 
 
 @pytest.mark.parametrize(("last", "ends"), [((1.0, 3.0), True), ((1.0, 2.99), False), ((0.99, 3.0), False)])
