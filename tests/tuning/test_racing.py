@@ -142,7 +142,8 @@ def test_a_best_point_of_responses_that_were_cut_is_proved_on_the_whole(
     monkeypatch.setattr("pneuopt.tuning.racing.LEAST_CUT", 0.02)
     loop, spec = ClosedLoop(FirstOrder().system(), PID(limits=False)), specify(SettlingTime())
     bounds = {"pid.Kp": (0.1, 5.0), "pid.Ki": (1.0, 200.0)}
-    space = search_space(loop, loop.parameters.with_bounds(bounds).freed(*bounds))
+    given = loop.parameters.with_values({"pid.Ki": 10.0}).with_bounds(bounds).freed(*bounds)
+    space = search_space(loop, given)
     simulator = Simulator(loop, (Step(1.0, horizon=2.0),), space, {}, spec)
     draws, told = np.random.default_rng(seed), list[str]()
     search = _RacingSearch(simulator, spec, 2.0, space.to_unit(space.start), draws, told.append)
