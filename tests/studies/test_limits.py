@@ -132,7 +132,7 @@ def test_the_users_filters_of_warnings_are_as_they_were(monkeypatch: pytest.Monk
     monkeypatch.setattr(
         _Crew, "start", lambda _: warnings.warn("A worker was restarted while some jobs were given", stacklevel=1)
     )
-    outcomes = dict(run_in_processes(Processes(), evaluate_case, RIG, [("a", RIG)], 1))
+    outcomes = dict(run_in_processes(Processes(), len, RIG, [("a", RIG)], 1))
     assert "no process could be started" in outcomes["a"].error
     assert list(warnings.filters) == before
 
