@@ -20,7 +20,7 @@ from pneuopt.dynamics.runnable import HasSystem, Runnable, as_runnable
 from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration, without_solver_warnings
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
-from pneuopt.quantities.arguments import check_argument, check_parameters
+from pneuopt.quantities.arguments import check_argument, check_number, check_parameters
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.intersample import Intersample
@@ -129,6 +129,7 @@ def simulate_stick_slip(
     intersample: Mapping[str, Intersample] | None = None,
     rtol: float = 1e-10,
     atol: float = 1e-12,
+    max_steps: float = MAX_STEPS,
 ) -> StickSlipResult:
     """Integrate a model with Karnopp's friction, and report its events; parameters and errors as for `simulate`.
 
@@ -143,6 +144,7 @@ def simulate_stick_slip(
     >>> [(round(e.t, 4), e.kind.value) for e in run.events]
     [(0.1, 'breaks away'), (0.4364, 'sticks')]
     """
+    _check_samples(as_runnable(model, "model"), inputs, max_steps)
     run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol), intersample=intersample)
     if not isinstance(run, StickSlipIntegration):
         raise ModelError("the model has no Karnopp friction, say ForceDrive(Karnopp(Stribeck())); take simulate")
@@ -222,6 +224,7 @@ def new_integration(system: System, p: Array, grid: Array, rtol: float, atol: fl
 def _check_samples(model: Runnable, inputs: Trajectory, max_steps: float) -> None:
     """Refuse a sampled loop whose samples over the inputs' time are more than a budget."""
     check_argument("inputs", inputs, Trajectory, "a Trajectory; a log's is its .trajectory")
+    check_number("max_steps", max_steps, "a number of samples, as 1e7; math.inf for no limit")
     sample_time, duration = model.motion().sample_time, float(inputs.t[-1] - inputs.t[0])
     count = duration / sample_time if sample_time else 0.0
     require(
@@ -246,6 +249,8 @@ def _integrate(
     model = as_runnable(model, "model")
     check_argument("inputs", inputs, Trajectory, "a Trajectory; a log's is its .trajectory")
     check_parameters(parameters)
+    for name, value, least in zip(("rtol", "atol"), tolerances, (1e-14, 1e-30), strict=True):
+        check_number(name, value, f"a tolerance from {least:g} to 1", least=least, most=1.0)
     motion = model.motion()
     system, update = motion.system, compile_function(motion.update) if motion.update is not None else None
     u, grid = input_rows(system.inputs, inputs), _report_times(t_out, inputs.t)
@@ -276,7 +281,10 @@ def _integrate(
 
 def _linear_inputs(inputs: Sequence[Quantity], intersample: Mapping[str, Intersample]) -> Mask:
     """Which of a model's inputs run linearly."""
+    check_argument("intersample", intersample, Mapping, "a mapping, as {'force': Intersample.LINEAR}")
     check_names("input", intersample, names(inputs), "intersample")
+    for name, kind in intersample.items():
+        check_argument(f"intersample[{name!r}]", kind, Intersample, "Intersample.HELD or Intersample.LINEAR")
     return np.array([intersample.get(n) is Intersample.LINEAR for n in names(inputs)], dtype=bool)
 
 

@@ -319,4 +319,4 @@ class SmoothIntegration:
         self._integrator.set_initial_value(x, begin)
         self._begin = None
         if self._system.states:  # without any SciPy takes another integrator, which is never run
-            self._work.give_to(self._integrator._integrator)
+            self._work.give_to(self._integrator)

@@ -18,7 +18,7 @@ from scipy import integrate, optimize
 
 from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
 from pneuopt.dynamics.ramps import Ramp
-from pneuopt.dynamics.smooth import Recorder
+from pneuopt.dynamics.smooth import MAX_INTERNAL_STEPS, Recorder
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names
 from pneuopt.dynamics.work_arrays import WorkArrays
 from pneuopt.quantities.arrays import Array
@@ -78,7 +78,7 @@ class StickSlipIntegration:
         self._event_time, self._last_indicator = inf, 0.0
         self._dense: Callable[[float], Array] | None = None
         self._record = Recorder(system, grid, ("stuck",))
-        self._events = list[Event]()
+        self._events, self._steps = list[Event](), 0  # steps since the last event, or instant asked for
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -96,7 +96,7 @@ class StickSlipIntegration:
 
     def advance(self, t: float) -> Array:
         """See `Integration`."""
-        until = t - self._origin
+        until, self._steps = t - self._origin, 0
         while self._event_time <= until or self._solver.t < until:
             if self._event_time <= until:
                 self._switch_mode()
@@ -128,10 +128,11 @@ class StickSlipIntegration:
         self._mode, self._event_time, self._dense = mode, inf, None
         self._now, self._x = t, x
         self._solver = integrate.LSODA(self._rate, t, x, self._end, **self._options)
-        self._work.give_to(self._solver._lsoda_solver._integrator)
+        self._work.give_to(self._solver)
         self._last_indicator = self._mode_indicator(t, x)
 
     def _note_event(self, t: float, mode: int, before: int) -> None:
+        self._steps = 0
         kind = EventKind.STANDSTILL if mode == 0 else EventKind.BREAK_AWAY if before == 0 else EventKind.REVERSAL
         self._events.append(Event(float(self._origin + t), kind, mode))
         require(
@@ -150,7 +151,9 @@ class StickSlipIntegration:
         t, x = self._solver.t, np.array(self._solver.y)
         self._solver.step()
         self._dense = None
-        if self._solver.t <= t or not np.isfinite(self._solver.y).all():
+        self._steps += 1
+        too_many = self._steps > MAX_INTERNAL_STEPS
+        if too_many or self._solver.t <= t or not np.isfinite(self._solver.y).all():
             self._record.fail(self._origin + t, x if self._mode else self._with_zero_speed(x))
         self._event_time = (
             inf if self._mode_persists() else _first_root(self._event_function, self._solver.t_old, self._solver.t)

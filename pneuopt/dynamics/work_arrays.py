@@ -14,16 +14,21 @@ class WorkArrays:
     def __init__(self) -> None:
         self._kept = list[Array]()
 
-    def give_to(self, integrator: Any) -> None:
+    def give_to(self, solver: Any) -> None:
         """Let SciPy's LSODA, just restarted, work in these; in its own the first time.
 
         Parameters
         ----------
-        integrator : lsoda
-            SciPy's: `_integrator` of an `ode`.
+        solver : ode or LSODA
+            SciPy's. No public name leads to its arrays: one that does not show them where this one does keeps its own,
+            with the same answer.
         """
-        fresh = integrator.call_args[4:6]
-        self._kept = self._kept or fresh
+        integrator: Any = getattr(getattr(solver, "_lsoda_solver", solver), "_integrator", None)
+        fresh = [getattr(integrator, name, None) for name in ("rwork", "iwork")]
+        handed = getattr(integrator, "call_args", [])[4:6]
+        if len(handed) != len(fresh) or any(a is None or a is not b for a, b in zip(fresh, handed, strict=True)):
+            return
+        self._kept = self._kept or handed
         for own, new in zip(self._kept, fresh, strict=True):
             own[:] = new
         integrator.call_args[4:6] = integrator.rwork, integrator.iwork = self._kept

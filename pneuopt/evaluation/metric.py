@@ -4,11 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from math import inf
+from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
 
 from pneuopt.evaluation.step_record import RowReader, StepRecord
+from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
@@ -126,10 +128,13 @@ class Metric:
         ------
         InputError
         """
+        if limit is None:
+            return
+        check_argument(f"{self.name}: {self.sense.value}", limit, Real, "a number, as 0.05 for 5 %")
         (least, most), unit = self.limits, "" if self.unit == "1" or "{" in self.unit else f" {self.unit}"
         room = f"above {least:g}{unit}" + (" and finite" if most == inf else f" and below {most:g}, a fraction")
         message = f"{self.name}: {self.sense.value} must be {room}, got {limit}"
-        require(limit is None or least < limit < most, f"{message}; {self.advice}" if self.advice else message)
+        require(least < limit < most, f"{message}; {self.advice}" if self.advice else message)
 
 
 class Requirement:

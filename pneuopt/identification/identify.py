@@ -30,7 +30,7 @@ from pneuopt.identification.examination import check_content
 from pneuopt.identification.identifiability import foresee_unidentifiable, leans_on_prior, rests_on_prior
 from pneuopt.identification.long_logs import fit_logs
 from pneuopt.identification.losses import Loss, fit_robustly
-from pneuopt.identification.misfit import Misfit, diagnose_misfit
+from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
 from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
@@ -44,7 +44,7 @@ from pneuopt.identification.widths import choose_widths
 from pneuopt.identification.windows import check_window, fit_in_windows
 from pneuopt.identification.wrong_values import FixedValueTest
 from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arguments import check_argument
+from pneuopt.quantities.arguments import as_tuple, check_argument, check_number, wrong_argument
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.blas_threads import one_blas_thread
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
@@ -130,10 +130,12 @@ def identify(
     ConvergenceError
         If no candidate start converged; the error's `solution` is the result, marked.
     """
+    check_options(method=method, loss=loss, window=window, start=start, cpu_seconds=cpu_seconds)
+    accept = as_tuple("accept", accept, str, 'the names of checks, as ["motion"]')
     method, model = method or LeastSquares(), as_estimation_model(system)
     if progress is not None:
         method = replace(method, progress=ProgressReporter(progress, "identify"))
-    if math.isfinite(cpu_seconds):
+    if cpu_seconds != math.inf:
         method = replace(method, budget=CpuBudget(cpu_seconds))
     check_smooth(model)
     experiments = tuple(e.accepting(*accept) for e in as_experiments(experiments))
@@ -162,6 +164,31 @@ def identify(
     if throw and not result.status.converged:
         raise ConvergenceError(f"identification {result.status}", result)
     return result
+
+
+def check_options(
+    *,
+    method: LeastSquares | None,
+    window: float | None,
+    loss: Loss | None = None,
+    start: IdentificationResult | None = None,
+    cpu_seconds: float = math.inf,
+) -> None:
+    """Refuse what is no option of a fit, before any log is read: `InputError` names the option and what it takes."""
+    if method is not None:
+        check_argument("method", method, LeastSquares, "LeastSquares(...), with its brackets, or None")
+    if isinstance(loss, type) or (loss is not None and not hasattr(loss, "weight")):
+        raise wrong_argument("loss", loss, "a loss with its brackets, Huber() or SoftL1(), or None")
+    if start is not None:
+        check_argument("start", start, IdentificationResult, "what identify returned for these logs, or None")
+    _check_window_time(window)
+    check_number("cpu_seconds", cpu_seconds, "a time in seconds, as 60.0; leave it out for no limit")
+
+
+def _check_window_time(window: float | None) -> None:
+    """Refuse a window that is no time; `check_window` compares it with the logs."""
+    if window is not None:
+        check_number("window", window, "a time in seconds, as 0.5, math.inf for whole logs, or None")
 
 
 def _fit_and_review(
@@ -233,6 +260,7 @@ def validate(
     """
     from pneuopt.quantities.frames import WideFrame
 
+    _check_window_time(window)
     model = as_estimation_model(system)
     logs = check_logs(model, experiments, parameters)
     fixed = _fixed_parameters(model, find_centre(model, logs, parameters))
@@ -270,6 +298,7 @@ def predict(
     Trajectory
         States and outputs on the log's grid; NaN in holes of its inputs, behind which the state is fitted anew.
     """
+    _check_window_time(window)
     model = as_estimation_model(system)
     check_argument("experiment", experiment, Experiment, "an Experiment, as read_log(path) gives it")
     (log,) = logs = check_logs(model, experiment, parameters)
@@ -324,9 +353,8 @@ def _result(
     shared = [n for n in free if n in problem.parameters]
     values = {n: fit.parameters.value(n) for n in shared}
     runs = {e.name: t for e, t in zip(problem.experiments, fit.trajectories, strict=True)}
-    starts = len(problem.experiments) * len(problem.system.states)
     squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
-    dof = max(1, fit.count - len(free) - starts)
+    dof = degrees_of_freedom(problem, fit)
     variance = squares / dof
     diagnosed = replace(diagnose_misfit(problem, fit, variance, dof), restarts=restarts)
     misfit = suspect_widths(diagnosed, problem, fit, variance)

@@ -32,7 +32,7 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.scores import FitScores, fit_scores
-from pneuopt.shooting.segments import Segments
+from pneuopt.shooting.segments import Segments, segment
 from pneuopt.shooting.solution import Fit, Optimum
 
 # classes of a simulated signal, equally full: more see finer effects with less certainty
@@ -192,6 +192,22 @@ def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: 
         found.is_slow,
         tuple(free[i] for i, alone in zip(keep, found.lone, strict=True) if alone and free[i] not in own),
     )
+
+
+def degrees_of_freedom(problem: EstimationProblem, fit: Fit) -> int:
+    """Residuals of a fit less the parameters and the start states that it has taken from them; at least one.
+
+    A log has a start state, and another one behind each hole in its inputs and in each window. States that no output
+    shows are not fitted, and a part takes no more than it has samples.
+    """
+    if fit.optimum is None:
+        segments = segment(problem.transcription(problem.start_from(fit)))
+    else:
+        segments = fit.optimum.equations.segments
+    heads = np.flatnonzero(np.append(True, ~segments.linked[:-1]))
+    samples = np.add.reduceat(np.isfinite(segments.measured).sum(axis=(1, 2)), heads)
+    starts = np.minimum(np.isnan(segments.fixed_start[heads]).sum(axis=1), samples)
+    return max(1, fit.count - len(fit.parameters.free_names) - int(starts.sum()))
 
 
 class Signal(NamedTuple):

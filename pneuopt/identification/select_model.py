@@ -12,11 +12,11 @@ from pneuopt.dynamics.system import System, names
 from pneuopt.identification.candidates import Candidate, Refutation, fit_candidates
 from pneuopt.identification.checks import as_experiments
 from pneuopt.identification.excitation import remedy
-from pneuopt.identification.identify import validate
+from pneuopt.identification.identify import check_options, validate
 from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arguments import check_argument, check_parameters
+from pneuopt.quantities.arguments import as_tuple, check_argument, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
@@ -132,6 +132,8 @@ def select_model(
     while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without any the
     fewer parameters.
     """
+    check_options(method=method, window=window)
+    free = as_tuple("free", free, str, 'names or patterns of parameters, as ["friction.*"]')
     check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
     require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
     systems = {name: as_system(model, f"candidates[{name!r}]") for name, model in candidates.items()}

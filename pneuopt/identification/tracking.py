@@ -11,6 +11,7 @@ import numpy as np
 from pneuopt.identification.clusters import t_quantile
 from pneuopt.identification.drift import MIN_LOGS, DriftLine, fit_line, look_level, power
 from pneuopt.identification.result import IdentificationResult
+from pneuopt.quantities.arguments import as_tuple
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
@@ -132,7 +133,8 @@ def track(
     order = sorted(range(len(fits)), key=lambda k: stamps[k])
     stamps = [stamps[k] for k in order]
     frames = [f.estimates if isinstance(f, IdentificationResult) else f for f in (fits[k] for k in order)]
-    chosen = _choose_parameters(frames, parameters)
+    wanted = as_tuple("parameters", parameters, str, 'names of parameters, as ["friction.coulomb"]')
+    chosen = _choose_parameters(frames, wanted)
     weeks = np.array([(s - stamps[0]).total_seconds() / WEEK for s in stamps])
     require(weeks[MIN_LOGS - 2] > 0, f"the first {MIN_LOGS - 1} logs are of one moment, {stamps[0]}; give their dates")
     planned = _plan_times(weeks, horizon)

@@ -17,7 +17,7 @@ import numpy as np
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.clusters import t_quantile
-from pneuopt.identification.misfit import Misfit, diagnose_misfit
+from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit
 from pneuopt.identification.multistart import fit_holding_unidentifiable
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.result import ChosenWindow
@@ -196,6 +196,5 @@ def _try_length(problem: EstimationProblem, start: Start, length: float, iterati
     cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=(last,)))
     held, found = fit_holding_unidentifiable(cut, start)
     held = replace(held, method=replace(held.method, stages=problem.method.stages))
-    unknowns = len(found.parameters.free_names) + len(held.experiments) * len(held.system.states)
-    freedom = max(1, found.count - unknowns)
+    freedom = degrees_of_freedom(held, found)
     return _Trial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))

@@ -12,6 +12,7 @@ from pneuopt.logs.frames import frame_table
 from pneuopt.logs.plant_channels import Plant, plant_channels
 from pneuopt.logs.source import LogSource
 from pneuopt.logs.table import Table
+from pneuopt.quantities.arguments import as_tuple, check_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.intersample import Intersample, usual_intersample
@@ -88,6 +89,11 @@ class Experiment:
         for parameter, value in self.conditions.items():
             require(math.isfinite(value), f"{where}: condition {parameter!r} must be finite, got {value}")
         check_names("channel", self.intersample, self.trajectory, f"{where}: intersample")
+        for channel, kind in self.intersample.items():
+            meant = "Intersample.HELD or Intersample.LINEAR"
+            check_argument(f"{where}: intersample[{channel!r}]", kind, Intersample, meant)
+        accept = as_tuple(f"{where}: accept", self.accept, str, 'the names of checks, as ["motion"]')
+        object.__setattr__(self, "accept", accept)
         object.__setattr__(self, "noise", dict(self.noise))
         object.__setattr__(self, "conditions", dict(self.conditions))
 

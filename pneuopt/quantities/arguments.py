@@ -1,6 +1,8 @@
 """Arguments of the verbs: one thing as well as several, and an error that says which argument came as what."""
 
 from collections.abc import Iterable
+from math import inf
+from numbers import Integral, Real
 from pathlib import PurePath
 from typing import Any, TypeVar
 
@@ -46,6 +48,30 @@ def check_argument(argument: str, given: object, kind: type | tuple[type, ...], 
     """Raise `InputError` where an argument is not of its kind, so that swapped ones are named."""
     if not isinstance(given, kind):
         raise wrong_argument(argument, given, meant)
+
+
+def check_number(
+    argument: str, given: object, meant: str, *, least: float = -inf, most: float = inf, whole: bool = False
+) -> None:
+    """Raise `InputError` where an argument is no number from `least` to `most`, NaN among them, or not whole.
+
+    Examples
+    --------
+    >>> check_number("members", 40, "a whole number of at least 5", least=5, whole=True)
+    >>> check_number("members", 4, "a whole number of at least 5", least=5, whole=True)
+    Traceback (most recent call last):
+    ...
+    pneuopt.quantities.errors.InputError: members takes a whole number of at least 5; got 4
+    """
+    if not isinstance(given, Integral if whole else Real) or isinstance(given, bool):
+        is_number = isinstance(given, Real) and not isinstance(given, bool)
+        raise (
+            InputError(f"{argument} takes {meant}; got {given}")
+            if is_number
+            else wrong_argument(argument, given, meant)
+        )
+    if not least <= float(given) <= most:
+        raise InputError(f"{argument} takes {meant}; got {given}")
 
 
 def check_parameters(given: object) -> None:

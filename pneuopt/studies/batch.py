@@ -27,7 +27,7 @@ from pneuopt.evaluation.meter import check_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, larger_is_better
 from pneuopt.evaluation.sampling import generator
-from pneuopt.quantities.arguments import check_parameters
+from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -170,6 +170,7 @@ def evaluate_batch(
     """
     from pneuopt.quantities.frames import WideFrame
 
+    metrics = as_tuple("metrics", metrics, str, 'names of metrics, as ["SettlingTime"]')
     steps, chosen = as_references(references), tuple(dict.fromkeys(metrics))
     check_parameters(parameters)
     check_closed_loop(loop)

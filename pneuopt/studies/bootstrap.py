@@ -33,6 +33,7 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import estimate_noise
+from pneuopt.quantities.arguments import check_number
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -156,7 +157,9 @@ def bootstrap(
         If the rig cannot be simulated along a log.
     """
     require(not isinstance(system, ClosedLoop), "a bootstrap simulates logs of a plant; give the drive", ModelError)
+    check_number("count", count, "a whole number, as 20", whole=True)
     require(count >= 2, f"count = {count}: a spread takes two sets of logs at least")
+    check_number("seed", seed, "a whole number, not below 0", least=0, whole=True)
     require(fit.status.converged, f"the fit has not converged: {fit.status.verdict}; mend it first")
     model = as_estimation_model(system)
     logs = check_logs(model, experiments, fit.parameters)

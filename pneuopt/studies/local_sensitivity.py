@@ -20,7 +20,7 @@ from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.meter import needed_channels
 from pneuopt.evaluation.scenarios import SampleSpreads, axis_labels, values_at
-from pneuopt.quantities.arguments import check_parameters
+from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -134,6 +134,7 @@ def local_sensitivity(
 
     from pneuopt.quantities.frames import WideFrame
 
+    metrics = as_tuple("metrics", metrics, str, 'names of metrics, as ["SettlingTime"]')
     steps, chosen = as_references(references), tuple(dict.fromkeys(metrics))
     check_parameters(parameters)
     check_closed_loop(loop)

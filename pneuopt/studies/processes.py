@@ -22,6 +22,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for_connections
 from typing import TYPE_CHECKING
 
+from pneuopt.quantities.arguments import check_number
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.studies.limits import limit_memory
@@ -64,6 +65,10 @@ class Processes:
     megabytes: float = inf
 
     def __post_init__(self) -> None:
+        if self.count is not None:
+            check_number("Processes: count", self.count, "a whole number of processes, or None", whole=True)
+        check_number("Processes: seconds", self.seconds, "a time in seconds, as 60.0")
+        check_number("Processes: megabytes", self.megabytes, "a size in MiB, as 500.0")
         require(self.count is None or self.count >= 1, f"there must be a process at least, got {self.count}")
         require(self.seconds > 0, f"the time limit of a case must be positive, got {self.seconds:g} s")
         require(self.megabytes > 0, f"the memory limit of a case must be positive, got {self.megabytes:g} MB")
@@ -110,21 +115,22 @@ def run_in_processes(
     InputError
         If the function cannot travel, or no process can start.
     """
-    warnings.filterwarnings("ignore", message="A worker was restarted")  # its chunk is given to its successor
     wanted = min(count, chosen.count or os.cpu_count() or 1, _MAX_PROCESSES)
     queue = CaseQueue(cases, count, wanted, _LIMIT_SHARE * chosen.seconds)
     crew = _Crew(pickle_function(fn, parameters, chosen), chosen)
-    try:
-        for _ in range(wanted):
-            crew.start()
-        while crew.busy:
-            for run, future in crew.wait():
-                yield from _receive(crew, queue, run, future)
-            yield from _stop_late(crew, queue)
-        while chunk := queue.take():
-            yield from ((name, Outcome(error="no process could be started for it")) for name in chunk.cases)
-    finally:
-        crew.shut_down()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="A worker was restarted")  # its chunk is given to its successor
+        try:
+            for _ in range(wanted):
+                crew.start()
+            while crew.busy:
+                for run, future in crew.wait():
+                    yield from _receive(crew, queue, run, future)
+                yield from _stop_late(crew, queue)
+            while chunk := queue.take():
+                yield from ((name, Outcome(error="no process could be started for it")) for name in chunk.cases)
+        finally:
+            crew.shut_down()
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pneuopt.evaluation.sampling import Sampling, unit_points
 from pneuopt.evaluation.scenarios import SampleSpreads, axis_labels, values_at
+from pneuopt.quantities.arguments import as_tuple
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -141,8 +142,9 @@ def _chosen(cases: "pd.DataFrame", parameters: ParameterSet, figures: Sequence[s
     numbers = [n for n in known if cases[n].dtype.kind in "fiub"]
     why = next((str(e) for e in cases["error"] if e), "it returns no number")
     require(len(numbers) > 0, f"no case of the study gave a figure: {why}")
-    check_names("figure", figures or (), numbers, "sensitivity")
-    return list(figures) if figures else numbers
+    wanted = as_tuple("figures", figures or (), str, 'names of figures, as ["SettlingTime"]')
+    check_names("figure", wanted, numbers, "sensitivity")
+    return list(wanted) or numbers
 
 
 def _tabulate(cases: "pd.DataFrame", figures: Sequence[str], axes: Sequence[str], count: int) -> Sensitivity:

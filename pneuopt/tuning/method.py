@@ -9,6 +9,7 @@ from pneuopt.control.reference import Reference
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arguments import check_number
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import ProgressCallback, Status
 from pneuopt.shooting.solution import Solution
@@ -75,6 +76,15 @@ class LimitPath(Protocol):
     def follow(self, start: Array, specs: Sequence[Specification]) -> list[Solution]:
         """Solve for one specification after the other, the first from gains of shape (n,), each from the one before."""
         ...
+
+
+def check_method_options(method: "Method") -> None:
+    """Refuse a margin, digits and a seed that are no numbers; `InputError` names the method and the option."""
+    kind = type(method).__name__
+    check_number(f"{kind}: margin", method.margin, "a fraction, as 0.03")
+    if method.digits is not None:
+        check_number(f"{kind}: digits", method.digits, "a whole number, or None for all", whole=True)
+    check_number(f"{kind}: seed", getattr(method, "seed", 0), "a whole number, not below 0", least=0, whole=True)
 
 
 class Method(Protocol):

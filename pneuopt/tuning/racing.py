@@ -16,11 +16,12 @@ import numpy as np
 from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arguments import check_argument, check_number
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.tuning.merit import SIMULATION_PEAK_MARGIN, search_result
-from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.method import SearchResult, TuningTask, check_method_options
 from pneuopt.tuning.polish import Polish
 from pneuopt.tuning.race import Race, may_be_cut
 from pneuopt.tuning.shade import SuccessHistory, first_population
@@ -57,6 +58,9 @@ CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15
 # Trials for each free gain of a short search, unless the whole one has fewer. With 200 the smallest relaxation of one
 # gain's limit came out 4 % too large; more cost time where there are many gains.
 LEAST_SHORT_TRIALS = 400
+# Members of a search, at least: a trial mixes four of them. Share of them in a short search: more take generations
+# from its trials, fewer leave it to its start.
+LEAST_MEMBERS, SHORT_MEMBERS = 5, 0.6
 NEARBY = 0.05  # spread about a start that is close, a share of each range: a wider one leaves it, a narrower one sticks
 
 
@@ -95,7 +99,15 @@ class Racing:
     parameters_without_effect: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        require(self.members >= 5, f"Racing: members must be at least 5, got {self.members}")
+        for option in ("members", "trials", "polish"):
+            check_number(f"Racing: {option}", getattr(self, option), "a whole number, as 40", whole=True)
+        meant = "multiples of the settling band, as (1.5, 2.5)"
+        check_argument("Racing: bands", self.bands, (tuple, list), meant)
+        for band in self.bands:
+            check_number("Racing: bands", band, meant)
+        object.__setattr__(self, "bands", tuple(self.bands))
+        check_method_options(self)
+        require(self.members >= LEAST_MEMBERS, f"Racing: members must be at least {LEAST_MEMBERS}, got {self.members}")
         require(self.trials >= 1, f"Racing: trials must be at least 1, got {self.trials}")
         require(self.polish >= 0, f"Racing: polish must not be negative, got {self.polish}")
         require(all(b > 1 for b in self.bands), f"Racing: bands are multiples of the one asked for, got {self.bands}")
@@ -133,7 +145,8 @@ class Racing:
     def shorten(self, margin: float) -> "Racing":
         """The method for a short search from a point that is close."""
         trials = min(self.trials, max(LEAST_SHORT_TRIALS, self.trials // 6))
-        return Racing(24, trials, (), self.polish, margin, digits=self.digits)
+        members = max(LEAST_MEMBERS, round(SHORT_MEMBERS * self.members))
+        return replace(self, members=members, trials=trials, bands=(), margin=margin)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
         """No path: each set of limits needs a new search."""

@@ -18,6 +18,7 @@ from pneuopt.evaluation.band import Tolerance, band_number
 from pneuopt.evaluation.margins import margins
 from pneuopt.evaluation.requirements import METRICS, MaxSensitivity, PeakControl, metric_name, upper_limit
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arguments import as_tuple, check_argument, check_number
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import Code, ProgressCallback, Status
@@ -25,7 +26,7 @@ from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path
 from pneuopt.shooting.solution import Solution
 from pneuopt.tuning.agreement import Agreement, compare_starts
 from pneuopt.tuning.merit import WIDEN_BOUNDS
-from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.method import SearchResult, TuningTask, check_method_options
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue
@@ -85,6 +86,16 @@ class TwoPhase:
     parameters_without_effect: ClassVar[tuple[str, ...]] = PARAMETERS_WITHOUT_EFFECT
 
     def __post_init__(self) -> None:
+        nodes = as_tuple(
+            "TwoPhase: nodes", self.nodes, int, "two whole numbers, of the transient and the settled phase"
+        )
+        require(
+            len(nodes) == 2, f"TwoPhase: nodes are two numbers, of the transient and the settled phase, got {nodes}"
+        )
+        object.__setattr__(self, "nodes", nodes)
+        check_number("TwoPhase: starts", self.starts, "a whole number, as 4", whole=True)
+        check_argument("TwoPhase: solver", self.solver, FullSpace, "FullSpace(...), with its brackets")
+        check_method_options(self)
         require(min(self.nodes) >= 4, f"TwoPhase: each phase needs at least 4 nodes, got {self.nodes}")
         require(0 <= self.margin < 1, f"TwoPhase: margin is a fraction below 1, got {self.margin}")
         require(self.starts >= 1, f"TwoPhase: starts must be at least 1, got {self.starts}")
@@ -138,7 +149,8 @@ class TwoPhase:
 
     def shorten(self, margin: float) -> "TwoPhase":
         """The method for a short search from a point that is close."""
-        return replace(self, starts=2, margin=margin, solver=replace(self.solver, max_iterations=150))
+        solver = replace(self.solver, max_iterations=min(150, self.solver.max_iterations))
+        return replace(self, starts=min(2, self.starts), margin=margin, solver=solver)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> "TwoPhasePath":
         """The problem, prepared once, to be solved for moving limits and settling bands.

@@ -39,6 +39,8 @@ def clamped() -> ClosedLoop:
         (0.0, 0.9, 0.9),  # at the upper limit, and the error drives it on: it stays
         (1.3, 3.0, 3.0 - 40 * H * 0.3),  # at the upper limit, and the error takes it back
         (3.0, -0.5, -0.5),  # at the lower limit
+        (0.7, 0.59, 0.6),  # a step that crosses the upper limit: it goes as far as the limit lets it, 0.6 + 0.6 = 1.2
+        (1.3, -0.59, -0.6),  # one that crosses the lower limit
     ],
 )
 def test_the_integral_stays_where_the_error_drives_it_beyond_a_limit(

@@ -230,3 +230,25 @@ def test_bad_input_is_named() -> None:
         simulate(plant, held, plant.parameters, initial=[1.0, 2.0])
     with pytest.raises(InputError, match=r"level starts at -20 1, outside \[-10, inf\]"):
         simulate(runaway(), Trajectory([0.0, 1.0], {}), ParameterSet(), initial={"level": -20.0})
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        *(("rtol", value) for value in (-1.0, 0.0, np.nan, "1e-6", 2.0)),
+        *(("atol", value) for value in (-1.0, np.nan, "1e-6")),
+        *(("max_steps", value) for value in (np.nan, "1000")),
+        ("intersample", "linear"),
+        ("intersample", {"valve_voltage": "linear"}),
+    ],
+)
+def test_a_wrong_option_is_named(option: str, value: object) -> None:
+    """A tolerance of NaN was taken, and an input said to be "linear" was held."""
+    plant = FirstOrder().system()
+    with pytest.raises(InputError, match=f"^{option}.* takes .*; got "):
+        simulate(
+            plant,
+            Trajectory([0.0, 1.0], {"valve_voltage": [1.0, 1.0]}),
+            plant.parameters,
+            **{option: value},  # type: ignore[arg-type]
+        )

@@ -24,7 +24,8 @@ from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ConvergenceError, ModelError
+from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -157,6 +158,33 @@ def test_a_sine_that_barely_exceeds_the_static_friction_is_not_stepped_over(anal
             assert not run.events
         else:
             assert run.events[0].t == pytest.approx(asin(45.0 / amplitude) / (2 * pi * 7.0), abs=1e-7)
+
+
+@pytest.mark.parametrize("depth", [1e-2, 1e-4, 1e-6])
+def test_a_speed_that_dips_to_zero_within_a_step_sticks_until_it_breaks_away(depth: float) -> None:
+    """A mass that a force F = k (t - 1) brakes and then drives; without sticking its speed would fall to -depth.
+
+    With Coulomb friction C the mass m sticks until F = C, at t' = 1 + C/k; from there on v = k (t - t')^2/2m. Speeds on
+    the way are those of a parabola, which an integrator of second order crosses in one step.
+    """
+    mass, level, slope = 2.0, 10.0, 40.0
+    drive = ForceDrive(Karnopp(Coulomb())).system()
+    p = given_values(drive, {"load.mass": mass, "friction.coulomb": level, "friction.viscous": 0.0})
+    leaves, begin = 1 + level / slope, slope / (2 * mass) * (1 + level / slope) ** 2 - depth
+    t, at = np.array([0.0, 2.0]), np.array([0.0, 0.5, leaves, 1.5, 2.0])
+    run = simulate_stick_slip(
+        drive,
+        Trajectory(t, {"force": slope * (t - 1)}),
+        p,
+        initial={"speed": begin, "position": 0.0},
+        t_out=at,
+        intersample={"force": Intersample.LINEAR},
+    )
+    assert [e.kind for e in run.events] == [STANDSTILL, BREAK_AWAY]
+    stops = leaves - sqrt(2 * mass * depth / slope)
+    assert [e.t for e in run.events] == pytest.approx([stops, leaves], abs=1e-6)
+    sliding = slope / (2 * mass) * (at - leaves) ** 2
+    assert run.trajectory["speed"] == pytest.approx(np.where(at < leaves, sliding - depth, sliding), abs=1e-8)
 
 
 def test_directions_and_pressures_raise_the_level() -> None:
@@ -345,3 +373,31 @@ def test_a_plant_without_a_speed_is_refused() -> None:
     )
     with pytest.raises(ModelError, match="needs a plant with a state 'speed'"):
         simulate(plant, Trajectory([0.0, 1.0], {}), ParameterSet())
+
+
+def test_an_endless_run_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mass sticks beside an oscillator of 160 kHz, which takes a million steps a second; none of them is an event."""
+    states = (Quantity("speed", "m/s"), Quantity("sine", "1"), Quantity("cosine", "1"))
+    plant = define(
+        states,
+        [],
+        [],
+        ParameterSet({FRICTION_DIRECTION: Parameter(0.0, "1")}),
+        lambda _t, x, _u, p: (
+            {"speed": -p[FRICTION_DIRECTION], "sine": 1e6 * x["cosine"], "cosine": -1e6 * x["sine"]},
+            {},
+        ),
+    )
+    start = {"cosine": 1.0}
+    short = simulate_stick_slip(plant, Trajectory([0.0, 1e-5], {}), ParameterSet(), initial=start).trajectory
+    assert short["sine"][-1] == pytest.approx(sin(10.0), abs=1e-6)
+    monkeypatch.setattr(stick_slip, "MAX_INTERNAL_STEPS", 2000)
+    with pytest.raises(ConvergenceError, match=r"stopped after t = .* s, where speed 0 m/s, .* too stiff"):
+        simulate_stick_slip(plant, Trajectory([0.0, 3600.0], {}), ParameterSet(), initial=start)
+
+
+def test_a_mistyped_sample_time_is_refused() -> None:
+    loop = ClosedLoop(ForceDrive(Karnopp(Coulomb())), PID(sample_time=1e-8))
+    steps = Trajectory([0.0, 1.0], {"reference": [0.1, 0.1]})
+    with pytest.raises(InputError, match=r"1e-08 s are 1e.08 samples.* raise max_steps"):
+        simulate_stick_slip(loop, steps, loop.parameters)

@@ -47,6 +47,26 @@ def test_a_response_that_is_inside_as_long_as_ever_hunts_on() -> None:
     assert found.returns(0.0) == 1
 
 
+@pytest.mark.parametrize(("share", "inside"), [(1.0, True), (1.0005, True), (1.002, False), (1.01, False)])
+def test_a_response_that_rests_beyond_the_band_is_outside(share: float, inside: bool) -> None:
+    """The continuation is exact to half a thousandth of the band; two thousandths are an error of the loop's."""
+    t = np.linspace(0.0, 1.5, 3001)
+    found = ending(t, -np.maximum(np.exp(-t / 0.1), share * BAND))
+    assert found.is_settled == inside
+    assert ([f.defect for f in find_defects(found, 0.0)] == []) == inside
+    late = ending(t, np.where(t > 1.2, share * BAND, 0.0))  # the horizon is 1 s
+    assert late.refutes(0.5) != inside
+
+
+@pytest.mark.parametrize(("horizons", "refused"), [(0.9, False), (3.0, False), (5.0, True), (9.0, True)])
+def test_a_response_must_be_in_its_band_for_good_within_a_few_horizons(horizons: float, refused: bool) -> None:
+    """Three horizons are a user's who underrated the settling; five are none that a user would wait for."""
+    t = np.linspace(0.0, 30.0, 30001)
+    found = ending(t, np.where(t < horizons * STEP.horizon, -0.05, -0.5 * BAND))
+    assert found.is_settled
+    assert [f.defect for f in find_defects(found, 0.0)] == [Defect.CREEPS] * refused
+
+
 def test_a_response_that_never_was_in_the_band_has_no_stay() -> None:
     t = np.linspace(0.0, 1.0, 1001)
     found = ending(t, -0.5 * np.exp(-t / 5.0))

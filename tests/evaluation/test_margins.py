@@ -87,6 +87,16 @@ def test_no_frequency_beats_the_maximum_sensitivity(Kp: float, Ki: float, Kd: fl
     assert m.max_sensitivity >= 1 / (2 * np.sin(np.radians(abs(m.phase_margin)) / 2)) * (1 - 1e-9)
 
 
+@pytest.mark.parametrize("gain", [0.05, 1.0, 40.0])
+def test_a_crossing_of_the_positive_real_axis_is_no_gain_margin(gain: float) -> None:
+    """``k s/(s^2 + 0.2 s + 1)`` is real and positive at its resonance, and stable with any gain: ``0.2 + k > 0``."""
+    for factor in (1e-3, 1.0, 1e3):
+        found = margins(linearised([factor * gain, 0.0], [1.0, 0.2, 1.0]))
+        assert found.stable
+        assert found.gain_margin == np.inf
+        assert np.isnan(found.phase_crossover)
+
+
 def test_a_loop_that_only_approaches_its_maximum() -> None:
     m = margins(linearised([0.5], [1, 1]))
     assert (m.max_sensitivity, m.max_sensitivity_frequency) == (1.0, np.inf)

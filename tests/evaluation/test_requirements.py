@@ -110,3 +110,11 @@ def test_a_band_is_a_fraction() -> None:
 def test_a_bad_envelope_is_refused(bounds: tuple[tuple[float, float, float], ...], words: str) -> None:
     with pytest.raises(InputError, match=words):
         StepEnvelope(bounds)
+
+
+@pytest.mark.parametrize("value", ["5 %", [], Overshoot])
+def test_a_limit_that_is_no_number_is_named(value: object) -> None:
+    with pytest.raises(InputError, match=r"^Overshoot: max takes a number, as 0\.05 for 5 %; got "):
+        Overshoot(value)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^GainMargin: min takes a number"):
+        GainMargin(value)  # type: ignore[arg-type]

@@ -9,7 +9,9 @@ import pytest
 from pneuopt.dynamics.hooks import Log
 from pneuopt.identification.checks import NEEDED, check_logs, log_remarks
 from pneuopt.identification.examination import check_content
-from pneuopt.identification.identify import identify
+from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.losses import Huber
+from pneuopt.identification.select_model import select_model
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drive import ForceDrive
@@ -18,7 +20,10 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.tuning.racing import Racing
 
+PLANT = ForceDrive(Coulomb()).system()
 NOISE = 2e-5  # [m]
 RIG = ForceDrive(Coulomb())
 
@@ -214,3 +219,37 @@ def test_a_sidecar_accepts_checks_by_name(tmp_path: Path) -> None:
     (tmp_path / "run.toml").write_text('accept = "work"\n', encoding="utf-8")
     with pytest.raises(LogError, match=r'accept must list checks, as accept = \["work"\]; got \'work\''):
         read_log(tmp_path / "run.csv")
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("window", math.nan),
+        ("window", "1 s"),
+        ("loss", Huber),
+        ("loss", "huber"),
+        ("method", LeastSquares),
+        ("method", Racing()),
+        ("start", ParameterSet()),
+        ("cpu_seconds", math.nan),
+        ("cpu_seconds", "60 s"),
+        ("accept", 3),
+    ],
+)
+def test_an_option_that_is_none_is_named_with_what_it_takes(option: str, value: object) -> None:
+    """They were tracebacks, or had another meaning: a window of NaN cut no log."""
+    with pytest.raises(InputError, match=rf"^{option} takes .*; got "):
+        identify(PLANT, braked(), PLANT.parameters.freed("load.mass"), **{option: value})  # type: ignore[arg-type]
+    if option == "window":
+        for use in (validate, predict):
+            with pytest.raises(InputError, match=r"^window takes"):
+                use(PLANT, braked(), PLANT.parameters, window=value)  # type: ignore[arg-type]
+
+
+def test_one_name_is_a_name_and_no_letters() -> None:
+    free = PLANT.parameters.freed("load.mass")
+    with pytest.raises(UnknownNameError, match="unknown check 'motions'"):
+        identify(PLANT, braked(), free, accept="motions")
+    assert replace(braked(), accept="motion").accept == ("motion",)  # type: ignore[arg-type]
+    with pytest.raises(UnknownNameError, match=r"unknown parameter 'friction\.x\*'"):
+        select_model({"a": PLANT, "b": PLANT}, braked(), PLANT.parameters, free="friction.x*")

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.signal import lfilter
+from scipy.stats import ttest_1samp
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_marks, write_fit
 from pneuopt.identification import identify as identification
 from pneuopt.identification.identify import identify
-from pneuopt.identification.misfit import Misfit
+from pneuopt.identification.misfit import Misfit, _hotelling_p
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.logs.experiments import Experiment
@@ -62,12 +63,31 @@ def covers(result: IdentificationResult, truth: ParameterSet) -> Array:
     return np.array([rows["ci_low"][n] <= truth.value(n) <= rows["ci_high"][n] for n in FREE])
 
 
+def test_one_column_of_hotellings_test_is_students() -> None:
+    """T^2 of one variable is t^2 (Hotelling 1931), however few the rows."""
+    for count in (3, 5, 12):
+        rows = 0.4 + np.random.default_rng(count).standard_normal((count, 1))
+        assert _hotelling_p(rows) == pytest.approx(ttest_1samp(rows[:, 0], 0.0).pvalue, rel=1e-9)
+
+
+@pytest.mark.parametrize(("count", "closed"), [(9, False), (9, True), (32, True)])
+def test_hotellings_probability_is_uniform_where_chance_alone_acts(count: int, closed: bool) -> None:
+    """Rows of four correlated columns; closed: a fifth makes their sum zero, as classes that share an offset have."""
+    rng, mix = np.random.default_rng(1), np.tril(np.ones((4, 4)))
+    rows = rng.standard_normal((2000, count, 4)) @ mix
+    rows = np.concatenate([rows, -rows.sum(axis=2, keepdims=True)], axis=2) if closed else rows
+    found = np.array([_hotelling_p(each) for each in rows])
+    for level in (0.05, 0.2, 0.5):
+        assert np.mean(found < level) == pytest.approx(level, abs=4 * np.sqrt(level * (1 - level) / 2000))
+
+
 def test_white_residuals_are_exact() -> None:
     result = fit(log_of(exact()[0]))
     assert set(result.estimates["mark"]) == {Mark.EXACT}
     assert result.stats["variance_inflation"] == 1.0
     assert_allclose(np.diag(result.covariance), result.estimates["stderr"] ** 2)
-    assert_allclose(result.estimates["dof"], TIME.size - len(FREE) - 2)
+    # the logged speed has a start state that is fitted, the position has none: no output shows it
+    assert_allclose(result.estimates["dof"], TIME.size - len(FREE) - 1)
 
 
 def test_the_mark_of_an_estimate_is_the_gravest_that_anything_gives() -> None:

@@ -24,6 +24,7 @@ from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, Viscous
+from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.intersample import Intersample
@@ -245,3 +246,24 @@ def test_a_budget_that_ends_in_one_length_leaves_the_others(monkeypatch: pytest.
     assert tried == [0.4, 0.2]
     assert found is not None
     assert found[2].duration == 0.4
+
+
+@cache
+def linear_log(plant: FirstOrder | SecondOrder) -> tuple[Experiment, ParameterSet]:
+    """Three thousand samples of a linear plant under random steps of its input, and its parameters; noise as stated."""
+    rng, system = np.random.default_rng(5), plant.system()
+    slow = {"plant.time_constant": 0.05} if isinstance(plant, FirstOrder) else {"plant.natural_frequency": 20.0}
+    truth = system.parameters.with_values({"plant.gain": 0.5, **slow})
+    t, steps = np.arange(3000) * 0.01, np.repeat(rng.choice([-2.0, 2.0], 300), 10)
+    run = simulate(system, Trajectory(t, {"valve_voltage": steps}), truth)
+    noisy = run["speed"] + 0.02 * rng.standard_normal(t.size)
+    return Experiment(Trajectory(t, {"valve_voltage": steps, "speed": noisy}), {"speed": 0.02}, name="run"), truth
+
+
+@pytest.mark.parametrize(("plant", "length"), [(FirstOrder(), n) for n in (100, 20, 5, 3)] + [(SecondOrder(), 5)])
+def test_the_start_state_of_each_window_takes_a_degree_of_freedom(plant: FirstOrder | SecondOrder, length: int) -> None:
+    """Residuals of the stated noise have a chi-square ratio of one, within four of its standard deviations."""
+    log, truth = linear_log(plant)
+    result = identify(plant.system(), log, truth.freed("plant.*"), window=0.01 * length)
+    freedom = 3000 * (1 - len(plant.system().states) / length)
+    assert result.stats["chi_square_ratio"] == pytest.approx(1.0, abs=4 * math.sqrt(2 / freedom))

@@ -113,3 +113,9 @@ def test_resample_holds_what_is_said_to_be_held() -> None:
     held = resample(plain.with_intersample({"position": Intersample.HELD}), 2.5e-3)
     assert not np.array_equal(held.trajectory["position"], resample(plain, 2.5e-3).trajectory["position"])
     assert set(held.trajectory["position"]) <= set(plain.trajectory["position"])
+
+
+def test_how_a_channel_runs_is_no_word() -> None:
+    """A channel said to be "linear" was held."""
+    with pytest.raises(InputError, match=r"intersample\['position'\] takes Intersample\.HELD or Intersample\.LINEAR"):
+        ramp().with_intersample({"position": "linear"})  # type: ignore[dict-item]

@@ -111,3 +111,13 @@ def test_a_killed_batch_goes_on_where_it_was_and_gives_the_same_table(
     journal = po.Journal(tmp_path / "journal", "batch", resume=True)
     assert evaluate(journal).table.equals(whole.table)
     journal.close(finished=True)
+
+
+def test_one_metric_is_a_name_and_no_letters() -> None:
+    loop = po.ClosedLoop(po.SecondOrder().system(), po.PID())
+    step, nominal, spreads = po.Step(1.0), {"a": dict[str, float]()}, {"plant.gain": 0.1}
+    for metrics, words in (("Overshot", r"'Overshot'"), (3, r"^metrics takes names of metrics")):
+        with pytest.raises(po.InputError, match=words):
+            po.evaluate_batch(loop, step, loop.parameters, nominal, metrics=metrics)  # type: ignore[arg-type]
+        with pytest.raises(po.InputError, match=words):
+            po.local_sensitivity(loop, step, loop.parameters, spreads, metrics=metrics)  # type: ignore[arg-type]

@@ -18,10 +18,13 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
+from pneuopt.shooting.full_space import FullSpace
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.methods import METHODS, choose_method
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import prepare_search, tune
+from pneuopt.tuning.two_phase import TwoPhase
 
 STEP, LIMITS = Step(1.0, horizon=1.0), (Overshoot(0.05),)
 SMALL: dict[str, dict[str, object]] = {  # options with which each one takes a second
@@ -108,6 +111,17 @@ def test_its_fields_say_margin_and_digits(kind: str) -> None:
     assert 0 < method.shorten(0.01).margin == 0.01
 
 
+def test_a_short_search_keeps_what_was_chosen() -> None:
+    """The seed decides the answer; a search that is small already does not grow."""
+    chosen = Racing(members=10, trials=300, polish=0, seed=7, digits=None)
+    few = replace(TwoPhase().solver, max_iterations=20)
+    exact = TwoPhase(starts=1, seed=7, solver=few)
+    assert chosen.shorten(0.01) == replace(chosen, members=6, bands=(), margin=0.01)
+    assert Racing().shorten(0.01).members < Racing().members
+    assert Racing(members=5).shorten(0.01).members == 5
+    assert exact.shorten(0.01) == replace(exact, margin=0.01)
+
+
 def test_it_finds_a_certified_design_and_reports_progress(kind: str, tmp_path: Path) -> None:
     (loop, given), heard = problem(), list[str]()
     found = tune(
@@ -169,3 +183,23 @@ def test_a_file_that_names_a_method_of_old_is_told_its_successor(gone: str, tmp_
     message = rf"tuning.toml: \[method\]: '{gone}' is gone; write kind = 'racing', whose options are members, trials"
     with pytest.raises(InputError, match=message):
         read(gone, tmp_path, {"generations": 3})
+
+
+@pytest.mark.parametrize(
+    ("method", "option", "value"),
+    [
+        *((method, "seed", value) for method in (Racing, TwoPhase) for value in (-1, 1.5, None, "1")),
+        *((method, "margin", value) for method in (Racing, TwoPhase) for value in (float("nan"), "1 %")),
+        *((method, "digits", value) for method in (Racing, TwoPhase) for value in (2.5, "4")),
+        *((Racing, "members", value) for value in (float("inf"), 40.5, "40", None)),
+        *((Racing, "bands", value) for value in (2.5, "abc", (float("nan"),), ("2",))),
+        *((TwoPhase, "nodes", value) for value in ((40,), 40, "ab", (40.5, 50), (40, 50, 60))),
+        (TwoPhase, "starts", 1.5),
+        (TwoPhase, "solver", FullSpace),
+    ],
+)
+def test_a_wrong_option_is_refused_where_the_method_is_made(
+    method: type[Racing | TwoPhase], option: str, value: object
+) -> None:
+    with pytest.raises(InputError, match=f"^{method.__name__}: {option} "):
+        method(**{option: value})  # type: ignore[arg-type]

@@ -13,12 +13,13 @@ from pneuopt.evaluation.requirements import Overshoot, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.merit import compute_merits
 from pneuopt.tuning.method import TuningTask
 from pneuopt.tuning.polish import Polish
 from pneuopt.tuning.race import Race
-from pneuopt.tuning.racing import PATIENCE, Racing, RacingResult, _is_done, run_racing
+from pneuopt.tuning.racing import PATIENCE, Racing, RacingResult, _is_done, _Phase, _RacingSearch, run_racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 
@@ -130,6 +131,26 @@ def test_gradients_see_whole_responses_on_fine_samples(monkeypatch: pytest.Monke
     assert len(seen) >= 2
     assert {spacing for _, spacing in seen} == {fine}
     assert [end for end, _ in seen] == pytest.approx([whole] * len(seen), abs=fine)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_best_point_of_responses_that_were_cut_is_proved_on_the_whole(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trials see 40 of 2000 ms, and an overshoot that passes through the band just then has settled, as they see it."""
+    monkeypatch.setattr("pneuopt.tuning.racing.CUT_SETTLING_TIMES", 0.0)
+    monkeypatch.setattr("pneuopt.tuning.racing.LEAST_CUT", 0.02)
+    loop, spec = ClosedLoop(FirstOrder().system(), PID(limits=False)), specify(SettlingTime())
+    bounds = {"pid.Kp": (0.1, 5.0), "pid.Ki": (1.0, 200.0)}
+    given = loop.parameters.with_values({"pid.Ki": 10.0}).with_bounds(bounds).freed(*bounds)
+    space = search_space(loop, given)
+    simulator = Simulator(loop, (Step(1.0, horizon=2.0),), space, {}, spec)
+    draws, told = np.random.default_rng(seed), list[str]()
+    search = _RacingSearch(simulator, spec, 2.0, space.to_unit(space.start), draws, told.append)
+    population, merits = search.evolve(draws.random((8, 2)), _Phase("fine samples", simulator, 160))
+    whole = Race(simulator, spec, 2.0).merits(space.from_unit(population[:1]))[0]
+    assert merits[0] == pytest.approx(whole[0])
+    assert told[-1].endswith(f"best {whole[0]:.4g}")
 
 
 @pytest.mark.parametrize(("last", "ends"), [((1.0, 3.0), True), ((1.0, 2.99), False), ((0.99, 3.0), False)])
