@@ -10,7 +10,8 @@ from pneuopt.control.compensation import invert_increasing
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import integrates
 from pneuopt.control.sampled import controller_update
-from pneuopt.control.wiring import Signals, evaluate_plant
+from pneuopt.control.sensor import Signals
+from pneuopt.control.wiring import evaluate_plant
 from pneuopt.dynamics.system import names, stack, symbols
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require

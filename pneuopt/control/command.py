@@ -11,7 +11,7 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.pid import PID
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
-from pneuopt.control.wiring import Signals
+from pneuopt.control.sensor import Signals
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import with_prefix, without_prefix
 

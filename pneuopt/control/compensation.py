@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from pneuopt.control.dither import DITHER_OFFSET
 from pneuopt.control.sensor import SensedSignal
-from pneuopt.control.wiring import Signals
+from pneuopt.control.sensor import Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, stack
 from pneuopt.quantities.arrays import Array

@@ -23,7 +23,7 @@ from pneuopt.control.gain_schedule import schedule_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sampled import controller_update
 from pneuopt.control.sensor import Encoder, SensorLag
-from pneuopt.control.wiring import Signals
+from pneuopt.control.sensor import Signals
 from pneuopt.dynamics.system import names, stack
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import with_prefix, without_prefix

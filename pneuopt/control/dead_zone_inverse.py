@@ -7,7 +7,7 @@ import casadi as ca
 
 from pneuopt.control.compensation import LEAST_SMOOTHING, Instant
 from pneuopt.control.sensor import SensedSignal
-from pneuopt.control.wiring import Signals
+from pneuopt.control.sensor import Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity

@@ -8,7 +8,7 @@ import casadi as ca
 
 from pneuopt.control.compensation import LEAST_SMOOTHING, Instant
 from pneuopt.control.sensor import REFERENCE_SPEED, SensedSignal
-from pneuopt.control.wiring import Signals
+from pneuopt.control.sensor import Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, require

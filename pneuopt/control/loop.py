@@ -30,7 +30,8 @@ from pneuopt.control.pid import PID
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sampled import controller_readings, controller_update
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag
-from pneuopt.control.wiring import Signals, check_algebraic_loop, check_cascade, evaluate_plant, select_signal
+from pneuopt.control.sensor import Signals
+from pneuopt.control.wiring import check_algebraic_loop, check_cascade, evaluate_plant, select_signal
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.runnable import PlantField
 from pneuopt.dynamics.system import (

@@ -6,7 +6,8 @@ import casadi as ca
 
 from pneuopt.control.command import added_command, pid_reference
 from pneuopt.control.gain_schedule import schedule_gains
-from pneuopt.control.wiring import Signals, evaluate_plant
+from pneuopt.control.sensor import Signals
+from pneuopt.control.wiring import evaluate_plant
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import with_prefix, without_prefix
 

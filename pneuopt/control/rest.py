@@ -9,7 +9,8 @@ import numpy as np
 from pneuopt.control.command import CommandParts, pid_reference
 from pneuopt.control.gain_schedule import ScheduledParts, schedule_gains
 from pneuopt.control.pid import integrates
-from pneuopt.control.wiring import JoinedSignals, Signals, evaluate_plant
+from pneuopt.control.sensor import Signals
+from pneuopt.control.wiring import JoinedSignals, evaluate_plant
 from pneuopt.dynamics.system import FRICTION_DIRECTION, Symbols, System, define, names, parameter_vector
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, require

@@ -15,7 +15,7 @@ from pneuopt.control.gain_schedule import GainSchedule, schedule_gains
 from pneuopt.control.pid import BAD_SAMPLES
 from pneuopt.control.reset_integral import reset_integral
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag
-from pneuopt.control.wiring import Signals
+from pneuopt.control.sensor import Signals
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Quantity, with_prefix, without_prefix
 

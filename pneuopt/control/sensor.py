@@ -12,6 +12,8 @@ from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
 
+Signals = dict[str, ca.SX]
+"""Symbolic values by name."""
 REFERENCE_SPEED, REFERENCE_ACCELERATION = "reference_speed", "reference_acceleration"
 """The loop's inputs with the rates of the motion that its reference describes; a loop has those that it uses."""
 MIN_SENSOR_LAG = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast sensors are refused

@@ -11,7 +11,6 @@ from pneuopt.dynamics.system import Symbols, System, names
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Quantity
 
-Signals = dict[str, ca.SX]
 
 
 def evaluate_plant(

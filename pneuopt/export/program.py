@@ -16,7 +16,7 @@ from pneuopt.control.pid import BAD_SAMPLES, PID
 from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sampled import begin_controller, controller_update, signals_are_good
 from pneuopt.control.sensor import Encoder, SensedSignal
-from pneuopt.control.wiring import Signals
+from pneuopt.control.sensor import Signals
 from pneuopt.dynamics.system import Symbols, symbols
 from pneuopt.export.identifiers import Identifiers
 from pneuopt.quantities.errors import ModelError, require
