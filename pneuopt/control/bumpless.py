@@ -6,12 +6,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.control.compensation import invert_increasing
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.compensators import invert_increasing
+from pneuopt.control.controller import controller_update
+from pneuopt.control.loop import ClosedLoop, evaluate_plant
 from pneuopt.control.pid import integrates
-from pneuopt.control.sampled import controller_update
 from pneuopt.control.sensor import Signals
-from pneuopt.control.wiring import evaluate_plant
 from pneuopt.dynamics.system import names, stack, symbols
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require

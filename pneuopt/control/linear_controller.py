@@ -7,9 +7,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.compensation import acting_always, compensation_slopes
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.rest import find_rest
+from pneuopt.control.compensators import acting_always, compensation_slopes
+from pneuopt.control.loop import ClosedLoop, find_rest
 from pneuopt.dynamics.system import Linearisation, names, parameter_vector
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require

@@ -5,50 +5,158 @@ feedforward, compensators and dither are added to its command, the sum is clippe
 drives the actuated input.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial, reduce
+from math import inf
 from operator import or_
-from typing import Any
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 
-from pneuopt.control.compensation import (
+from pneuopt.control.compensators import (
     Compensator,
+    Instant,
     check_compensators,
     check_values,
     compensation_function,
+    uncompensated_command,
+)
+from pneuopt.control.controller import (
+    CommandParts,
+    Feedforward,
+    PositionLoop,
+    added_command,
+    controller_readings,
+    controller_update,
+    pid_reference,
 )
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import ParallelForm, parallel_gains
-from pneuopt.control.gain_schedule import GainSchedule
-from pneuopt.control.loop_equations import continuous_rates, held_rates
-from pneuopt.control.loop_start import start_state
-from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
-from pneuopt.control.sampled import controller_readings, controller_update
-from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag
-from pneuopt.control.sensor import Signals
-from pneuopt.control.wiring import check_algebraic_loop, check_cascade, evaluate_plant, select_signal
+from pneuopt.control.gain_schedule import GainSchedule, ScheduledParts, schedule_gains
+from pneuopt.control.pid import PID, ParallelForm, integrates, parallel_gains
+from pneuopt.control.reference import Reference, disturbance_input
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag, Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.runnable import PlantField
 from pneuopt.dynamics.system import (
+    FRICTION_DIRECTION,
     DiscreteSystem,
     Motion,
+    Symbols,
     System,
     define,
     discretise,
     names,
+    parameter_vector,
     stack,
     symbols,
 )
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ModelError, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
+from pneuopt.quantities.errors import ConvergenceError, ModelError, check_names, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity, with_prefix, without_prefix
 from pneuopt.quantities.unit_algebra import unit_ratio
+
+
+def evaluate_plant(
+    plant: System, actuated: str, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX
+) -> tuple[Signals, Signals]:
+    """Rates and outputs of the plant under a command."""
+    driven = {**u, actuated: command}
+    xs, us = (ca.vertcat(*(v[n] for n in names(q))) for v, q in ((x, plant.states), (driven, plant.inputs)))
+    xdot, y = plant.ode(t, xs, us, ca.vertcat(*(p[n] for n in plant.parameters)))
+    states, outputs = names(plant.states), names(plant.outputs)
+    return {n: xdot[k] for k, n in enumerate(states)}, {n: y[k] for k, n in enumerate(outputs)}
+
+
+def select_signal(kind: str, name: str | None, known: Sequence[Quantity], usual: str | None) -> Quantity:
+    """The signal of that name, by default the usual one or the only one.
+
+    Raises
+    ------
+    ModelError
+        If there are several; `UnknownNameError` if there is none of that name.
+    """
+    by_name = {q.name: q for q in known}
+    if name is None:
+        name = usual if usual in by_name else next(iter(by_name)) if len(by_name) == 1 else None
+    field = "actuated" if kind == "input" else "measured"
+    require(name is not None, f"the plant has the {kind}s {', '.join(by_name) or 'none'}; choose {field}=", ModelError)
+    check_names(kind, [str(name)], by_name, f"ClosedLoop {field}")
+    return by_name[str(name)]
+
+
+def check_algebraic_loop(plant: System, command: str, output: str) -> None:
+    """Refuse an algebraic loop: an output that depends on the command without any lag."""
+    t, x, u = (ca.SX.sym(k, plant.ode.size1_in(i)) for i, k in enumerate("txu"))
+    y = plant.ode(t, x, u, ca.SX.sym("p", plant.ode.size1_in(3)))[1]
+    j, i = names(plant.inputs).index(command), names(plant.outputs).index(output)
+    require(
+        ca.jacobian(y[i], u[j]).nnz() == 0,
+        f"algebraic loop: output {output!r} depends on input {command!r} without any lag; "
+        "measure another output, or give the plant an actuator or a sensor with a lag",
+        ModelError,
+    )
+
+
+class JoinedSignals(Protocol):
+    """The signals of a `ClosedLoop` at which plant and controller meet."""
+
+    @property
+    def plant(self) -> System:
+        """Without the controller."""
+        ...
+
+    @property
+    def command(self) -> Quantity:
+        """The plant's input that the controller drives."""
+        ...
+
+    @property
+    def feedback(self) -> Quantity:
+        """The plant's output that is fed back, by which the loop is judged."""
+        ...
+
+    @property
+    def pid_signal(self) -> Quantity:
+        """The plant's output that the PID controls."""
+        ...
+
+
+class CascadedLoop(JoinedSignals, Protocol):
+    """What of a `ClosedLoop` decides whether it can be a cascade."""
+
+    @property
+    def outer(self) -> object:
+        """The outer loop."""
+        ...
+
+    @property
+    def feedforward(self) -> object:
+        """The feedforward of the reference's jumps."""
+        ...
+
+
+def check_cascade(loop: CascadedLoop) -> None:
+    """Refuse an outer loop of anything but the axis's position, and a feedforward of its jumps."""
+    if loop.outer is None:
+        return
+    position = (loop.plant.axis or Axis()).position
+    told = f"a PositionLoop controls the {position}, this loop {loop.feedback.name!r}; take measured={position!r}"
+    require(loop.feedback.name == position, told, ModelError)
+    check_algebraic_loop(loop.plant, loop.command.name, position)
+    told = "a Feedforward is of jumps of what the PID follows, in a cascade a speed; take MotionFeedforward"
+    require(loop.feedforward is None, told, ModelError)
+
+
+def check_initial_command(command: float, value: Mapping[str, float], unit: str) -> None:
+    """Refuse a start that takes a command beyond the limits."""
+    low, high = value.get("pid.lower", -inf), value.get("pid.upper", inf)
+    require(
+        low <= command <= high,
+        f"the loop cannot start at rest: it needs a command of {command:g} {unit}, the limits are {low:g} and {high:g}",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,3 +504,247 @@ class ClosedLoop:
 def check_closed_loop(loop: object) -> None:
     """Raise `InputError` where `loop` is no `ClosedLoop`, but a drive, say."""
     check_argument("loop", loop, ClosedLoop, "a ClosedLoop, such as ClosedLoop(drive, PID())")
+
+
+def add_disturbances(loop: ClosedLoop, references: Iterable[Reference]) -> ClosedLoop:
+    """Give the plant an input for each disturbance of the references, named by `disturbance_input`.
+
+    A parameter becomes its value plus that input, an input of the plant likewise; so 0 is the plant as it was.
+
+    Raises
+    ------
+    UnknownNameError
+        If a disturbance is neither a parameter nor an input of the plant.
+    """
+    wanted = dict.fromkeys(n for reference in references for n in reference.disturbance)
+    new = [n for n in wanted if disturbance_input(n) not in names(loop.plant.inputs)]
+    known = [*names(loop.plant.inputs), *loop.plant.parameters]
+    check_names("parameter or input of the plant", new, known, "disturbance")
+    if not new:
+        return loop
+    plant = _add_plant_disturbances(loop.plant, new)
+    return replace(loop, plant=plant, actuated=loop.command.name, measured=loop.feedback.name)
+
+
+def _add_plant_disturbances(plant: System, wanted: list[str]) -> System:
+    u, p = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in ((2, "u"), (3, "p")))
+    t, x, d = ca.SX.sym("t"), ca.SX.sym("x", plant.ode.size1_in(1)), ca.SX.sym("d", len(wanted))
+    inputs, parameters = list(names(plant.inputs)), list(plant.parameters)
+    us, ps = ca.SX(u), ca.SX(p)
+    for k, n in enumerate(wanted):
+        if n in inputs:
+            us[inputs.index(n)] += d[k]
+        else:
+            ps[parameters.index(n)] += d[k]
+
+    def wrap(function: ca.Function) -> ca.Function:
+        arguments, given = [t, x, ca.vertcat(u, d), p], ["t", "x", "u", "p"]
+        found = function.call([t, x, us, ps])  # a list, whatever the number of outputs
+        return ca.Function(function.name(), arguments, found, given, list(function.name_out()))
+
+    units = {q.name: q.unit for q in plant.inputs} | {n: q.unit for n, q in plant.parameters.items()}
+    more = tuple(Quantity(disturbance_input(n), units[n]) for n in wanted)
+    meter = None if plant.meter is None else wrap(plant.meter)
+    return replace(plant, inputs=(*plant.inputs, *more), ode=wrap(plant.ode), meter=meter)
+
+
+def continuous_rates(loop: "ClosedLoop", t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+    """Rates and outputs of a loop with a continuous PID."""
+    shown = evaluate_plant(loop.plant, loop.command.name, t, x, u, p, ca.SX(0))[1]
+    seen = x["sensor.reading"] if loop.sensor else shown[loop.pid_signal.name]
+    p = schedule_gains(loop, p, seen, {}, shown)
+    u = pid_reference(loop, u, shown[loop.feedback.name], p)
+    moved, added = added_command(loop, t, x, u, seen, shown, p)
+    rates, command = loop.pid.rates(without_prefix(x, "pid"), u["reference"], seen, added, without_prefix(p, "pid"))
+    xdot, y = evaluate_plant(loop.plant, loop.command.name, t, x, u, p, command)
+    own = with_prefix(rates, "pid") | moved | _sensor_rates(loop, x, y, p)
+    return xdot | own, y | {"control": command}
+
+
+def held_rates(loop: "ClosedLoop", t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+    """Rates and outputs of a loop with a sampled PID while its command is held."""
+    command = x["pid.command"]
+    if loop.dither and loop.dither.analogue:
+        command = loop.pid.clip(command + loop.dither.wave(t, without_prefix(p, "dither")), without_prefix(p, "pid"))
+    xdot, y = evaluate_plant(loop.plant, loop.command.name, t, x, u, p, command)
+    held = tuple(f"{n}." for n in loop.tunable_sections)
+    own = {n: ca.SX(0) for n in x if n.startswith(held)} | _sensor_rates(loop, x, y, p)
+    return xdot | own, y | {"control": command}
+
+
+def _sensor_rates(loop: "ClosedLoop", x: Symbols, y: Symbols, p: Symbols) -> Signals:
+    if loop.sensor is None:
+        return {}
+    own = without_prefix(x, "sensor"), y, loop.sensed_signal, without_prefix(p, "sensor")
+    return with_prefix(loop.sensor.rates(*own), "sensor")
+
+
+def start_state(
+    loop: "ClosedLoop",
+    parameters: ParameterSet,
+    x_plant: Sequence[float] | Array | None,
+    reference: float,
+    command: float,
+    start: Mapping[str, float],
+) -> Array:
+    """The state of `ClosedLoop.initial`, which tells of the arguments; shape (n_states,)."""
+    parameters = set_sliding_direction(loop, loop.complete(parameters), reference)
+    p = loop.parameter_vector(parameters)
+    value = dict(zip(loop.parameters, p, strict=True))
+    if x_plant is None:
+        x, command = find_rest(loop, parameters, reference, start)
+    else:
+        x, shape = np.asarray(x_plant, dtype=float), (len(loop.plant.states),)
+        require(x.shape == shape, f"x_plant has shape {x.shape}, the plant's state has {shape}")
+    check_initial_command(command, value, loop.command.unit)
+    shown = loop.plant.ode(0, x, np.zeros(len(loop.plant.inputs)), [value[n] for n in loop.plant.parameters])[1]
+    y = dict(zip(names(loop.plant.outputs), shown.full().ravel().tolist(), strict=True))
+    sensor = loop.sensor.start(y, loop.sensed_signal, without_prefix(value, "sensor")) if loop.sensor else []
+    seen = sensor[0] if sensor else y[loop.pid_signal.name]
+    value = dict(schedule_gains(loop, value, seen, {}, y))
+    p = np.array([float(v) for v in value.values()])
+    wanted = float(pid_reference(loop, {"reference": reference}, y[loop.feedback.name], value)["reference"])
+    v = float(uncompensated_command(loop, p, wanted, seen, command, [y[n] for n in loop.readings])[0])
+    own = [float(state) for state in loop.pid.start(wanted, seen, v, without_prefix(value, "pid"))]
+    known = Instant(0.0, wanted, seen, v, loop.pid.sample_time, {}, y)
+    others = [float(remembered) for part in loop.compensators for remembered in part.start(loop.sensed_signal, known)]
+    return np.concatenate([x, sensor, own, [reference] if loop.feedforward else [], others])
+
+
+INTEGRAL_STATE = "pid.integral"
+
+
+class WiredLoop(CommandParts, JoinedSignals, ScheduledParts, Protocol):
+    """What of a `ClosedLoop` its equilibrium depends on."""
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """The reference, then the plant's other inputs."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """The plant's, then the control."""
+        ...
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """The plant's and the controller's."""
+        ...
+
+    @property
+    def gains(self) -> ca.Function:
+        """``p -> [Kp, Ki, Kd, Tf]`` of the parallel form."""
+        ...
+
+    @property
+    def readings(self) -> tuple[str, ...]:
+        """The outputs of the plant that compensators read."""
+        ...
+
+    @property
+    def compensation(self) -> ca.Function:
+        """``(command, reference, measured, readings, p) -> compensated`` command, and its slopes."""
+        ...
+
+
+def find_rest(
+    loop: WiredLoop, parameters: ParameterSet, reference: float, start: Mapping[str, float]
+) -> tuple[Array, float]:
+    """The plant's state and the command, at rest or in steady motion.
+
+    A plant with a `rest_hook` gives them. Otherwise they are the equilibrium of plant and controller; a state that
+    neither the rates nor the measured output depend on, such as the position of an axis under speed control, is left
+    out and may keep moving.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+    reference : float
+        [unit of the measured signal]
+    start : mapping of str to float
+        What else is known of the plant.
+
+    Raises
+    ------
+    ConvergenceError
+        If there is no equilibrium.
+    InputError
+        If the plant refuses, or does not start from what `start` names.
+    """
+    plant, measured = loop.plant, loop.feedback.name
+    require(measured not in start, f"start: {measured!r} is what the loop controls; give it as initial=")
+    if plant.rest_hook is not None:
+        try:
+            rest = plant.rest_hook(parameters, {measured: reference, **start})
+        except ConvergenceError as error:
+            raise _no_rest(loop, reference, error) from None
+        return np.array([rest.states.get(n, 0.0) for n in names(plant.states)]), rest.inputs.get(loop.command.name, 0.0)
+    free = unobservable_states(plant, measured)
+    others = ", ".join(sorted(start.keys() - free))
+    require(not others, f"start: this plant cannot start from {others}, only from {', '.join(free) or 'its rest'}")
+    system = _rest_system(loop, free, parameters)
+    guess = {measured: reference} if measured in names(system.states) else {}
+    try:
+        x = system.equilibrium({"reference": reference}, parameters, guess)
+    except ConvergenceError as error:
+        raise _no_rest(loop, reference, error) from None
+    found = {**start, **dict(zip(names(system.states), x.tolist(), strict=True))}
+    u = [reference] + [0.0] * (len(system.inputs) - 1)
+    command = float(system.ode(0, x, u, parameter_vector(system.parameters, parameters))[1][-1])
+    return np.array([found.get(n, 0.0) for n in names(plant.states)]), command
+
+
+def set_sliding_direction(loop: WiredLoop, parameters: ParameterSet, reference: float) -> ParameterSet:
+    """Set the direction in which Karnopp's friction already slides where the plant moves at the start.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+        Every parameter of the loop.
+    reference : float
+        The speed so far [m/s, or rad/s].
+    """
+    if loop.feedback.name != "speed" or FRICTION_DIRECTION not in loop.parameters:
+        return parameters
+    return parameters.with_values({FRICTION_DIRECTION: float(np.sign(reference))})
+
+
+def unobservable_states(plant: System, measured: str) -> tuple[str, ...]:
+    """States on which no rate and not the measured output depends."""
+    t, x, u, p = (ca.SX.sym(k, plant.ode.size1_in(i)) for i, k in enumerate("txup"))
+    xdot, y = plant.ode(t, x, u, p)
+    what = ca.vertcat(xdot, y[names(plant.outputs).index(measured)])
+    matters = ca.which_depends(what, x, 1)
+    return tuple(n for n, counts in zip(names(plant.states), matters, strict=True) if not counts)
+
+
+def _no_rest(loop: WiredLoop, reference: float, error: ConvergenceError) -> ConvergenceError:
+    where = f"{loop.feedback.name} {reference:g} {loop.feedback.unit}"
+    message = f"the loop neither rests nor moves steadily at {where}: {error}, or give x_plant"
+    return ConvergenceError(message, error.solution)
+
+
+def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSet) -> System:
+    """The loop with the integral as its controller's only state, and without the plant's free ones."""
+    plant, acts = loop.plant, integrates(float(loop.gains(parameter_vector(loop.parameters, parameters))[1]))
+    integral = [Quantity(INTEGRAL_STATE, loop.command.unit, loop.command.nominal)] if acts else []
+    states = [*(q for q in plant.states if q.name not in free), *integral]
+
+    def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+        moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
+        shown = evaluate_plant(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1]
+        y, read = shown[loop.pid_signal.name], ca.vertcat(*(shown[n] for n in loop.readings))
+        p = schedule_gains(loop, p, y, {}, shown)
+        r = pid_reference(loop, u, shown[loop.feedback.name], p)["reference"]
+        every = ca.vertcat(*p.values())
+        gains = loop.gains(every)
+        command = gains[0] * (p["pid.b"] * r - y) + x.get(INTEGRAL_STATE, 0.0)
+        command = loop.compensation(command, r, y, read, every)[0]
+        rates, outputs = evaluate_plant(plant, loop.command.name, t, moving, u, p, command)
+        rates |= {INTEGRAL_STATE: gains[1] * (r - y)}
+        return {n: rates[n] for n in x}, outputs | {"control": command}
+
+    return define(states, loop.inputs, loop.outputs, loop.parameters, rhs)

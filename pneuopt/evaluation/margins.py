@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
-from pneuopt.control.compensation import acting_always
+from pneuopt.control.compensators import acting_always
 from pneuopt.control.linear_controller import linear_gains, pade_delay_response
 from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop

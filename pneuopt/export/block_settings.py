@@ -5,9 +5,8 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.pid import AntiWindup
+from pneuopt.control.pid import AntiWindup, Form
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.export.header import check_name, comment_text

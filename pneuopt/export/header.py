@@ -6,10 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from pneuopt.control.forms import to_series, to_standard
+from pneuopt.control.controller import LARGEST_SIGNAL
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import integrates
-from pneuopt.control.sampled import LARGEST_SIGNAL
+from pneuopt.control.pid import integrates, to_series, to_standard
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance

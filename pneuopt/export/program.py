@@ -6,17 +6,20 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from pneuopt.control.command import pid_reference
-from pneuopt.control.compensation import Compensator
+from pneuopt.control.compensators import Compensator
+from pneuopt.control.controller import (
+    Feedforward,
+    PositionLoop,
+    begin_controller,
+    controller_update,
+    pid_reference,
+    signals_are_good,
+)
 from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.gain_schedule import GainSchedule, schedule_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import BAD_SAMPLES, PID
-from pneuopt.control.position_loop import PositionLoop
-from pneuopt.control.sampled import begin_controller, controller_update, signals_are_good
-from pneuopt.control.sensor import Encoder, SensedSignal
-from pneuopt.control.sensor import Signals
+from pneuopt.control.sensor import Encoder, SensedSignal, Signals
 from pneuopt.dynamics.system import Symbols, symbols
 from pneuopt.export.identifiers import Identifiers
 from pneuopt.quantities.errors import ModelError, require

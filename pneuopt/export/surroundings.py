@@ -10,10 +10,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from pneuopt.control.compensators import MotionFeedforward
 from pneuopt.control.dither import Waveform
-from pneuopt.control.forms import ParallelForm
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.motion_feedforward import MotionFeedforward
+from pneuopt.control.pid import ParallelForm
 from pneuopt.control.reference import Reference
 from pneuopt.control.sensor import REFERENCE_SPEED, Encoder, SensorLag
 from pneuopt.export.makers.block_form import BlockForm, Design, number

@@ -13,11 +13,10 @@ import casadi as ca
 import numpy as np
 from scipy.signal import savgol_filter
 
-from pneuopt.control.command import pid_reference
-from pneuopt.control.compensation import Instant
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.compensators import Instant
+from pneuopt.control.controller import pid_reference
+from pneuopt.control.loop import ClosedLoop, unobservable_states
 from pneuopt.control.reset_integral import RESET_STATES
-from pneuopt.control.rest import unobservable_states
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Log, Start

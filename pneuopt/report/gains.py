@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from pneuopt.control.forms import ParallelForm, to_series, to_standard
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import ParallelForm, to_series, to_standard
 from pneuopt.control.reference import Reference
 from pneuopt.export.block_settings import describe_refusal
 from pneuopt.export.vendor_blocks import BLOCK_FORMS, Block

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, Step, disturbance_input
 from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.report import relevant_units

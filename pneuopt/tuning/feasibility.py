@@ -7,14 +7,13 @@ from math import inf
 
 import numpy as np
 
-from pneuopt.control.averaged_plant import is_affine
-from pneuopt.control.compensation import acting_always
-from pneuopt.control.composed_loops import ComposedLoops
+from pneuopt.control.averaging import is_affine
+from pneuopt.control.compensators import acting_always
 from pneuopt.control.dither import DITHER_AMPLITUDE
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.linear_loop import ComposedLoops
+from pneuopt.control.loop import ClosedLoop, find_rest, set_sliding_direction
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Reference, Step
-from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.counts import describe_counts, sees_speed

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pneuopt.control.compensation import acting_always
+from pneuopt.control.compensators import acting_always
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
 from pneuopt.evaluation.band import band_share

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
+from pneuopt.control.pid import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.evaluation.expected_plants import PlantAxis
 from pneuopt.evaluation.report import metric_cell, report_margins, report_metrics, report_notes
 from pneuopt.evaluation.requirements import METRICS, percent_factor

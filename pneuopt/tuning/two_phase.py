@@ -9,7 +9,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from pneuopt.control.compensation import acting_always
+from pneuopt.control.compensators import acting_always
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, Step

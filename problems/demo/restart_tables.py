@@ -30,10 +30,9 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 
 import numpy as np
 
-from pneuopt.control.forms import Form, ParallelForm, to_series, to_standard
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID, AntiWindup
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import PID, AntiWindup, Form, ParallelForm, to_series, to_standard
 from pneuopt.dynamics.system import System, discretise, names
 from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import make_header

@@ -13,9 +13,8 @@ from typing import Any, ClassVar
 import casadi as ca
 
 import pneuopt as po
-from pneuopt.control.compensation import Instant
-from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, SensedSignal
-from pneuopt.control.sensor import Signals
+from pneuopt.control.compensators import Instant
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, SensedSignal, Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.cylinder import areas, volumes

@@ -7,12 +7,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pneuopt.control.compensation import Instant
+from pneuopt.control.compensators import Instant
+from pneuopt.control.controller import Feedforward
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
+from pneuopt.control.pid import PID, Form
 from pneuopt.control.sensor import SensedSignal
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import System, define, names

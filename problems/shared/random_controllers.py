@@ -5,13 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID, AntiWindup
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import PID, AntiWindup, Form
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
 from pneuopt.export.program import controller_program

@@ -4,9 +4,8 @@ import re
 
 import pytest
 
-from pneuopt.control.forms import Form, SeriesForm, to_parallel
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID, AntiWindup
+from pneuopt.control.pid import PID, AntiWindup, Form, SeriesForm, to_parallel
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.export.block_settings import export_settings, run_as_block

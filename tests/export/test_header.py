@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from pneuopt.control.compensators import FrictionFeedforward
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.dither import Dither
-from pneuopt.control.forms import Form
-from pneuopt.control.friction_feedforward import FrictionFeedforward
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import PID, Form
 from pneuopt.export.header import comment_text, make_header
 from pneuopt.export.targets import Language, export_controller
 from pneuopt.models.drive import ForceDrive

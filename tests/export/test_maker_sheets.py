@@ -6,20 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pneuopt.control.acceleration_feedback import AccelerationFeedback
-from pneuopt.control.dead_zone_inverse import DeadZoneInverse
+from pneuopt.control.compensators import (
+    AccelerationFeedback,
+    DeadZoneInverse,
+    FrictionFeedforward,
+    ImpulsiveControl,
+    Knocker,
+    MotionFeedforward,
+    PressureFeedback,
+)
+from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.friction_feedforward import FrictionFeedforward
 from pneuopt.control.gain_schedule import GainSchedule
-from pneuopt.control.impulsive_control import ImpulsiveControl
-from pneuopt.control.knocker import Knocker
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.motion_feedforward import MotionFeedforward
 from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID, AntiWindup
-from pneuopt.control.position_loop import PositionLoop
-from pneuopt.control.pressure_feedback import PressureFeedback
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.export.block_settings import export_settings, run_as_block

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pneuopt as po
-from pneuopt.control.compensation import Instant
+from pneuopt.control.compensators import Instant
 from problems.shared.exact_linearisation import ExactLinearisation
 from problems.shared.p32 import SAMPLE_TIME, drive, fresh_plants, plants, trips
 from problems.shared.p32_margins import Margins

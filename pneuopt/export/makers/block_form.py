@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pneuopt.control.forms import ParallelForm
+from pneuopt.control.pid import ParallelForm
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.units import write_value
 

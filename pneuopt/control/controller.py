@@ -1,23 +1,239 @@
-"""`controller_update`: what a sampled controller computes at a sample, without a plant around it.
-
-A `ClosedLoop` joins it to its plant, an export writes it for another machine: there is one law.
-"""
+"""What a controller computes beside its PID, and all that it computes at a sample: one law for loops and exports."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass
+from math import inf
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import casadi as ca
 
-from pneuopt.control.command import CommandParts, added_command, added_terms, pid_reference
-from pneuopt.control.compensation import Instant
-from pneuopt.control.forms import Form, parallel_gains
+from pneuopt.control.compensators import Compensator, Instant, compensate
+from pneuopt.control.dither import Dither
 from pneuopt.control.gain_schedule import GainSchedule, schedule_gains
-from pneuopt.control.pid import BAD_SAMPLES
+from pneuopt.control.pid import BAD_SAMPLES, PID, Form, parallel_gains
 from pneuopt.control.reset_integral import reset_integral
-from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag
-from pneuopt.control.sensor import Signals
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag, Signals
 from pneuopt.dynamics.system import Symbols
-from pneuopt.quantities.parameters import Quantity, with_prefix, without_prefix
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, with_prefix, without_prefix
+from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
+
+MIN_FEEDFORWARD_TIME = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast leads are refused
+
+
+@dataclass(frozen=True)
+class Feedforward:
+    """A set-point lead: ``u_ff = gain (r - r_f)``, ``d(r_f)/dt = (r - r_f)/time``, added to the PID's command.
+
+    A step R of the reference adds ``gain R e^(-t/time)``: a push that the controller need not wait for its error's
+    integral to give. It sees the reference alone, so the loop's margins do not change, and at rest it adds nothing.
+
+    With a sampled PID it is computed with it, h = `PID.sample_time` (backward Euler, the suffix _ marks the previous
+    sample): ``r_f = (time r_f_ + h r)/(time + h)``.
+
+    Parameters
+    ----------
+    time : float
+        Default of the parameter "feedforward.time" [s].
+    """
+
+    time: float = 0.05
+
+    def __post_init__(self) -> None:
+        require(
+            MIN_FEEDFORWARD_TIME <= self.time < inf,
+            f"Feedforward: time must be at least {MIN_FEEDFORWARD_TIME:g} s, got {self.time:g} s",
+        )
+
+    def parameters(self, input_unit: str, output_unit: str) -> ParameterSet:
+        """The gain [output_unit/input_unit], zero by default, and the time [s].
+
+        Examples
+        --------
+        >>> [(n, p.unit) for n, p in Feedforward().parameters("m/s", "V").items()]
+        [('gain', 'V*s/m'), ('time', 's')]
+        """
+        gain = Parameter(
+            0.0, unit_ratio(output_unit, input_unit), meaning="command per jump of the reference, which decays again"
+        )
+        return ParameterSet(
+            {
+                "gain": gain,
+                "time": Parameter(self.time, "s", lower=MIN_FEEDFORWARD_TIME, meaning="time constant of that decay"),
+            }
+        )
+
+    def states(self, measured: Quantity) -> tuple[Quantity, ...]:
+        """The filtered reference r_f, as "filter"."""
+        return (Quantity("filter", measured.unit, measured.nominal),)
+
+    def rates(self, x: Symbols, r: ca.SX, p: Symbols) -> tuple[dict[str, ca.SX], ca.SX]:
+        """The continuous law: d(r_f)/dt, and u_ff [output unit]."""
+        lead = r - x["filter"]
+        return {"filter": lead / p["time"]}, p["gain"] * lead
+
+    def update(self, x: Symbols, r: ca.SX, p: Symbols, elapsed: ca.SX | float) -> tuple[dict[str, ca.SX], ca.SX]:
+        """The sampled law at a sample, `elapsed` [s] after the last good one: the next r_f, and u_ff [output unit]."""
+        slow = (p["time"] * x["filter"] + elapsed * r) / (p["time"] + elapsed)
+        return {"filter": slow}, p["gain"] * (r - slow)
+
+
+POSITION_GAIN = 10.0  # [1/s] default: a small one creeps in, one near the speed loop's own bandwidth swings
+
+
+@dataclass(frozen=True)
+class PositionLoop:
+    """``v_r = Kp (r - y) + weight reference_speed``: the reference of the speed that the PID then controls.
+
+    r and y are the position wanted and the position measured. With a weight of 1 a motion at constant speed is followed
+    without an error, with 0 it trails by its speed over Kp. It has no integral: that of a PI of the speed lets no error
+    rest, and two integrals in series swing. It is proportional, so there is nothing to start, and nothing to wind up
+    beside the PID's integral.
+
+    K. J. Åström and T. Hägglund, Advanced PID Control, ISA 2006, section 12.4 (cascade control).
+    """
+
+    section: ClassVar[str] = "position_loop"
+
+    def parameters(self, position_unit: str, speed_unit: str) -> ParameterSet:
+        """The gain [1/s] and the weight of the reference's speed [1].
+
+        Examples
+        --------
+        >>> [(n, p.value, p.unit) for n, p in PositionLoop().parameters("m", "m/s").items()]
+        [('Kp', 10.0, '1/s'), ('weight', 1.0, '1')]
+        """
+        gain = unit_ratio(speed_unit, difference_unit(position_unit))
+        return ParameterSet(
+            {
+                "Kp": Parameter(POSITION_GAIN, gain, lower=0.0, meaning="speed per error of the position"),
+                "weight": Parameter(1.0, "1", lower=0.0, meaning="weight of the reference's speed"),
+            }
+        )
+
+    def set_point(self, reference: Any, speed: Any, position: Any, p: Any) -> Any:
+        """The PID's reference v_r, from the reference, its speed, the position measured and the own parameters."""
+        return p["Kp"] * (reference - position) + p["weight"] * speed
+
+
+ERROR = "error"
+"""Beside the inputs of a cascade's inner controller: the error of the outer one."""
+
+
+class CommandParts(Protocol):
+    """The parts of a `ClosedLoop` that make its command."""
+
+    @property
+    def pid(self) -> PID:
+        """The controller, which says whether the parts are sampled."""
+        ...
+
+    @property
+    def dither(self) -> Dither | None:
+        """The last to add."""
+        ...
+
+    @property
+    def feedforward(self) -> Feedforward | None:
+        """The first to add."""
+        ...
+
+    @property
+    def compensators(self) -> tuple[Compensator, ...]:
+        """They add between the two."""
+        ...
+
+    @property
+    def outer(self) -> PositionLoop | None:
+        """The outer loop of a cascade."""
+        ...
+
+
+def pid_reference(parts: CommandParts, u: Mapping[str, Any], position: Any, p: Mapping[str, Any]) -> dict[str, Any]:
+    """The inputs as the PID and its compensators see them: a cascade's reference is a speed, and `ERROR` a position's.
+
+    Parameters
+    ----------
+    parts : ClosedLoop
+    u, p : mapping of str to casadi.SX
+        The loop's inputs and parameters.
+    position : casadi.SX
+        What the loop is judged by, as the controller sees it.
+    """
+    if parts.outer is None:
+        return dict(u)
+    own = without_prefix(p, parts.outer.section)
+    speed = parts.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, own)
+    return {**u, "reference": speed, ERROR: u["reference"] - position}
+
+
+def added_command(
+    parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
+) -> tuple[Signals, ca.SX]:
+    """What feedforward, compensators and dither, in this order, add to the PID's command.
+
+    Parameters
+    ----------
+    parts : ClosedLoop
+    t : casadi.SX
+    x, u, p : mapping of str to casadi.SX
+        The loop's states, inputs as `pid_reference` gives them, and parameters.
+    measured : casadi.SX
+        The measured signal, as the controller sees it.
+    y : mapping of str to casadi.SX
+        The plant's outputs that compensators read.
+
+    Returns
+    -------
+    moved : dict
+        The rates of the parts' states, or with a sampled PID their next values.
+    added : casadi.SX
+        [the command's unit]
+    """
+    moved, terms = added_terms(parts, t, x, u, measured, y, p)
+    return moved, terms["dither"] + (terms["feedforward"] + terms["compensation"])
+
+
+def added_terms(
+    parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
+) -> tuple[Signals, Signals]:
+    """The terms of `added_command`, "feedforward", "compensation" and "dither", in place of their sum."""
+    moved, lead = _feedforward_terms(parts, x, u, p)
+    bent = ca.SX(0)
+    if parts.compensators:
+        v = parts.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
+        rates = {n: u[n] for n in (REFERENCE_SPEED, REFERENCE_ACCELERATION) if n in u}
+        error = u.get(ERROR, u["reference"] - measured)
+        h = parts.pid.sample_time
+        seen = Instant(t, u["reference"], measured, v + lead, h, rates, y, error, _elapsed_time(parts, x))
+        own, bent = compensate(parts.compensators, seen, x, p)
+        moved = moved | own
+    return moved, {"feedforward": lead, "compensation": bent, "dither": _dither_command(parts, t, p)}
+
+
+def _dither_command(parts: CommandParts, t: ca.SX, p: Symbols) -> ca.SX:
+    """What the controller itself adds."""
+    if parts.dither is None:
+        return ca.SX(0)
+    own = without_prefix(p, "dither")
+    sampled_apart = parts.dither.analogue and parts.pid.sample_time is not None
+    return own["offset"] if sampled_apart else own["offset"] + parts.dither.wave(t, own)
+
+
+def _feedforward_terms(parts: CommandParts, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    """The feedforward's state, its rate or with a sampled PID its next value, and what it adds to the command."""
+    if parts.feedforward is None:
+        return {}, ca.SX(0)
+    own = (without_prefix(x, "feedforward"), u["reference"], without_prefix(p, "feedforward"))
+    elapsed = _elapsed_time(parts, x)
+    moved, added = parts.feedforward.rates(*own) if elapsed is None else parts.feedforward.update(*own, elapsed)
+    return with_prefix(moved, "feedforward"), added
+
+
+def _elapsed_time(parts: CommandParts, x: Symbols) -> ca.SX | float | None:
+    """The time since the last good sample [s]; None of a continuous PID."""
+    return None if parts.pid.sample_time is None else parts.pid.elapsed_time(without_prefix(x, "pid"))
+
 
 LARGEST_SIGNAL = 1e30
 """A signal beyond it, or that compares with nothing, is no number: larger than any reading, a literal everywhere."""
