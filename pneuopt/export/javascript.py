@@ -11,7 +11,7 @@ import casadi as ca
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import FRICTION_DIRECTION
-from pneuopt.export.expression_writer import (
+from pneuopt.export.writer import (
     ARITHMETIC,
     COMPARED,
     SELECT,

@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from pneuopt.export.expression_writer import Assignment, Names, Syntax, write_expressions
 from pneuopt.export.identifiers import Identifiers
 from pneuopt.export.program import C_NAMES, ControllerProgram
+from pneuopt.export.writer import Assignment, Names, Syntax, write_expressions
 
 
 @dataclass(frozen=True)

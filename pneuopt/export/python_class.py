@@ -4,10 +4,10 @@ import textwrap
 
 import casadi as ca
 
-from pneuopt.export.expression_writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix, unary_calls
 from pneuopt.export.header import Header, comment_text
 from pneuopt.export.page import Places, write_page
 from pneuopt.export.program import CENTRE, ControllerProgram, Variable
+from pneuopt.export.writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix, unary_calls
 
 PYTHON = Syntax(
     {

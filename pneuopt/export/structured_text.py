@@ -9,10 +9,10 @@ import textwrap
 
 import casadi as ca
 
-from pneuopt.export.expression_writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix
 from pneuopt.export.header import Header, comment_text
 from pneuopt.export.page import Places, write_page
 from pneuopt.export.program import ControllerProgram, Variable
+from pneuopt.export.writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix
 from pneuopt.quantities.errors import require
 
 _WHOLE = "LINT_TO_LREAL(LREAL_TO_LINT({0}))"

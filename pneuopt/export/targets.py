@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import Header, make_header
 from pneuopt.export.identifiers import RESERVED_FILES, Identifiers, reserved_as
+from pneuopt.export.languages import write_c99
 from pneuopt.export.program import ControllerProgram, controller_program
 from pneuopt.export.python_class import write_python
 from pneuopt.export.reference_run import make_reference_run

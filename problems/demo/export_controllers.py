@@ -33,8 +33,8 @@ import numpy as np
 
 import pneuopt as po
 from pneuopt.export.block_settings import run_as_block
-from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import make_header
+from pneuopt.export.languages import write_c99
 from pneuopt.export.program import controller_program
 from pneuopt.export.python_class import write_python
 from pneuopt.export.reference_run import ReferenceRun, make_reference_run

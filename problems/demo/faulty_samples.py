@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
-from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import make_header
+from pneuopt.export.languages import write_c99
 from pneuopt.export.program import SAMPLE, ControllerProgram, controller_program
 from pneuopt.export.python_class import write_python
 from pneuopt.export.reference_run import make_reference_run

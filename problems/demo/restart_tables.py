@@ -34,8 +34,8 @@ from pneuopt.control.controller import PositionLoop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, AntiWindup, Form, ParallelForm, to_series, to_standard
 from pneuopt.dynamics.system import System, discretise, names
-from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import make_header
+from pneuopt.export.languages import write_c99
 from pneuopt.export.program import ControllerProgram, controller_program
 from pneuopt.export.python_class import write_python
 from pneuopt.export.reference_run import make_reference_run

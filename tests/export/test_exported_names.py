@@ -10,15 +10,15 @@ import pytest
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.export.c99 import C99
-from pneuopt.export.expression_writer import Syntax
 from pneuopt.export.header import make_header
 from pneuopt.export.identifiers import RESERVED
 from pneuopt.export.javascript import JAVASCRIPT, write_loop_javascript
+from pneuopt.export.languages import C99
 from pneuopt.export.program import controller_program
 from pneuopt.export.python_class import PYTHON
 from pneuopt.export.structured_text import STRUCTURED_TEXT, write_structured_text
 from pneuopt.export.targets import Language, export_controller
+from pneuopt.export.writer import Syntax
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from problems.demo.export_controllers import files_of

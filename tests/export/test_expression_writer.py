@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pneuopt.export.expression_writer import Names, Written, write_expressions
 from pneuopt.export.python_class import PYTHON
+from pneuopt.export.writer import Names, Written, write_expressions
 
 a, b, c = (ca.SX.sym(n) for n in "abc")
 EXPRESSIONS = [

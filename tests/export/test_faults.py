@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pneuopt.dynamics.system import names
-from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import make_header
 from pneuopt.export.javascript import write_loop_javascript
+from pneuopt.export.languages import write_c99
 from pneuopt.export.python_class import write_python
 from pneuopt.export.reference_run import make_reference_run
 from pneuopt.export.structured_text import write_structured_text

@@ -10,8 +10,8 @@ import pytest
 
 from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.pid import AntiWindup
-from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import make_header
+from pneuopt.export.languages import write_c99
 from pneuopt.export.program import controller_program
 from pneuopt.export.python_class import write_python
 from pneuopt.export.reference_run import ReferenceRun

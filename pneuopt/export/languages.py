@@ -4,11 +4,11 @@ import math
 
 import casadi as ca
 
-from pneuopt.export.expression_writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix, unary_calls
 from pneuopt.export.header import Header, comment_text
 from pneuopt.export.page import Page, Places, write_page
 from pneuopt.export.program import CENTRE, ControllerProgram, Variable
 from pneuopt.export.reference_run import RUN_TOLERANCE, ReferenceRun
+from pneuopt.export.writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix, unary_calls
 
 C99 = Syntax(
     {
