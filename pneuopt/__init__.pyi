@@ -79,10 +79,10 @@ from .evaluation.rest_check import NoHunting, RestCase, RestCheck, RestKind, che
 from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.sampling import Sampling
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
-from .export.block_settings import export_settings
+from .export.blocks import export_settings
 from .export.fmu import export_fmu
-from .export.targets import Language, export_controller
-from .export.vendor_blocks import Block
+from .export.languages import Language, export_controller
+from .export.makers import Block
 from .files.drive import read_drive, write_fit
 from .files.path import read_path
 from .files.results import load_result

@@ -7,16 +7,26 @@ result by a rounding.
 """
 
 import math
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 
+from pneuopt.control.controller import LARGEST_SIGNAL
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import integrates, to_series, to_standard
 from pneuopt.dynamics.compiled.c_writer import DIVISIONS, Instruction, read_instructions
 from pneuopt.export.identifiers import Identifiers
+from pneuopt.export.program import C_NAMES, ControllerProgram
+from pneuopt.quantities.errors import InputError, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.provenance import provenance
+from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
+from pneuopt.quantities.units import write_value
 
 MAX_INLINE = 70
 """Length of an expression that stands within another [character]: a longer one gets a name of its own; below some 40
@@ -40,7 +50,7 @@ class Binding(IntEnum):
     ATOM = 7
 
 
-class Form(NamedTuple):
+class OperationSyntax(NamedTuple):
     """How a language words an operation: a template with {0}, {1}, {2}, how tightly it and its operands bind."""
 
     template: str
@@ -51,28 +61,30 @@ class Form(NamedTuple):
 _LEFT_TO_RIGHT = {Binding.SUM: Binding.PRODUCT, Binding.PRODUCT: Binding.ATOM, Binding.COMPARISON: Binding.SUM}
 
 
-def infix(sign: str, binding: Binding) -> Form:
+def infix(sign: str, binding: Binding) -> OperationSyntax:
     """An operation between its two operands, read from left to right."""
     tighter = _LEFT_TO_RIGHT.get(binding, Binding.ATOM)
-    return Form(f"{{0}} {sign} {{1}}", binding, (tighter if binding is Binding.COMPARISON else binding, tighter))
+    return OperationSyntax(
+        f"{{0}} {sign} {{1}}", binding, (tighter if binding is Binding.COMPARISON else binding, tighter)
+    )
 
 
-def unary_calls(names: str, template: str = "{}") -> dict[int, Form]:
+def unary_calls(names: str, template: str = "{}") -> dict[int, OperationSyntax]:
     """Functions of one argument that a language calls as CasADi does, but for the template around the name."""
-    return {getattr(ca, f"OP_{n.upper()}"): Form(f"{template.format(n)}({{0}})") for n in names.split()}
+    return {getattr(ca, f"OP_{n.upper()}"): OperationSyntax(f"{template.format(n)}({{0}})") for n in names.split()}
 
 
 COMPARED = (Binding.COMPARISON, Binding.COMPARISON)  # what "and" and "or" need of their operands
-ARITHMETIC: Mapping[int, Form] = {
-    ca.OP_ASSIGN: Form("{0}"),
+ARITHMETIC: Mapping[int, OperationSyntax] = {
+    ca.OP_ASSIGN: OperationSyntax("{0}"),
     ca.OP_ADD: infix("+", Binding.SUM),
     ca.OP_SUB: infix("-", Binding.SUM),
     ca.OP_MUL: infix("*", Binding.PRODUCT),
     ca.OP_DIV: infix("/", Binding.PRODUCT),
-    ca.OP_NEG: Form("-{0}", Binding.SUM, (Binding.ATOM,)),
-    ca.OP_SQ: Form("{0} * {0}", Binding.PRODUCT, (Binding.ATOM,)),
-    ca.OP_TWICE: Form("2.0 * {0}", Binding.PRODUCT, (Binding.ATOM,)),
-    ca.OP_INV: Form("1.0 / {0}", Binding.PRODUCT, (Binding.ATOM,)),
+    ca.OP_NEG: OperationSyntax("-{0}", Binding.SUM, (Binding.ATOM,)),
+    ca.OP_SQ: OperationSyntax("{0} * {0}", Binding.PRODUCT, (Binding.ATOM,)),
+    ca.OP_TWICE: OperationSyntax("2.0 * {0}", Binding.PRODUCT, (Binding.ATOM,)),
+    ca.OP_INV: OperationSyntax("1.0 / {0}", Binding.PRODUCT, (Binding.ATOM,)),
     ca.OP_LT: infix("<", Binding.COMPARISON),
     ca.OP_LE: infix("<=", Binding.COMPARISON),
 }
@@ -85,20 +97,20 @@ class Syntax:
 
     Attributes
     ----------
-    forms : mapping of int to Form
+    forms : mapping of int to OperationSyntax
         By CasADi's operation, and `SELECT`.
     infinity : str
         A number larger than all others.
-    truth : Form
+    truth : OperationSyntax
         1 where a condition holds, else 0.
-    condition : Form
+    condition : OperationSyntax
         Whether a number is not 0.
     """
 
-    forms: Mapping[int, Form]
+    forms: Mapping[int, OperationSyntax]
     infinity: str
-    truth: Form
-    condition: Form
+    truth: OperationSyntax
+    condition: OperationSyntax
 
     def literal(self, value: float) -> str:
         """A number that reads back as the same double."""
@@ -183,7 +195,7 @@ def write_expressions(function: ca.Function, names: Names, syntax: Syntax) -> Wr
 
     Examples
     --------
-    >>> from pneuopt.export.python_class import PYTHON
+    >>> from pneuopt.export.languages import PYTHON
     >>> x, T = ca.SX.sym("x"), ca.SX.sym("T")
     >>> f = ca.Function("f", [x, T], [2 / T * (x - 1)])
     >>> found = write_expressions(f, Names([["x"], ["T"]], ["y"], parameters=frozenset({"T"})), PYTHON)
@@ -304,7 +316,7 @@ class _Writer:
         value = self.values[place]
         return value if value.is_condition else self._wrap(self.syntax.condition, value, True)
 
-    def _wrap(self, form: Form, value: _Value, is_condition: bool) -> _Value:
+    def _wrap(self, form: OperationSyntax, value: _Value, is_condition: bool) -> _Value:
         text = value.text if value.binding >= form.needs[0] else f"({value.text})"
         return _Value(form.template.format(text), form.binding, is_condition, value.varies)
 
@@ -348,3 +360,266 @@ def _before_jumps(instructions: list[Instruction]) -> set[int]:
         ):
             found |= set(i.sources)
     return found
+
+
+@dataclass(frozen=True)
+class Places:
+    """How a language reaches the numbers of a block; {} stands for the name.
+
+    Attributes
+    ----------
+    parameter, state, coefficient : str
+    """
+
+    parameter: str = "{}"
+    state: str = "{}"
+    coefficient: str = "{}"
+
+
+@dataclass(frozen=True)
+class Page:
+    """A program in one language.
+
+    Attributes
+    ----------
+    coefficients : tuple of Assignment
+        What is computed when parameters are set.
+    start : tuple of Assignment
+        The first states, each once, after `start_locals`.
+    start_locals, locals : tuple of Assignment
+        Values on the way.
+    outputs, states : mapping of str to str
+        What each becomes, in terms of the locals; no state is read here that has been written. A flag's is a condition.
+    operations : frozenset of int
+        CasADi's operations in all of them.
+    """
+
+    coefficients: tuple[Assignment, ...]
+    start_locals: tuple[Assignment, ...]
+    start: tuple[Assignment, ...]
+    locals: tuple[Assignment, ...]
+    outputs: Mapping[str, str]
+    states: Mapping[str, str]
+    operations: frozenset[int]
+
+
+def write_page(program: ControllerProgram, syntax: Syntax, places: Places, taken: Iterable[str] = ()) -> Page:
+    """Word a program in a language; no value on the way has a name of the program or one that is `taken`."""
+    parameters = [places.parameter.format(v.name) for v in program.parameters]
+    inputs, states = [v.name for v in program.inputs], [v.name for v in program.states]
+    outputs, known = [v.name for v in program.outputs], frozenset(parameters)
+    used = [*program.names, *C_NAMES, *taken]
+    free = Identifiers(used)
+    first, after = ([free.claim(f"{n}_{what}") for n in states] for what in ("first", "next"))
+    now = [free.claim(f"{n}_now") for n in outputs]
+    used += [*first, *after, *now]
+    given = [[v.name for v in program.start_inputs], parameters]
+    begin = Names(given, first, (), frozenset(), program.constants, taken=frozenset(used))
+    started = write_expressions(program.start, begin, syntax)
+    used += [a.name for a in (*started.coefficients, *started.statements)]
+    names = Names(
+        [inputs, [places.state.format(n) for n in states], parameters],
+        [*now, *after],
+        program.terms,
+        known,
+        program.constants,
+        places.coefficient,
+        frozenset(used),
+    )
+    step = write_expressions(program.step, names, syntax)
+    own = [*step.statements]
+    found: dict[str, str] = {}
+    local = {a.name for a in own} | set(inputs)
+    for name, text in step.results.items():
+        if text not in local:
+            own.append(Assignment(name, text))
+        found[name] = text if text in local else name
+    return Page(
+        tuple(step.coefficients),
+        (*started.coefficients, *started.statements),
+        tuple(Assignment(n, started.results[begun]) for n, begun in zip(states, first, strict=True)),
+        tuple(own),
+        {v.name: found[made] + (" > 0.0" if v.is_flag else "") for v, made in zip(program.outputs, now, strict=True)},
+        {n: found[made] for n, made in zip(states, after, strict=True)},
+        frozenset(started.operations | step.operations),
+    )
+
+
+MAX_BLOCK_NAME = 40
+"""Length of a block's name [character]: some controllers cut longer ones."""
+_COMMENT_MARKS = re.compile(r"\*/|/\*|\(\*|\*\)|//|\"\"\"|'''|\?\?|\\|<!|--|\$")
+MAX_COMMENT = 200
+"""Length of a text that comes from a file [character]: longer ones fill the header with another's words."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """The lines on top of a file.
+
+    Attributes
+    ----------
+    name : str
+        Of the block, structure or class.
+    lines : tuple of str
+        Plain text, which no comment of C, structured text or Python ends in.
+    """
+
+    name: str
+    lines: tuple[str, ...] = field(default=())
+
+    @property
+    def own_names(self) -> tuple[str, ...]:
+        """What the files call the block and what belongs to it."""
+        parts = ("parameters", "tuned", "prepare", "start", "step", "test", "h")
+        return (self.name, *(f"{self.name}_{part}" for part in parts))
+
+
+def comment_text(text: str) -> str:
+    r"""A text that cannot end a comment: one line of printable ASCII, without the marks of comments.
+
+    Examples
+    --------
+    >>> comment_text("a */ system(1); *) b \\\n c")
+    'a * / system(1); * ) b c'
+    """
+    plain = "".join(c if c.isprintable() and c.isascii() else " " for c in text[:MAX_COMMENT])
+    while _COMMENT_MARKS.search(plain):
+        plain = _COMMENT_MARKS.sub(lambda mark: " ".join(mark[0]).replace("\\", "").replace("$", ""), plain)
+    return " ".join(plain.split())
+
+
+def check_name(name: str) -> None:
+    """Refuse a name that is no identifier in C, structured text and Python: `InputError`."""
+    proper = re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) is not None
+    told = "letters, digits and single underscores between them, a letter first"
+    require(
+        proper and len(name) <= MAX_BLOCK_NAME, f"--name {name!r}: a block's name has {told}, {MAX_BLOCK_NAME} at most"
+    )
+
+
+def make_header(name: str, loop: ClosedLoop, parameters: ParameterSet, centre: float, origin: Sequence[str]) -> Header:
+    """The header of a controller: where it comes from, its sample time, its gains in every form, what to mind.
+
+    Parameters
+    ----------
+    name : str
+    loop : ClosedLoop
+    parameters : ParameterSet
+    centre : float
+        Of the valve [the command's unit].
+    origin : sequence of str
+        Sentences on where the gains come from; they may hold any text.
+
+    Raises
+    ------
+    InputError
+        If the name is no identifier.
+    """
+    check_name(name)
+    h, signal = loop.pid.sample_time or 0.0, loop.feedback
+    lines = [
+        f"{name}: sampled PID controller of the {signal.name}, written by pneuopt {provenance()['pneuopt']}",
+        *origin,
+        "",
+    ]
+    lines += [
+        f"Sample time: {write_value(h, 's')}. Call it once a sample, at equal times; the gains hold for no other."
+    ]
+    of = f" of the inner loop, which controls the {loop.pid_signal.name}" if loop.outer else ""
+    lines += ["Numbers are in SI units, as marked.", "", f"Gains{of}, in every form that controllers take:"]
+    lines += [*_gain_lines(loop, parameters), *_part_lines(loop, parameters), "", *_notes(loop, parameters, centre)]
+    return Header(name, tuple(map(comment_text, lines)))
+
+
+def _gain_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
+    """The gains in the parallel, standard and series forms."""
+    gains, gain = loop.parallel_form(parameters), unit_ratio(loop.command.unit, loop.pid_signal.unit)
+    units = {"Kp": gain, "K": gain, "Ti": "s", "Td": "s", "Tf": "s", "N": ""}
+    units["Ki"] = unit_ratio(loop.command.unit, f"{difference_unit(loop.pid_signal.unit)}*s")
+    units["Kd"] = unit_ratio(f"{difference_unit(loop.command.unit)}*s", loop.pid_signal.unit)
+
+    def line(name: str, convert: Callable[[], Any], formula: str) -> str:
+        try:
+            found = vars(convert())
+        except InputError as reason:
+            return f"- {name}: none ({reason})"
+        without = {"N", "Tf"} if gains.Kd == 0 else set()
+        shown = [f"{n} = {v:.9g} {units[n]}".rstrip() if math.isfinite(v) else f"{n} = none" for n, v in found.items()]
+        return f"- {name}: {', '.join(s for s in shown if s.partition(' ')[0] not in without)}; {formula}"
+
+    return [
+        line("parallel", lambda: gains, "Kp + Ki/s + Kd s/(Tf s + 1)"),
+        line("standard", lambda: to_standard(gains), "Kp (1 + 1/(Ti s) + Td s/(1 + s Td/N)), N a ratio"),
+        line("series", lambda: to_series(gains), "K (1 + 1/(Ti s)) (1 + Td s/(Tf s + 1))"),
+    ]
+
+
+def _part_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
+    """The parts beside the PID, each with its parameters, in the loop's order."""
+    complete, parts = loop.complete(parameters), dict[str, list[str]]()
+    for n in (n for n in loop.parameters if n not in loop.plant.parameters):
+        section, _, name = n.partition(".")
+        parts.setdefault(section, []).append(f"{name} = {write_value(complete.value(n), complete[n].unit)}")
+    parts.pop("pid", None)
+    lines = [f"- {section}: {', '.join(values)}" for section, values in parts.items()]
+    return ["", "Parts beside it, which belong to the design as much as its gains:", *lines] if lines else []
+
+
+def _notes(loop: ClosedLoop, parameters: ParameterSet, centre: float) -> list[str]:
+    """What the hardware around the block has to do."""
+    value = dict(zip(loop.parameters, loop.parameter_vector(parameters).tolist(), strict=True))
+    notes, unit = list[str](), loop.command.unit
+    if centre:
+        notes += [f"The output is {write_value(centre, unit)}, where the valve is closed, plus the command."]
+    if loop.pid.limits and all(math.isfinite(value[n]) for n in ("pid.lower", "pid.upper")):
+        low, high = (write_value(value[n] + centre, unit) for n in ("pid.lower", "pid.upper"))
+        about = "; lower and upper count from the centre" if centre else ""
+        notes += [f"The output runs from {low} to {high}{about}."]
+    notes += [*_start_notes(loop, parameters, value), *_fault_notes(loop, value, centre)]
+    if loop.pid.delay:
+        notes += ["The design counts on one sample from reading to acting."]
+    if loop.dither is not None and loop.dither.analogue:
+        size, frequency = write_value(value["dither.amplitude"], loop.command.unit), value["dither.frequency"]
+        shape = loop.dither.waveform.value
+        notes += [
+            f"A generator behind the block adds a {shape} of {size} peak at {frequency:.9g} Hz; it is not in here."
+        ]
+    if loop.schedule is not None:
+        told = " and with the load told, schedule_load" if loop.schedule.load is not None else ""
+        gains = ", ".join(loop.schedule.gains)
+        notes += [
+            f"Scheduled with the position{told}: {gains}. The gains above hold in the middle, at the nominal load."
+        ]
+    if loop.sensor is not None:
+        notes += [f"Designed behind a sensor: {loop.sensor!r}."]
+    if loop.pid.limits and math.isinf(value["pid.lower"]) and math.isinf(value["pid.upper"]):
+        notes += ["The output has no limits; set lower and upper."]
+    return notes
+
+
+def _start_notes(loop: ClosedLoop, parameters: ParameterSet, value: Mapping[str, float]) -> list[str]:
+    """What a start does with the output so far, and why."""
+    time = write_value(float(loop.pid.emptying_time({n.removeprefix("pid."): v for n, v in value.items()})), "s")
+    if not integrates(loop.parallel_form(parameters).Ki):
+        return [
+            "A start, or restart, does not make the output jump: the output so far passes to the controller's own",
+            f"with a time constant of {time}. Without an integral gain nothing is kept there, at a limit neither.",
+        ]
+    return [
+        "A start, or restart, does not make the output jump, and does not leave the axis waiting for a slow integral:",
+        f"the setpoint counts as if it moved from the measurement to its value with a time constant of {time}.",
+    ]
+
+
+def _fault_notes(loop: ClosedLoop, value: Mapping[str, float], centre: float) -> list[str]:
+    """What happens at a sample that is no number, after how many, and how the controller recovers."""
+    count, h = math.ceil(value["pid.fault_samples"]), loop.pid.sample_time or 0.0
+    inside = min(max(value["pid.fault_output"], value.get("pid.lower", -math.inf)), value.get("pid.upper", math.inf))
+    safe, time = write_value(inside + centre, loop.command.unit), write_value(count * h, "s", 3)
+    return [
+        f"A sample is bad where an input is no number, or larger than {LARGEST_SIGNAL:g}: the output stays as it was,",
+        "fault is set, and the next good sample goes on from there, its differences taken over the whole gap.",
+        f"After {count} bad samples in a row (fault_samples), {time}, the output goes to {safe} (fault_output); "
+        "the next good sample then begins anew from it, as at a start.",
+        "Where the first sample is bad, the output is the safe one until a good sample begins.",
+    ]

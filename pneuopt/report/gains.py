@@ -7,8 +7,8 @@ from pathlib import Path
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import ParallelForm, to_series, to_standard
 from pneuopt.control.reference import Reference
-from pneuopt.export.block_settings import describe_refusal
-from pneuopt.export.vendor_blocks import BLOCK_FORMS, Block
+from pneuopt.export.blocks import describe_refusal
+from pneuopt.export.makers import BLOCK_FORMS, Block
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Line, Report, Table, text_columns

@@ -32,13 +32,10 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.export.block_settings import run_as_block
-from pneuopt.export.header import make_header
-from pneuopt.export.languages import write_c99
+from pneuopt.export.blocks import run_as_block
+from pneuopt.export.languages import ReferenceRun, make_reference_run, write_c99, write_python, write_structured_text
 from pneuopt.export.program import controller_program
-from pneuopt.export.python_class import write_python
-from pneuopt.export.reference_run import ReferenceRun, make_reference_run
-from pneuopt.export.structured_text import write_structured_text
+from pneuopt.export.writer import make_header
 from problems.shared.claims import Claim, arguments, finish, frame
 from problems.shared.random_controllers import COUNT, Run, run_library
 from problems.shared.structured_text_run import FunctionBlock

@@ -30,12 +30,9 @@ from numpy.typing import NDArray
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
-from pneuopt.export.header import make_header
-from pneuopt.export.languages import write_c99
+from pneuopt.export.languages import make_reference_run, write_c99, write_python, write_structured_text
 from pneuopt.export.program import SAMPLE, ControllerProgram, controller_program
-from pneuopt.export.python_class import write_python
-from pneuopt.export.reference_run import make_reference_run
-from pneuopt.export.structured_text import write_structured_text
+from pneuopt.export.writer import make_header
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from problems.shared.claims import Claim, arguments, finish, frame

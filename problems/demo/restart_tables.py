@@ -34,12 +34,9 @@ from pneuopt.control.controller import PositionLoop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, AntiWindup, Form, ParallelForm, to_series, to_standard
 from pneuopt.dynamics.system import System, discretise, names
-from pneuopt.export.header import make_header
-from pneuopt.export.languages import write_c99
+from pneuopt.export.languages import make_reference_run, write_c99, write_python, write_structured_text
 from pneuopt.export.program import ControllerProgram, controller_program
-from pneuopt.export.python_class import write_python
-from pneuopt.export.reference_run import make_reference_run
-from pneuopt.export.structured_text import write_structured_text
+from pneuopt.export.writer import make_header
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive

@@ -9,8 +9,8 @@ from pneuopt.control.compensators import DeadZoneInverse
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.export.block_settings import describe_refusal, export_settings
-from pneuopt.export.vendor_blocks import Block
+from pneuopt.export.blocks import describe_refusal, export_settings
+from pneuopt.export.makers import Block
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.report.gains import EXPORTS, report_exports

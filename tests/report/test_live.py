@@ -19,7 +19,7 @@ from pneuopt.control.sensor import SensorLag
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.response import loop_inputs, sample_spacing
-from pneuopt.export.javascript import write_loop_javascript
+from pneuopt.export.languages import write_loop_javascript
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive
