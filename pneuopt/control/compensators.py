@@ -4,7 +4,7 @@ They act in the order in which the loop has them, each on the command of those b
 dither and clip: what they add counts for the limits, and back-calculation unwinds it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from math import inf
@@ -12,25 +12,19 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import casadi as ca
-import numpy as np
-from numpy.typing import ArrayLike
 
-from pneuopt.control.dither import DITHER_OFFSET
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, SensedSignal, Signals
 from pneuopt.dynamics.hooks import Axis
-from pneuopt.dynamics.system import Symbols, stack
-from pneuopt.quantities.arrays import Array
+from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, with_prefix, without_prefix
 from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
 
 LEAST_SMOOTHING = 1e-9  # [any unit] of a smooth sign: at zero it would jump, and a rest has no derivative
-MAX_BISECTIONS = 120  # halvings of a bracket: fewer than some 60 leave digits of a double, more cost time
-MAX_DOUBLINGS = 60  # of a bracket from 1 [command's unit] on: fewer than some 20 miss large commands
 
 
 @dataclass(frozen=True)
-class Instant:
+class ControllerSnapshot:
     """What a compensator sees: the time [s], reference and measured signal, and the command so far.
 
     `sample_time` [s] is the controller's, None of a continuous one. `rates` are the motion inputs that the part asks
@@ -94,36 +88,12 @@ class Compensator(Protocol):
         """What it remembers."""
         ...
 
-    def start(self, on: SensedSignal, seen: Instant) -> list[Any]:
+    def start(self, on: SensedSignal, seen: ControllerSnapshot) -> list[Any]:
         """The states in a loop whose signals have been constant so far, or with a sampled PID since the last sample."""
         ...
 
-    def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The states' rates, or with a sampled PID their next values, and what it adds to the command."""
-        ...
-
-
-class CompensatedLoop(Protocol):
-    """What of a `ClosedLoop` its compensation depends on."""
-
-    @property
-    def compensators(self) -> tuple[Compensator, ...]:
-        """In the order in which they act."""
-        ...
-
-    @property
-    def parameters(self) -> ParameterSet:
-        """The plant's and the controller's."""
-        ...
-
-    @property
-    def readings(self) -> tuple[str, ...]:
-        """The outputs of the plant that compensators read."""
-        ...
-
-    @property
-    def compensation(self) -> ca.Function:
-        """Of `compensation_function`."""
         ...
 
 
@@ -160,13 +130,15 @@ def check_values(
             require(value[name] > count, f"{told}: no error could be told from it; take at least {2 * count:g}")
 
 
-def compensate(compensators: Sequence[Compensator], seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+def compensate(
+    compensators: Sequence[Compensator], seen: ControllerSnapshot, x: Symbols, p: Symbols
+) -> tuple[Signals, ca.SX]:
     """Let compensators act one after the other.
 
     Parameters
     ----------
     compensators : sequence of Compensator
-    seen : Instant
+    seen : ControllerSnapshot
         Its command is that of PID and feedforward.
     x, p : mapping of str to casadi.SX
         The loop's states and parameters.
@@ -184,119 +156,6 @@ def compensate(compensators: Sequence[Compensator], seen: Instant, x: Symbols, p
         own, more = part.act(now, without_prefix(x, part.section), without_prefix(p, part.section))
         moved, added = moved | with_prefix(own, part.section), added + more
     return moved, added
-
-
-def compensation_function(loop: CompensatedLoop, on: SensedSignal, command: Quantity) -> ca.Function:
-    """The compensators that act always, under constant signals and a reference at rest, of the PID's command.
-
-    Returns
-    -------
-    casadi.Function
-        ``(command, reference, measured, readings, p) -> [compensated, slope, feedback]``: the command that they make
-        of the PID's, and its derivatives to the PID's command and to the measured signal.
-    """
-    v, r, y = (ca.SX.sym(n) for n in ("command", "reference", "measured"))
-    p: Signals = {n: ca.SX.sym(n) for n in loop.parameters}
-    shown: Signals = {n: ca.SX.sym(n) for n in loop.readings}
-    made = v
-    for part in acting_always(loop):
-        rates = dict.fromkeys(part.motion_inputs(on), ca.SX(0))
-        seen = Instant(ca.SX(0), r, y, made, None, rates, shown)
-        x = dict(zip((q.name for q in part.states(on, command)), map(ca.SX, part.start(on, seen)), strict=True))
-        made = made + part.act(seen, x, without_prefix(p, part.section))[1]
-    slopes = (ca.densify(ca.jacobian(made, signal)) for signal in (v, y))
-    return ca.Function("compensation", [v, r, y, stack(shown), stack(p)], [made, *slopes])
-
-
-def acting_always(loop: CompensatedLoop) -> tuple[Compensator, ...]:
-    """The compensators that count in a loop's rest and margins."""
-    return tuple(c for c in loop.compensators if c.acts_always)
-
-
-def uncompensated_command(
-    loop: CompensatedLoop, p: Array, reference: Any, measured: Any, command: ArrayLike, readings: ArrayLike = ()
-) -> Array:
-    """The PID's command of which the compensators that act always make another one.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    p : ndarray, shape (n_parameters,) or (n_parameters, m)
-    reference, measured : float or array_like, shape (m,)
-        The signals at that instant.
-    command : float or array_like, shape (m,)
-        What the compensators make, which grows with the PID's command.
-    readings : array_like, shape (n_readings,) or (n_readings, m)
-        The outputs ``loop.readings``.
-
-    Returns
-    -------
-    ndarray, shape (m,)
-    """
-    wanted = np.atleast_1d(np.asarray(command, dtype=float))
-    if not acting_always(loop):
-        return wanted
-    shown = np.asarray(readings, dtype=float)
-    return invert_increasing(lambda v: _evaluate_compensation(loop, p, reference, measured, v, shown)[0], wanted)
-
-
-def compensation_slopes(
-    loop: CompensatedLoop, p: Array, measured: ArrayLike, command: ArrayLike
-) -> tuple[Array, Array]:
-    """Slopes of the compensators that act always, at a steady operating point without dither.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    p : ndarray, shape (n_parameters,) or (n_parameters, m)
-    measured : float or array_like, shape (m,)
-        The measured signal, which the reference equals there.
-    command : float or array_like, shape (m,)
-        What the actuator gets, the dither's offset included.
-
-    Returns
-    -------
-    slope, feedback : ndarray, shape (m,)
-        Derivatives of what they make to the PID's command and to the measured signal.
-    """
-    order = list(loop.parameters)
-    offset = p[order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0
-    v = uncompensated_command(loop, p, measured, measured, np.asarray(command) - offset)
-    _, slope, feedback = _evaluate_compensation(loop, p, measured, measured, v)
-    return slope, feedback
-
-
-def _evaluate_compensation(
-    loop: CompensatedLoop, p: Array, reference: Any, measured: Any, v: Array, readings: ArrayLike = ()
-) -> list[Array]:
-    """What `CompensatedLoop.compensation` gives for m points at once, shape (m,) each."""
-    rows = [np.broadcast_to(a, v.shape)[None] for a in (v, reference, measured)]
-    shown = np.asarray(readings, dtype=float)
-    rows.append(np.broadcast_to(shown[:, None] if shown.ndim == 1 else shown, (len(loop.readings), len(v))))
-    given = p if np.ndim(p) > 1 else np.repeat(np.reshape(p, (-1, 1)), len(v), axis=1)
-    return [np.asarray(found, dtype=float).ravel() for found in loop.compensation(*rows, given)]
-
-
-def invert_increasing(function: Callable[[Array], Array], wanted: Array) -> Array:
-    """Where an increasing function of shape (m,) takes the values wanted, entry by entry, by bisection.
-
-    Examples
-    --------
-    >>> invert_increasing(lambda v: v**3, np.array([8.0, 0.0, -1.0])).round(12).tolist()
-    [2.0, 0.0, -1.0]
-    """
-    reach = np.ones_like(wanted)
-    for _ in range(MAX_DOUBLINGS):
-        outside = (function(wanted - reach) > wanted) | (function(wanted + reach) < wanted)
-        if not outside.any():
-            break
-        reach[outside] *= 2
-    low, high = wanted - reach, wanted + reach
-    for _ in range(MAX_BISECTIONS):
-        middle = (low + high) / 2
-        above = function(middle) > wanted
-        low, high = np.where(above, low, middle), np.where(above, middle, high)
-    return np.asarray(low)
 
 
 PULSE_SAMPLES, PERIOD_SAMPLES = 2, 10  # [samples] defaults: shorter or rarer pulses move nothing, longer push through
@@ -363,11 +222,11 @@ class Knocker:
         """The command and the direction at the last onset."""
         return replace(command, name="command"), Quantity("direction", "1")
 
-    def start(self, _on: SensedSignal, seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, seen: ControllerSnapshot) -> list[Any]:
         """The command so far, and no direction."""
         return [seen.command, 0.0]
 
-    def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The states after a sample, and the pulse [the command's unit]."""
         h = seen.sample_time or 1.0
         sample = ca.floor(seen.t / h + 0.5)
@@ -462,11 +321,11 @@ class FrictionFeedforward:
         """None."""
         return ()
 
-    def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, _seen: ControllerSnapshot) -> list[Any]:
         """No states."""
         return []
 
-    def act(self, seen: Instant, _x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, _x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """No states, and u_f [the command's unit]."""
         wanted = seen.rates.get(REFERENCE_SPEED, seen.reference)
         speed = seen.measured if self.direction is Direction.MEASURED else wanted
@@ -521,11 +380,11 @@ class DeadZoneInverse:
         """None."""
         return ()
 
-    def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, _seen: ControllerSnapshot) -> list[Any]:
         """No states."""
         return []
 
-    def act(self, seen: Instant, _x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, _x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """No states, and what it adds [the command's unit]."""
         return {}, p["width"] * ca.tanh(seen.command / p["smoothing"])
 
@@ -632,11 +491,11 @@ class ImpulsiveControl:
             replace(command, name="ceiling"),
         )
 
-    def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, _seen: ControllerSnapshot) -> list[Any]:
         """No pulse so far."""
         return [0.0] * 7
 
-    def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The states after a sample, and the pulse [the command's unit]."""
         h, e = seen.sample_time or 1.0, seen.error
         width, pause = (ca.fmax(1.0, ca.floor(p[n] / h + 0.5)) for n in ("width", "pause"))
@@ -737,11 +596,11 @@ class MotionFeedforward:
         """None."""
         return ()
 
-    def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, _seen: ControllerSnapshot) -> list[Any]:
         """No states."""
         return []
 
-    def act(self, seen: Instant, _x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, _x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """No states, and u_m [the command's unit]."""
         speed = seen.rates.get(REFERENCE_SPEED, seen.reference)
         return {}, p["speed"] * speed + p["acceleration"] * seen.rates[REFERENCE_ACCELERATION]
@@ -807,11 +666,11 @@ class PressureFeedback:
         """The slow part of the differential pressure."""
         return (Quantity("slow", difference_unit(_pressure(on).unit), PRESSURE_NOMINAL),)
 
-    def start(self, _on: SensedSignal, seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, seen: ControllerSnapshot) -> list[Any]:
         """The pressures so far are the slow part."""
         return [_difference(seen)]
 
-    def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The slow part's rate or next value, and u_p [the command's unit]."""
         d, h, time = _difference(seen), seen.elapsed, p["time"]
         if h is None:
@@ -820,7 +679,7 @@ class PressureFeedback:
         return {"slow": slow}, p["gain"] * (slow - d)
 
 
-def _difference(seen: Instant) -> Any:
+def _difference(seen: ControllerSnapshot) -> Any:
     a, b = (seen.readings[n] for n in PRESSURES)
     return a - b
 
@@ -892,11 +751,11 @@ class AccelerationFeedback:
         speed = Quantity("speed", on.speed_unit)
         return (Quantity("position", on.measured.unit, on.measured.nominal), speed) if on.order == 0 else (speed,)
 
-    def start(self, on: SensedSignal, seen: Instant) -> list[Any]:
+    def start(self, on: SensedSignal, seen: ControllerSnapshot) -> list[Any]:
         """The measured signal so far; a position has stood still."""
         return [seen.measured, 0.0] if on.order == 0 else [seen.measured]
 
-    def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The states' rates or next values, and u_a [the command's unit]."""
         moved, signal, h, time = Signals(), seen.measured, seen.elapsed, p["filter"]
         fed_back = ca.SX(0)

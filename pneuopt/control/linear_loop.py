@@ -1,11 +1,11 @@
 """The loop linearised: `linear_plant`, the plant as the controller sees it; `open_loop`, whose margins count.
 
 Loops whose controller feeds back several signals (`ComposedLoops`) are cut at the command. The controller's law is
-differentiated as it runs, so there is one law. A sampled one is exact: the plant on a held command
-by its matrix exponential, the controller from sample to sample with its delay, and the discrete loop L(z) in continuous
-form by the bilinear transformation ``z = (1 + s h/2)/(1 - s h/2)``, which maps the unit circle to the imaginary axis.
-Margins and peaks are those of L(z); a frequency w is shown as ``2/h tan(w h/2)`` [rad/s], which is w but for 1 % at a
-tenth of the sampling frequency over pi.
+differentiated as it runs (`Controller.update`), so there is one law. A sampled one is exact: the plant on a held
+command by its matrix exponential, the controller from sample to sample with its delay, and the discrete loop L(z) in
+continuous form by the bilinear transformation ``z = (1 + s h/2)/(1 - s h/2)``, which maps the unit circle to the
+imaginary axis. Margins and peaks are those of L(z); a frequency w is shown as ``2/h tan(w h/2)`` [rad/s], which is w
+but for 1 % at a tenth of the sampling frequency over pi.
 """
 
 from collections.abc import Mapping
@@ -17,10 +17,9 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.control.averaging import AveragedPlant
-from pneuopt.control.compensators import Instant, acting_always, uncompensated_command
-from pneuopt.control.controller import added_command, controller_update, pid_reference
+from pneuopt.control.compensators import ControllerSnapshot
+from pneuopt.control.controller import Controller
 from pneuopt.control.dither import DITHER_OFFSET
-from pneuopt.control.gain_schedule import schedule_gains
 from pneuopt.control.linear_controller import linear_controller, operating_point
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag, Signals
@@ -110,7 +109,7 @@ class ComposedLoops:
         """``(p, y) -> p`` with the gains that a schedule has at the plant's outputs."""
         loop = self.loop
         y, p = ({n: ca.SX.sym(n) for n in own} for own in (names(loop.plant.outputs), loop.parameters))
-        frozen = schedule_gains(loop, p, y[loop.pid_signal.name], {}, y)
+        frozen = loop.controller.schedule_gains(p, y[loop.pid_signal.name], {}, y)
         return ca.Function("frozen", [stack(p), stack(y)], [stack(frozen)])
 
     @cached_property
@@ -130,7 +129,7 @@ class ComposedLoops:
         bare = command - (p[:, order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0)
         y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
         seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])
-        v = uncompensated_command(loop, p.T, seen, seen, bare, read)
+        v = loop.controller.uncompensated_command(loop.controller_part(p.T), seen, seen, bare, read)
         return _Laws(*(_split_columns(M.full(), len(p)) for M in self._law(shown.T, v[None], p.T)))
 
     @cached_property
@@ -139,16 +138,16 @@ class ComposedLoops:
 
         v is the PID's command at the operating point.
         """
-        loop = _linear_law(self.loop)
-        y, p = ({n: ca.SX.sym(n) for n in own} for own in (names(loop.plant.outputs), self.loop.parameters))
+        law = _linear_law(self.loop.controller)
+        y, p = ({n: ca.SX.sym(n) for n in own} for own in (law.signals.outputs, self.loop.parameters))
         v, noise, r = ca.SX.sym("v"), ca.SX.sym("noise"), ca.SX.sym("reference")
-        known = [q.name for q in loop.states[len(loop.plant.states) :]]
-        x: Signals = {n: ca.SX.sym(n) for n in known if n not in _COMMANDS and n not in _lagging(loop)}
-        moved, w = _controller(loop, x, r, y, noise, p)
-        at = _resting_states(loop, x, y, v, p)
+        apart = (*_COMMANDS, "sensor.reading") if isinstance(law.sensor, SensorLag) else _COMMANDS
+        x: Signals = {n: ca.SX.sym(n) for n in names(law.states) if n not in apart}
+        moved, w = _controller(law, x, r, y, noise, p)
+        at = _resting_states(law, x, y, v, p)
         z = ca.vertcat(stack(x), stack(y), noise)
         J = ca.jacobian(ca.vertcat(stack({n: moved[n] for n in x}), w), z)
-        point = ca.vertcat(stack({n: at[n] for n in x}), 0, y[loop.feedback.name])
+        point = ca.vertcat(stack({n: at[n] for n in x}), 0, y[law.feedback.name])
         J = ca.substitute(J, ca.vertcat(stack(x), noise, r), point)
         n = len(x)
         blocks = (J[:n, :n], J[:n, n:], J[n, :n], J[n, n:])
@@ -186,58 +185,50 @@ def _split_columns(joined: Array, m: int) -> Array:
     return joined.reshape(len(joined), m, joined.shape[1] // m).transpose(1, 0, 2)
 
 
-def _linear_law(loop: ClosedLoop) -> ClosedLoop:
-    """The loop without what its linearisation leaves out: limits, dead band, resets, counts, dither, pulses."""
-    sensor = replace(loop.sensor, resolution=0.0) if isinstance(loop.sensor, Encoder) else loop.sensor
-    pid = replace(loop.pid, limits=False, dead_band=False, reset=False)
-    return replace(loop, pid=pid, sensor=sensor, dither=None, compensators=acting_always(loop), schedule=None)
+def _linear_law(controller: Controller) -> Controller:
+    """A controller without what its linearisation leaves out: limits, dead band, resets, counts, dither, pulses."""
+    sensor = controller.sensor
+    sensor = replace(sensor, resolution=0.0) if isinstance(sensor, Encoder) else sensor
+    pid, acting = replace(controller.pid, limits=False, dead_band=False, reset=False), controller.acting_always
+    return replace(controller, pid=pid, sensor=sensor, dither=None, compensators=acting, schedule=None)
 
 
-def _lagging(loop: ClosedLoop) -> tuple[str, ...]:
-    return ("sensor.reading",) if isinstance(loop.sensor, SensorLag) else ()
-
-
-def _controller(loop: ClosedLoop, x: Signals, r: ca.SX, y: Signals, noise: ca.SX, p: Signals) -> tuple[Signals, ca.SX]:
+def _controller(law: Controller, x: Signals, r: ca.SX, y: Signals, noise: ca.SX, p: Signals) -> tuple[Signals, ca.SX]:
     """Rates or next values of a controller's states, and its command before the clip, under a reference at rest."""
     own = without_prefix(x, "sensor")
-    noisy = loop.feedback.name
-    y = {**y, noisy: y[noisy] + noise} if loop.outer else y
+    noisy = law.feedback.name
+    y = {**y, noisy: y[noisy] + noise} if law.outer else y
     seen = (
-        loop.sensor.update(own, y, loop.sensed_signal, without_prefix(p, "sensor"), loop.pid.sample_time or 0.0)
-        if isinstance(loop.sensor, Encoder)
+        law.sensor.update(own, y, law.sensed_signal, without_prefix(p, "sensor"), law.pid.sample_time or 0.0)
+        if isinstance(law.sensor, Encoder)
         else {}
     )
-    measured = seen.get("reading", y[loop.pid_signal.name]) + (0 if loop.outer else noise)
-    bare, u = replace(loop, sensor=None), dict.fromkeys(names(loop.inputs), ca.SX(0))
+    measured = seen.get("reading", y[law.pid_signal.name]) + (0 if law.outer else noise)
+    bare, u = replace(law, sensor=None), dict.fromkeys(names(law.inputs), ca.SX(0))
     u["reference"] = r
-    shown = {**y, loop.pid_signal.name: measured}
-    if loop.pid.sample_time is None:
-        inner = pid_reference(bare, u, y[loop.feedback.name], p)
-        moved, added = added_command(bare, ca.SX(0), x, inner, measured, shown, p)
-        rates, w = loop.pid.rates(
-            without_prefix(x, "pid"), inner["reference"], measured, added, without_prefix(p, "pid")
-        )
-        return with_prefix(rates, "pid") | moved, w
+    shown = {**y, law.pid_signal.name: measured}
+    if law.pid.sample_time is None:
+        return bare.rates(ca.SX(0), x, u, shown, p)
     held = {n: ca.SX(0) for n in _COMMANDS}
-    found = controller_update(bare, ca.SX(0), x | held, u, shown, p)
+    found = bare.update(ca.SX(0), x | held, u, shown, p)
     return with_prefix(seen, "sensor") | found.states, found.terms["unlimited"]
 
 
-def _resting_states(loop: ClosedLoop, x: Signals, y: Signals, v: ca.SX, p: Signals) -> Signals:
+def _resting_states(law: Controller, x: Signals, y: Signals, v: ca.SX, p: Signals) -> Signals:
     """The states under constant signals, with the integral that makes the PID's command v."""
-    h, measured = loop.pid.sample_time or 0.0, y[loop.pid_signal.name]
+    h, measured = law.pid.sample_time or 0.0, y[law.pid_signal.name]
     at: Signals = {n: ca.SX(0) for n in x}
-    if isinstance(loop.sensor, Encoder):
-        at["sensor.reading"], position = measured, y[loop.sensor.position]
+    if isinstance(law.sensor, Encoder):
+        at["sensor.reading"], position = measured, y[law.sensor.position]
         at["sensor.count"] = position - h * measured
-    seen = Instant(ca.SX(0), measured, measured, v, loop.pid.sample_time, {}, y)
-    for part in loop.compensators:
-        named = (f"{part.section}.{q.name}" for q in part.states(loop.sensed_signal, loop.command))
-        at |= dict(zip(named, map(ca.SX, part.start(loop.sensed_signal, seen)), strict=True))
+    seen = ControllerSnapshot(ca.SX(0), measured, measured, v, law.pid.sample_time, {}, y)
+    for part in law.compensators:
+        named = (f"{part.section}.{q.name}" for q in part.states(law.sensed_signal, law.command))
+        at |= dict(zip(named, map(ca.SX, part.start(law.sensed_signal, seen)), strict=True))
     given: Mapping[str, ca.SX] = {**at, "pid.integral": ca.SX(0), **{n: ca.SX(0) for n in _COMMANDS}}
-    own = without_prefix(given, "pid")
-    wanted = pid_reference(loop, {"reference": y[loop.feedback.name]}, y[loop.feedback.name], p)["reference"]
-    at["pid.integral"] = v - loop.pid.output(own, wanted, measured, without_prefix(p, "pid"))
+    own, position = without_prefix(given, "pid"), y[law.feedback.name]
+    wanted = law.inner_inputs({"reference": position}, position, p)["reference"]
+    at["pid.integral"] = v - law.pid.output(own, wanted, measured, without_prefix(p, "pid"))
     return at
 
 

@@ -292,7 +292,7 @@ class PID:
     holds, of a start or of earlier gains, goes with Tt, ``I = I_/(1 + h/Tt)``. Without a Tt, the time of both is its
     default; a Tt that switches back-calculation off counts as ten times that at most.
 
-    After samples that were no numbers (`controller_update`), the h of the derivative is the time since the last good
+    After samples that were no numbers (`Controller.update`), the h of the derivative is the time since the last good
     one.
 
     With a dead band, what is integrated is ``e - min(max(e, -dead_band), dead_band)`` instead of e = r - y: nothing

@@ -12,15 +12,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pneuopt.control.compensators import MotionFeedforward
+from pneuopt.control.controller import Controller
 from pneuopt.control.dither import Waveform
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.pid import AntiWindup, Form, ParallelForm
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.control.sensor import REFERENCE_SPEED, Encoder, SensorLag
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.export.makers import BLOCK_FORMS, Block, BlockForm, Design, Setting, number, standard_times, wire
+from pneuopt.export.makers import BLOCK_FORMS, Block, BlockDesign, BlockForm, Setting, number, standard_times, wire
+from pneuopt.export.program import check_sampled
 from pneuopt.export.writer import check_name, comment_text
-from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
+from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import write_value
@@ -82,14 +84,14 @@ def export_settings(
     """
     check_closed_loop(loop)
     check_name(name)
-    told = "a continuous controller cannot be exported: give it a sample time, sample_time under [pid], and tune again"
-    require(loop.pid.sample_time is not None, told, ModelError)
+    check_sampled(loop.controller)
     loop.check(parameters)
     if measured_span is not None:
         message = f"measured_span must be positive and finite, got {measured_span:g} {loop.feedback.unit}"
         require(0 < measured_span < math.inf, message)
     form, steps = BLOCK_FORMS[block], as_references(references)
-    around = find_surroundings(acting_loop(loop, parameters), parameters, form, steps, centre, measured_span)
+    acting = acting_controller(loop.controller, parameters)
+    around = find_surroundings(acting, parameters, form, steps, centre, measured_span)
     d = around.inner
     settings = form.settings(d)  # first of all: it refuses what the block cannot have
     compared = compare_with_block(loop, parameters, block, steps)
@@ -107,7 +109,7 @@ def export_settings(
 
 
 def describe_refusal(
-    loop: ClosedLoop,
+    controller: Controller,
     parameters: ParameterSet,
     block: Block,
     references: Reference | Sequence[Reference],
@@ -116,7 +118,8 @@ def describe_refusal(
     """Why a block cannot hold a design, as `export_settings` refuses it; empty where it can."""
     form, steps = BLOCK_FORMS[block], as_references(references)
     try:
-        around = find_surroundings(acting_loop(loop, parameters), parameters, form, steps, centre, None)
+        acting = acting_controller(controller, parameters)
+        around = find_surroundings(acting, parameters, form, steps, centre, None)
         for design in filter(None, (around.inner, around.outer)):
             form.settings(design)
     except InputError as reason:
@@ -137,7 +140,7 @@ def run_as_block(
         In what that differs from the design; empty where the block runs it as it is.
     """
     form, found = BLOCK_FORMS[block], list[str]()
-    acting = acting_loop(loop, parameters)
+    acting = acting_controller(loop.controller, parameters)
     integrates = loop.parallel_form(parameters).Ki != 0
     clamps = form.clamps and loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
     kind = AntiWindup.CLAMPING if clamps else loop.pid.anti_windup
@@ -147,7 +150,8 @@ def run_as_block(
     found += ["it has no dead band of the integral"] if acting.pid.dead_band else []
     found += ["it has no reset of the integral"] if loop.pid.reset else []
     pid = replace(loop.pid, form=Form.PARALLEL, anti_windup=kind, dead_band=False, reset=False)
-    own = replace(acting, pid=pid)
+    parts = {n: getattr(acting, n) for n in ("dither", "feedforward", "compensators", "schedule")}
+    own = replace(loop, pid=pid, **parts)
     gains = loop.parallel_form(parameters)
     values = {f"pid.{n}": v for n, v in vars(gains).items()} | _block_gains(loop, parameters, form, found)
     shared = parameters.select(n for n in parameters if n in own.parameters and n not in values)
@@ -188,7 +192,7 @@ def _verdict(loop: ClosedLoop, parameters: ParameterSet, block: Block) -> str:
     return f"The block runs the design as it was tuned{but}{inferred}."
 
 
-def _scale_lines(d: Design) -> list[str]:
+def _scale_lines(d: BlockDesign) -> list[str]:
     """That an output is in no output module's unit."""
     words = MECHANICAL_UNITS.get(d.command_unit)
     if words is None:
@@ -200,7 +204,7 @@ def _scale_lines(d: Design) -> list[str]:
     ]
 
 
-def _rest_words(d: Design, form: BlockForm) -> Iterator[str]:
+def _rest_words(d: BlockDesign, form: BlockForm) -> Iterator[str]:
     """What the design itself makes of its rest."""
     b = form.weights(d)[0]
     if d.is_added_to:
@@ -220,7 +224,7 @@ def _rows(settings: list[Setting]) -> list[str]:
     return [f"  {s.name:<{widths[0]}}  {s.value:<{widths[1]}}  {s.formula}".rstrip() for s in settings]
 
 
-def _checks(d: Design, first: Design, form: BlockForm) -> Iterator[str]:
+def _checks(d: BlockDesign, first: BlockDesign, form: BlockForm) -> Iterator[str]:
     """What an engineer tries before the loop is closed."""
     rest = wire(d.centre, d)
     rises = "rise" if (d.gains.Kp or d.gains.Ki or d.gains.Kd) >= 0 else "fall"
@@ -235,7 +239,7 @@ def _checks(d: Design, first: Design, form: BlockForm) -> Iterator[str]:
 
 def _block_gains(loop: ClosedLoop, parameters: ParameterSet, form: BlockForm, found: list[str]) -> dict[str, float]:
     """Weights, filter and times as a block has them; what that changes is added to `found`."""
-    design = design_of(acting_loop(loop, parameters), parameters, 0.0)
+    design = design_of(acting_controller(loop.controller, parameters), parameters, 0.0)
     gains, values = design.gains, dict[str, float]()
     matters = {"b": gains.Kp != 0, "c": gains.Kd != 0}
     for weight, wanted, own in zip("bc", (design.b, design.c), form.weights(design), strict=True):
@@ -256,7 +260,7 @@ def _block_gains(loop: ClosedLoop, parameters: ParameterSet, form: BlockForm, fo
     return values
 
 
-def _round_times(design: Design, form: BlockForm) -> dict[str, float]:
+def _round_times(design: BlockDesign, form: BlockForm) -> dict[str, float]:
     """Ki, Kd and, of a derivative, Tf of times that are rounded."""
     gains, grain = design.gains, form.time_grain
     times = (*standard_times(design, form.title.partition(" (")[0]), gains.Tf)
@@ -286,40 +290,40 @@ class Surroundings:
     ----------
     lines : tuple of str
         From the sensor to the wire.
-    inner : Design
+    inner : BlockDesign
         The block itself.
-    outer : Design or None
+    outer : BlockDesign or None
         A cascade's outer block, whose output is the setpoint of the inner one.
     """
 
     lines: tuple[str, ...]
-    inner: Design
-    outer: Design | None
+    inner: BlockDesign
+    outer: BlockDesign | None
 
 
-def acting_loop(loop: ClosedLoop, parameters: ParameterSet) -> ClosedLoop:
-    """The loop without the parts whose parameters make them add nothing."""
-    value = _values(loop, parameters)
-    schedule, lead, dither = loop.schedule, loop.feedforward, loop.dither
+def acting_controller(controller: Controller, parameters: ParameterSet) -> Controller:
+    """The controller without the parts whose parameters make them add nothing."""
+    value = _values(controller, parameters)
+    schedule, lead, dither = controller.schedule, controller.feedforward, controller.dither
     scheduled = schedule is not None and any(
         value[n]
-        for n in loop.parameters
+        for n in controller.parameters
         if n.startswith("schedule.") and n.endswith(("_slope", "_curve", "_load"))
         if n != "schedule.nominal_load"
     )
     oscillates = dither is not None and (value["dither.amplitude"] != 0 or value["dither.offset"] != 0)
     return replace(
-        loop,
-        pid=replace(loop.pid, dead_band=loop.pid.dead_band and value["pid.dead_band"] > 0),
+        controller,
+        pid=replace(controller.pid, dead_band=controller.pid.dead_band and value["pid.dead_band"] > 0),
         dither=dither if oscillates else None,
         feedforward=lead if lead is not None and value["feedforward.gain"] != 0 else None,
-        compensators=tuple(c for c in loop.compensators if _acts(c, value)),
+        compensators=tuple(c for c in controller.compensators if _acts(c, value)),
         schedule=schedule if scheduled else None,
     )
 
 
 def find_surroundings(
-    loop: ClosedLoop,
+    controller: Controller,
     parameters: ParameterSet,
     form: BlockForm,
     references: Sequence[Reference],
@@ -330,8 +334,8 @@ def find_surroundings(
 
     Parameters
     ----------
-    loop : ClosedLoop
-        Of `acting_loop`.
+    controller : Controller
+        Of `acting_controller`.
     parameters : ParameterSet
     form : BlockForm
     references : sequence of Reference
@@ -346,45 +350,45 @@ def find_surroundings(
     InputError
         If a part of the design has no counterpart among the maker's standard blocks.
     """
-    value = _values(loop, parameters)
-    low, high = _process_range(references, measured_span, loop.feedback.unit)
-    outer = _outer_design(loop, value, references, (low, high))
+    value = _values(controller, parameters)
+    low, high = _process_range(references, measured_span, controller.feedback.unit)
+    outer = _outer_design(controller, value, references, (low, high))
     if outer is not None:
         low, high = outer.low, outer.high
-    inner = replace(design_of(loop, parameters, centre), pv_low=low, pv_high=high)
+    inner = replace(design_of(controller, parameters, centre), pv_low=low, pv_high=high)
     given = references[0].origin
     inner = replace(inner, start=given) if outer is None else replace(inner, reach="what the outer block gives at most")
-    _check_parts(loop, value, form)
+    _check_parts(controller, value, form)
     rest_is_inside = inner.low <= inner.centre <= inner.high
     told = f"the valve's centre, {write_value(centre, inner.command_unit)}, lies beyond the limits of the output"
     require(rest_is_inside, f"{told}: no setting of {form.maker} rests there; mend the limits under [pid]")
-    lines = list(_lines(loop, value, form, inner, outer, references))
+    lines = list(_lines(controller, value, form, inner, outer, references))
     return Surroundings(tuple(f"{k}. {line}" for k, line in enumerate(lines, 1)), inner, outer)
 
 
-def design_of(loop: ClosedLoop, parameters: ParameterSet, centre: float) -> Design:
-    """The numbers of a loop's PID."""
-    value = _values(loop, parameters)
-    motion = any(isinstance(c, MotionFeedforward) for c in loop.compensators)
-    sampled_dither = loop.dither is not None and (not loop.dither.analogue or value["dither.offset"] != 0)
-    return Design(
-        loop.parallel_form(parameters),
+def design_of(controller: Controller, parameters: ParameterSet, centre: float) -> BlockDesign:
+    """The numbers of a controller's PID."""
+    value = _values(controller, parameters)
+    motion = any(isinstance(c, MotionFeedforward) for c in controller.compensators)
+    sampled_dither = controller.dither is not None and (not controller.dither.analogue or value["dither.offset"] != 0)
+    return BlockDesign(
+        controller.parallel_form(parameters),
         value["pid.b"],
         value["pid.c"],
         value.get("pid.Tt", math.nan),
         value.get("pid.lower", -math.inf) + centre,
         value.get("pid.upper", math.inf) + centre,
         centre,
-        loop.pid.sample_time or 0.0,
-        loop.pid_signal.name,
-        loop.pid_signal.unit,
-        loop.command.unit,
+        controller.pid.sample_time or 0.0,
+        controller.pid_signal.name,
+        controller.pid_signal.unit,
+        controller.command.unit,
         is_added_to=motion or sampled_dither,
     )
 
 
-def _values(loop: ClosedLoop, parameters: ParameterSet) -> dict[str, float]:
-    return {n: p.value for n, p in loop.complete(parameters).items()}
+def _values(controller: Controller, parameters: ParameterSet) -> dict[str, float]:
+    return {n: p.value for n, p in controller.complete(parameters).items()}
 
 
 def _acts(part: object, value: Mapping[str, float]) -> bool:
@@ -421,58 +425,58 @@ def _top_speed(references: Sequence[Reference]) -> float:
 
 
 def _outer_design(
-    loop: ClosedLoop, value: Mapping[str, float], references: Sequence[Reference], span: tuple[float, float]
-) -> Design | None:
+    controller: Controller, value: Mapping[str, float], references: Sequence[Reference], span: tuple[float, float]
+) -> BlockDesign | None:
     """The outer block of a cascade: proportional; it reaches its limits only with its process value out of range."""
-    if loop.outer is None:
+    if controller.outer is None:
         return None
-    Kp, weight = (value[f"{loop.outer.section}.{n}"] for n in ("Kp", "weight"))
+    Kp, weight = (value[f"{controller.outer.section}.{n}"] for n in ("Kp", "weight"))
     top = Kp * (span[1] - span[0]) + weight * _top_speed(references)
-    gains, h = ParallelForm(Kp), loop.pid.sample_time or 0.0
-    on, speed = loop.feedback, loop.pid_signal.unit
-    found = Design(gains, 1.0, 1.0, math.nan, -top, top, 0.0, h, on.name, on.unit, speed, *span)
+    gains, h = ParallelForm(Kp), controller.pid.sample_time or 0.0
+    on, speed = controller.feedback, controller.pid_signal.unit
+    found = BlockDesign(gains, 1.0, 1.0, math.nan, -top, top, 0.0, h, on.name, on.unit, speed, *span)
     return replace(found, goes="to the inner block", zero="no speed")
 
 
-def _check_parts(loop: ClosedLoop, value: Mapping[str, float], form: BlockForm) -> None:
-    missing = list(_missing_parts(loop, value))
+def _check_parts(controller: Controller, value: Mapping[str, float], form: BlockForm) -> None:
+    missing = list(_missing_parts(controller, value))
     block = form.title.partition(" (")[0].partition(",")[0]
     told = f"{block} cannot hold this design: {'; '.join(missing)}. No standard block of {form.maker} stands for that"
     remedy = "use --to st, which writes the whole controller"
     require(not missing, f"{told}; {remedy}")
 
 
-def _missing_parts(loop: ClosedLoop, value: Mapping[str, float]) -> Iterator[str]:
+def _missing_parts(controller: Controller, value: Mapping[str, float]) -> Iterator[str]:
     """The parts without a counterpart, with their numbers."""
-    if isinstance(loop.sensor, Encoder) and loop.sensor.differentiates(loop.sensed_signal):
-        yield f"the speed from an encoder's counts ({_numbers(loop, value, 'sensor')})"
-    if loop.schedule is not None:
-        yield f"a gain schedule of {', '.join(loop.schedule.gains)}"
-    if loop.pid.dead_band:
-        yield f"the integral's dead band ({_named_value('pid.dead_band', loop, value)})"
-    if loop.pid.reset:
+    if isinstance(controller.sensor, Encoder) and controller.sensor.differentiates(controller.sensed_signal):
+        yield f"the speed from an encoder's counts ({_numbers(controller, value, 'sensor')})"
+    if controller.schedule is not None:
+        yield f"a gain schedule of {', '.join(controller.schedule.gains)}"
+    if controller.pid.dead_band:
+        yield f"the integral's dead band ({_named_value('pid.dead_band', controller, value)})"
+    if controller.pid.reset:
         yield "the integral's reset"
-    if loop.feedforward is not None:
-        yield f"the set-point lead feedforward ({_numbers(loop, value, 'feedforward')})"
-    for part in loop.compensators:
+    if controller.feedforward is not None:
+        yield f"the set-point lead feedforward ({_numbers(controller, value, 'feedforward')})"
+    for part in controller.compensators:
         if not isinstance(part, MotionFeedforward):
-            yield f"{part.section} ({_numbers(loop, value, part.section)})"
+            yield f"{part.section} ({_numbers(controller, value, part.section)})"
 
 
-def _numbers(loop: ClosedLoop, value: Mapping[str, float], section: str) -> str:
-    return ", ".join(_named_value(n, loop, value) for n in loop.parameters if n.startswith(f"{section}."))
+def _numbers(controller: Controller, value: Mapping[str, float], section: str) -> str:
+    return ", ".join(_named_value(n, controller, value) for n in controller.parameters if n.startswith(f"{section}."))
 
 
-def _named_value(name: str, loop: ClosedLoop, value: Mapping[str, float]) -> str:
-    return f"{name.partition('.')[2]} = {write_value(value[name], loop.parameters[name].unit)}"
+def _named_value(name: str, controller: Controller, value: Mapping[str, float]) -> str:
+    return f"{name.partition('.')[2]} = {write_value(value[name], controller.parameters[name].unit)}"
 
 
 def _lines(
-    loop: ClosedLoop,
+    controller: Controller,
     value: Mapping[str, float],
     form: BlockForm,
-    inner: Design,
-    outer: Design | None,
+    inner: BlockDesign,
+    outer: BlockDesign | None,
     references: Sequence[Reference],
 ) -> Iterator[str]:
     """From the setpoint and the sensor to the wire."""
@@ -481,7 +485,7 @@ def _lines(
     unit = first.measured_unit
     typed = f"{write_value(example, unit)} is the number {number(example)}"
     yield f"Setpoint: the {first.measured} in {unit}; {typed}."
-    seen = _sensor_words(loop, value)
+    seen = _sensor_words(controller, value)
     yield f"Process value: the {first.measured}, in {unit}, too{'' if outer else seen}."
     if outer is not None:
         weight = value["position_loop.weight"]
@@ -491,61 +495,63 @@ def _lines(
         yield f"Process value of the inner block: the {speed}, measured{seen}."
         yield "Order: enable the inner block first; hold the outer one in manual while the inner one is."
     yield f"{'Inner block' if outer else 'Block'}: {form.title}; {_block_words(inner)}."
-    yield from _added_lines(loop, value, form, inner)
+    yield from _added_lines(controller, value, form, inner)
     yield f"Limits: {_limit_words(inner, form)}."
     zero = write_value(inner.centre, inner.command_unit)
     yield f"Centre: {zero} on the wire is the command 0, at which the valve is closed or the drive without force."
-    yield from _hardware_lines(loop, value)
+    yield from _hardware_lines(controller, value)
 
 
-def _sensor_words(loop: ClosedLoop, value: Mapping[str, float]) -> str:
-    if isinstance(loop.sensor, SensorLag):
+def _sensor_words(controller: Controller, value: Mapping[str, float]) -> str:
+    if isinstance(controller.sensor, SensorLag):
         return f"; the design counts on a sensor with a lag of {write_value(value['sensor.lag'], 's')}: add no filter"
-    if isinstance(loop.sensor, Encoder) and loop.sensor.resolution:
-        unit = loop.sensed_signal.outputs[loop.sensor.position].unit
+    if isinstance(controller.sensor, Encoder) and controller.sensor.resolution:
+        unit = controller.sensed_signal.outputs[controller.sensor.position].unit
         return f"; counted in steps of {write_value(value['sensor.resolution'], unit)}"
     return "; the design counts on no filter of it"
 
 
-def _block_words(d: Design) -> str:
+def _block_words(d: BlockDesign) -> str:
     terms = (("P", d.gains.Kp), ("I", d.gains.Ki), ("D", d.gains.Kd))
     return "settings below, " + ("".join(n for n, gain in terms if gain) or "no gain")
 
 
-def _added_lines(loop: ClosedLoop, value: Mapping[str, float], form: BlockForm, inner: Design) -> Iterator[str]:
-    terms = [*_motion_terms(loop, value), *_dither_terms(loop, value, inner.sample_time)]
+def _added_lines(
+    controller: Controller, value: Mapping[str, float], form: BlockForm, inner: BlockDesign
+) -> Iterator[str]:
+    terms = [*_motion_terms(controller, value), *_dither_terms(controller, value, inner.sample_time)]
     if terms:
         where = form.added(inner) if form.added else "a sum behind the block, before the limits"
         yield f"Sum: {' + '.join(terms)}; in your program once a sample, 0 while the block is not in automatic."
         yield f"Where it goes: {where}."
 
 
-def _motion_terms(loop: ClosedLoop, value: Mapping[str, float]) -> Iterator[str]:
-    is_speed = REFERENCE_SPEED not in (q.name for q in loop.inputs)  # a loop of the speed: the setpoint is one
+def _motion_terms(controller: Controller, value: Mapping[str, float]) -> Iterator[str]:
+    is_speed = REFERENCE_SPEED not in (q.name for q in controller.inputs)  # a loop of the speed: the setpoint is one
     factors = {
         "speed": "setpoint" if is_speed else "speed of the setpoint",
         "acceleration": "acceleration of the setpoint",
     }
-    for part in loop.compensators:
+    for part in controller.compensators:
         for name, factor in factors.items() if isinstance(part, MotionFeedforward) else ():
             gain = f"{part.section}.{name}"
             if value[gain]:
-                yield f"{write_value(value[gain], loop.parameters[gain].unit, 9)} x {factor}"
+                yield f"{write_value(value[gain], controller.parameters[gain].unit, 9)} x {factor}"
 
 
-def _dither_terms(loop: ClosedLoop, value: Mapping[str, float], sample_time: float) -> Iterator[str]:
-    if loop.dither is None:
+def _dither_terms(controller: Controller, value: Mapping[str, float], sample_time: float) -> Iterator[str]:
+    if controller.dither is None:
         return
-    unit, turns = loop.command.unit, f"{number(value['dither.frequency'] * sample_time)} k"
-    is_sine = loop.dither.waveform is Waveform.SINE
+    unit, turns = controller.command.unit, f"{number(value['dither.frequency'] * sample_time)} k"
+    is_sine = controller.dither.waveform is Waveform.SINE
     wave = f"sin(2 pi frac({turns}))" if is_sine else f"(1 - 4 abs(frac({turns} + 0.25) - 0.5))"
     if value["dither.offset"]:
         yield write_value(value["dither.offset"], unit, 9)
-    if not loop.dither.analogue and value["dither.amplitude"]:
+    if not controller.dither.analogue and value["dither.amplitude"]:
         yield f"{write_value(value['dither.amplitude'], unit, 9)} x {wave}, k the number of the sample"
 
 
-def _limit_words(d: Design, form: BlockForm) -> str:
+def _limit_words(d: BlockDesign, form: BlockForm) -> str:
     if not (math.isfinite(d.low) or math.isfinite(d.high)):
         return "the design has none; the output stage has its own"
     ends = [write_value(v, d.command_unit) if math.isfinite(v) else "none" for v in (d.low, d.high)]
@@ -555,9 +561,10 @@ def _limit_words(d: Design, form: BlockForm) -> str:
     return f"{ends[0]} to {ends[1]} on the wire, behind that sum, in your program{own}"
 
 
-def _hardware_lines(loop: ClosedLoop, value: Mapping[str, float]) -> Iterator[str]:
-    if loop.pid.delay:
+def _hardware_lines(controller: Controller, value: Mapping[str, float]) -> Iterator[str]:
+    if controller.pid.delay:
         yield "Delay: the design counts on one sample from reading to acting: write the output at the next sample."
-    if loop.dither is not None and loop.dither.analogue and value["dither.amplitude"]:
-        size, frequency = write_value(value["dither.amplitude"], loop.command.unit), number(value["dither.frequency"])
-        yield f"Generator behind the output: a {loop.dither.waveform.value} of {size} peak at {frequency} Hz; hardware."
+    if controller.dither is not None and controller.dither.analogue and value["dither.amplitude"]:
+        size = write_value(value["dither.amplitude"], controller.command.unit)
+        wave, frequency = controller.dither.waveform.value, number(value["dither.frequency"])
+        yield f"Generator behind the output: a {wave} of {size} peak at {frequency} Hz; hardware."

@@ -15,6 +15,7 @@ from importlib import resources
 import casadi as ca
 import numpy as np
 
+from pneuopt.control.controller import Controller
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.dynamics.system import FRICTION_DIRECTION
 from pneuopt.export.identifiers import RESERVED_FILES, Identifiers, reserved_as
@@ -27,15 +28,15 @@ from pneuopt.export.writer import (
     Header,
     Names,
     OperationSyntax,
-    Page,
     Places,
+    ProgramText,
     Syntax,
     comment_text,
     infix,
     make_header,
     unary_calls,
     write_expressions,
-    write_page,
+    write_program_text,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -137,10 +138,10 @@ _HELPERS = {
 
 def write_c99(program: ControllerProgram, header: Header, run: ReferenceRun) -> dict[str, str]:
     """Header, source and test; their texts by the files' names."""
-    name, page = header.name, write_page(program, C99, Places("c->p.{}", "c->{}", "c->{}"), header.own_names)
+    name, body = header.name, write_program_text(program, C99, Places("c->p.{}", "c->{}", "c->{}"), header.own_names)
     return {
-        f"{name}.h": _header(program, header, page),
-        f"{name}.c": _source(program, header, page),
+        f"{name}.h": _header(program, header, body),
+        f"{name}.c": _source(program, header, body),
         f"{name}_test.c": _test(program, header, run),
     }
 
@@ -163,12 +164,12 @@ def _prototypes(program: ControllerProgram, name: str) -> tuple[str, str, str]:
     )
 
 
-def _header(program: ControllerProgram, header: Header, page: Page) -> str:
+def _header(program: ControllerProgram, header: Header, body: ProgramText) -> str:
     name, guard = header.name, f"{header.name.upper()}_H"
     prepare, start, step = _prototypes(program, name)
     signals = [f" * {v.name} {comment_text(f'[{v.unit}]: {v.meaning}')}" for v in program.inputs]
     last, out = program.start_inputs[-1], program.outputs[0]
-    coefficients = [f"    double {a.name};" for a in page.coefficients]
+    coefficients = [f"    double {a.name};" for a in body.coefficients]
     lines = [*_comment(header), f"#ifndef {guard}", f"#define {guard}", ""]
     lines += ["typedef struct {", *_members(program.parameters), f"}} {name}_parameters;", ""]
     lines += ["typedef struct {", f"    {name}_parameters p;", "    /* computed of them by prepare: */", *coefficients]
@@ -186,25 +187,25 @@ def _header(program: ControllerProgram, header: Header, page: Page) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _source(program: ControllerProgram, header: Header, page: Page) -> str:
+def _source(program: ControllerProgram, header: Header, body: ProgramText) -> str:
     name = header.name
     prepare, start, step = _prototypes(program, name)
-    texts = [a.text for a in (*page.coefficients, *page.start_locals, *page.start, *page.locals)]
+    texts = [a.text for a in (*body.coefficients, *body.start_locals, *body.start, *body.locals)]
     lines = [*_comment(header), f'#include "{name}.h"', "", "#include <math.h>", ""]
     if any("SAMPLE_TIME" in text for text in texts):
         lines += [f"#define SAMPLE_TIME {C99.literal(program.sample_time)} /* s */", ""]
-    lines += [text for operation, text in _HELPERS.items() if operation in page.operations]
+    lines += [text for operation, text in _HELPERS.items() if operation in body.operations]
     values = [f"    {C99.literal(v.value)}, /* {v.name} [{comment_text(v.unit)}] */" for v in program.parameters]
     lines += [f"const {name}_parameters {name}_tuned = {{", *values, "};", "", prepare, "{", "    c->p = *p;"]
-    lines += [f"    c->{a.name} = {a.text};" for a in page.coefficients]
-    unread = [v.name for v in program.start_inputs if not _reads((*page.start_locals, *page.start), v.name)]
+    lines += [f"    c->{a.name} = {a.text};" for a in body.coefficients]
+    unread = [v.name for v in program.start_inputs if not _reads((*body.start_locals, *body.start), v.name)]
     lines += ["}", "", start, "{", *(f"    (void)({n});" for n in unread)]
-    lines += [f"    const double {a.name} = {a.text};" for a in page.start_locals]
-    lines += [f"    c->{a.name} = {a.text};" for a in page.start]
-    unused = [v.name for v in program.inputs if not _reads(page.locals, v.name)]
+    lines += [f"    const double {a.name} = {a.text};" for a in body.start_locals]
+    lines += [f"    c->{a.name} = {a.text};" for a in body.start]
+    unused = [v.name for v in program.inputs if not _reads(body.locals, v.name)]
     lines += ["}", "", step, "{", *(f"    (void)({n});" for n in unused)]
-    lines += [*(f"    const double {a.name} = {a.text};" for a in page.locals), ""]
-    lines += [f"    c->{n} = {text};" for n, text in {**page.outputs, **page.states}.items()]
+    lines += [*(f"    const double {a.name} = {a.text};" for a in body.locals), ""]
+    lines += [f"    c->{n} = {text};" for n, text in {**body.outputs, **body.states}.items()]
     return "\n".join([*lines, f"    return c->{program.outputs[0].name};", "}"]) + "\n"
 
 
@@ -300,8 +301,8 @@ STRUCTURED_TEXT = _StructuredTextSyntax(
 
 def write_structured_text(program: ControllerProgram, header: Header) -> dict[str, str]:
     """One function block; its text by the file's name."""
-    page, name = write_page(program, STRUCTURED_TEXT, Places(), header.own_names), header.name
-    values = [*page.coefficients, *page.start_locals, *page.locals]
+    body, name = write_program_text(program, STRUCTURED_TEXT, Places(), header.own_names), header.name
+    values = [*body.coefficients, *body.start_locals, *body.locals]
     lines = ["(*", *(f"  {line}".rstrip() for line in header.lines), "*)", f"FUNCTION_BLOCK {name}", "VAR_INPUT"]
     lines += (
         _declare(program.inputs, False)
@@ -315,12 +316,12 @@ def write_structured_text(program: ControllerProgram, header: Header) -> dict[st
     period = STRUCTURED_TEXT.literal(program.sample_time)
     lines += ["END_VAR", "VAR CONSTANT", f"    SAMPLE_TIME : LREAL := {period}; (* s *)", "END_VAR", ""]
     lines += ["(* what the parameters alone give; they may be changed while it runs *)"]
-    lines += _assign({a.name: a.text for a in page.coefficients})
+    lines += _assign({a.name: a.text for a in body.coefficients})
     lines += ["", "IF restart OR NOT runs THEN"]
-    started = {a.name: a.text for a in (*page.start_locals, *page.start)}
+    started = {a.name: a.text for a in (*body.start_locals, *body.start)}
     lines += [f"    {line}" for line in _assign(started)]
-    lines += ["    runs := TRUE;", "END_IF;", "", *_assign({a.name: a.text for a in page.locals}), ""]
-    lines += [*_assign({**page.outputs, **page.states}), "END_FUNCTION_BLOCK"]
+    lines += ["    runs := TRUE;", "END_IF;", "", *_assign({a.name: a.text for a in body.locals}), ""]
+    lines += [*_assign({**body.outputs, **body.states}), "END_FUNCTION_BLOCK"]
     return {f"{name}.st": "\n".join(lines) + "\n"}
 
 
@@ -367,7 +368,7 @@ PYTHON = Syntax(
 
 def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     """One module with one class; its text by the file's name."""
-    page = write_page(program, PYTHON, Places("self.{}", "self.{}", "self.{}"), header.own_names)
+    body = write_program_text(program, PYTHON, Places("self.{}", "self.{}", "self.{}"), header.own_names)
     name = "".join(part[:1].upper() + part[1:] for part in header.name.split("_"))
     signature = ", ".join(f"{v.name}: float" for v in program.inputs)
     begin = ", ".join(f"{v.name}: float" for v in program.start_inputs[:-1])
@@ -390,22 +391,22 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     zeros = ", ".join("0.0" for _ in program.start_inputs[:-1])
     lines += ["        self.prepare()", f"        self.start({zeros})", ""]
     lines += ["    def prepare(self) -> None:", '        """Take over parameters that were changed."""']
-    lines += [f"        self.{a.name} = {a.text}" for a in page.coefficients]
+    lines += [f"        self.{a.name} = {a.text}" for a in body.coefficients]
     last = program.start_inputs[-1]
     usual = f"self.{program.originals[CENTRE].name}" if CENTRE in program.originals else "0.0"
     lines += ["", f"    def start(self, {begin}, {last.name}: float | None = None) -> None:"]
     lines += [f'        """Begin, or go on without a bump from {last.name}: {last.meaning}."""']
     lines += [f"        {last.name} = {usual} if {last.name} is None else {last.name}"]
-    lines += [f"        {a.name} = {a.text}" for a in page.start_locals]
-    lines += [f"        self.{a.name} = {a.text}" for a in page.start]
+    lines += [f"        {a.name} = {a.text}" for a in body.start_locals]
+    lines += [f"        self.{a.name} = {a.text}" for a in body.start]
     out = program.outputs[0]
     lines += [
         "",
         f"    def step(self, {signature}) -> float:",
         f'        """Compute a sample: {out.meaning} [{comment_text(out.unit)}]."""',
     ]
-    lines += [f"        {a.name} = {a.text}" for a in page.locals]
-    lines += [f"        self.{n} = {text}" for n, text in {**page.outputs, **page.states}.items()]
+    lines += [f"        {a.name} = {a.text}" for a in body.locals]
+    lines += [f"        self.{n} = {text}" for n, text in {**body.outputs, **body.states}.items()]
     return {f"{header.name}.py": "\n".join([*lines, f"        return self.{out.name}"]) + "\n"}
 
 
@@ -525,7 +526,7 @@ _WRITERS: Mapping[Language, Callable[[ControllerProgram, Header], dict[str, str]
 
 
 def export_controller(
-    loop: ClosedLoop,
+    loop: ClosedLoop | Controller,
     parameters: ParameterSet,
     language: Language,
     *,
@@ -537,8 +538,8 @@ def export_controller(
 
     Parameters
     ----------
-    loop : ClosedLoop
-        With a sample time.
+    loop : ClosedLoop or Controller
+        With a sample time. Of a loop, its controller alone is written.
     parameters : ParameterSet
         A missing one has the loop's default.
     language : Language
@@ -569,9 +570,14 @@ def export_controller(
     >>> list(export_controller(loop, loop.parameters, Language.C))
     ['controller.h', 'controller.c', 'controller_test.c']
     """
-    check_closed_loop(loop)
-    program = controller_program(loop, parameters, centre)
-    header = make_header(name, loop, parameters, centre, origin)
+    if isinstance(loop, Controller):
+        controller = loop
+    else:
+        check_closed_loop(loop)
+        loop.check(parameters)
+        controller = loop.controller
+    program = controller_program(controller, parameters, centre)
+    header = make_header(name, controller, parameters, centre, origin)
     _check_block_name(header, program)
     return _WRITERS[language](program, header)
 

@@ -1,7 +1,7 @@
 """The PID blocks of common controllers: what is typed in, by which formula and source, what is refused.
 
-`BlockForm` says what is known of a maker's block, `Design` has the numbers of a controller that such a block takes. A
-newcomer adds a maker: its `BlockForm`, and a row in `BLOCK_FORMS`.
+`BlockForm` says what is known of a maker's block, `BlockDesign` has the numbers of a controller that it takes. To add a
+maker, write its `BlockForm`, and a row in `BLOCK_FORMS`.
 """
 
 import math
@@ -22,7 +22,7 @@ PLAIN_WEIGHT = 0.5  # [1] of the set-point weights 0 and 1 a block takes the nea
 
 
 @dataclass(frozen=True)
-class Design:
+class BlockDesign:
     """The numbers of a tuned controller that a block takes, in SI units.
 
     Parameters
@@ -128,14 +128,14 @@ class BlockForm:
     title, formula : str
     sources : tuple of str
     settings : callable
-        From a `Design`; raises `InputError` for gains that the block cannot have.
+        From a `BlockDesign`; raises `InputError` for gains that the block cannot have.
     states : callable
-        What the output is at rest, at a fault and while the block is stopped, from a `Design`.
+        What the output is at rest, at a fault and while the block is stopped, from a `BlockDesign`.
     manual : str
         How it is held in manual at the centre.
     added : callable, optional
-        Where a signal in the command's unit is added before the limits, from a `Design`; None: the block has no such
-        input.
+        Where a signal in the command's unit is added before the limits, from a `BlockDesign`; None: the block has no
+        such input.
     weights : callable
         The set-point weights b and c that the block has in place of a design's own.
     has_filter : bool
@@ -149,11 +149,11 @@ class BlockForm:
     title: str
     formula: str
     sources: tuple[str, ...]
-    settings: Callable[[Design], list[Setting]]
-    states: Callable[[Design], list[str]]
+    settings: Callable[[BlockDesign], list[Setting]]
+    states: Callable[[BlockDesign], list[str]]
     manual: str
-    added: Callable[[Design], str] | None = None
-    weights: Callable[[Design], tuple[float, float]] = lambda d: (d.b, d.c)
+    added: Callable[[BlockDesign], str] | None = None
+    weights: Callable[[BlockDesign], tuple[float, float]] = lambda d: (d.b, d.c)
     has_filter: bool = True
     clamps: bool = True
     time_grain: float = 0.0
@@ -184,19 +184,19 @@ def nearest_weight(value: float) -> float:
     return 0.0 if value < PLAIN_WEIGHT else 1.0
 
 
-def wire(value: float, design: Design) -> str:
+def wire(value: float, design: BlockDesign) -> str:
     """An output in its unit."""
     return write_value(value, design.command_unit)
 
 
-def check_limits(design: Design, block: str) -> None:
+def check_limits(design: BlockDesign, block: str) -> None:
     """Refuse a design without limits where the block counts its output in percent of them."""
     told = f"{block} counts its output in percent of the command's range, and this design has no limits"
     remedy = "state limits under [pid] of tuning.toml and tune again, or use --to st"
     require(math.isfinite(design.span), f"{told}; {remedy}")
 
 
-def standard_times(design: Design, block: str) -> tuple[float, float]:
+def standard_times(design: BlockDesign, block: str) -> tuple[float, float]:
     """Ti, infinite for no integral, and Td [s] of a block whose gain multiplies all its terms.
 
     Raises
@@ -211,7 +211,7 @@ def standard_times(design: Design, block: str) -> tuple[float, float]:
     return Kp / Ki if Ki else math.inf, Kd / Kp if Kp else 0.0
 
 
-def direction(design: Design, block: str) -> float:
+def direction(design: BlockDesign, block: str) -> float:
     """1, or -1 of a design whose gains are negative; refuses gains of both signs."""
     Kp, Ki, Kd = design.gains.Kp, design.gains.Ki, design.gains.Kd
     signs = {math.copysign(1.0, g) for g in (Kp, Ki, Kd) if g}
@@ -223,7 +223,7 @@ def direction(design: Design, block: str) -> float:
 PID_COMPACT = "Siemens PID_Compact"
 
 
-def _siemens_settings(d: Design) -> list[Setting]:
+def _siemens_settings(d: BlockDesign) -> list[Setting]:
     check_limits(d, PID_COMPACT)
     Ti, Td = standard_times(d, PID_COMPACT)
     sign, percent = direction(d, PID_COMPACT), 100.0 / d.span
@@ -263,7 +263,7 @@ def _siemens_settings(d: Design) -> list[Setting]:
     ]
 
 
-def _siemens_states(d: Design) -> list[str]:
+def _siemens_states(d: BlockDesign) -> list[str]:
     rest = wire(d.centre, d)
     return [
         f"At error 0 from rest: Output = 0 %, {rest} on the wire.",
@@ -274,7 +274,7 @@ def _siemens_states(d: Design) -> list[str]:
     ]
 
 
-def _counts(d: Design) -> str:
+def _counts(d: BlockDesign) -> str:
     """The same in counts of an analogue output of 10 V, which has 27648 of them."""
     if d.command_unit != "V":
         return "; not Output_PER, which has no offset"
@@ -283,11 +283,11 @@ def _counts(d: Design) -> str:
     return f"; at a 10 V output {counts} counts, not Output_PER"
 
 
-def _siemens_weights(d: Design) -> tuple[float, float]:
+def _siemens_weights(d: BlockDesign) -> tuple[float, float]:
     return min(max(d.b, 0.0), 1.0), min(max(d.c, 0.0), 1.0)
 
 
-def _siemens_sum_input(d: Design) -> str:
+def _siemens_sum_input(d: BlockDesign) -> str:
     return (
         f"Disturbance = {number(100.0 / d.span)} %/({d.command_unit}) x sum (INFERRED: it is added before the limits)"
     )
@@ -318,32 +318,32 @@ USUAL_UPDATE = 0.01  # [s], where the update times of PID begin that are usual
 LOGIX_PID = "Rockwell PID"
 
 
-def _can_be_enhanced(d: Design) -> bool:
+def _can_be_enhanced(d: BlockDesign) -> bool:
     """Whether PIDE runs the design: its velocity form rests at the centre by its integral only."""
     return d.integrates and not d.is_added_to
 
 
-def _can_be_plain(d: Design) -> bool:
+def _can_be_plain(d: BlockDesign) -> bool:
     """Whether PID runs it as well as PIDE: its proportional term sees the error."""
     return nearest_weight(d.b) == 1 or not _can_be_enhanced(d)
 
 
-def _rockwell_weights(d: Design) -> tuple[float, float]:
+def _rockwell_weights(d: BlockDesign) -> tuple[float, float]:
     return (1.0 if _can_be_plain(d) else 0.0), nearest_weight(d.c)
 
 
-def _rockwell_settings(d: Design) -> list[Setting]:
+def _rockwell_settings(d: BlockDesign) -> list[Setting]:
     check_limits(d, LOGIX_PID)
     plain = _plain_settings(d) if _can_be_plain(d) else []
     return plain + (_enhanced_settings(d) if _can_be_enhanced(d) else [])
 
 
-def _scaled_gains(d: Design) -> tuple[float, float, float]:
+def _scaled_gains(d: BlockDesign) -> tuple[float, float, float]:
     scale = direction(d, LOGIX_PID) * d.pv_span / d.span
     return d.gains.Kp * scale, d.gains.Ki * scale, d.gains.Kd * scale
 
 
-def _plain_settings(d: Design) -> list[Setting]:
+def _plain_settings(d: BlockDesign) -> list[Setting]:
     Kp, Ki, Kd = _scaled_gains(d)
     inverse = direction(d, LOGIX_PID) < 0
     S, R = write_value(d.pv_span, difference_unit(d.measured_unit)), wire(d.span, d)
@@ -375,7 +375,7 @@ def _plain_settings(d: Design) -> list[Setting]:
     return [Setting(f"PID .{name}", value, formula) for name, value, formula in rows]
 
 
-def _enhanced_settings(d: Design) -> list[Setting]:
+def _enhanced_settings(d: BlockDesign) -> list[Setting]:
     Kp, Ki, Kd = _scaled_gains(d)
     inverse = direction(d, LOGIX_PID) < 0
     unit, on = d.measured_unit, d.command_unit
@@ -412,7 +412,7 @@ def _enhanced_settings(d: Design) -> list[Setting]:
     return [Setting(f"PIDE {name}", value, formula) for name, value, formula in rows]
 
 
-def _rockwell_states(d: Design) -> list[str]:
+def _rockwell_states(d: BlockDesign) -> list[str]:
     rest = f"{number(d.rest)} %, {wire(d.centre, d)} on the wire"
     lines = []
     if _can_be_plain(d):
@@ -435,7 +435,7 @@ def _rockwell_states(d: Design) -> list[str]:
     ]
 
 
-def _rockwell_sum_input(d: Design) -> str:
+def _rockwell_sum_input(d: BlockDesign) -> str:
     return f"BIAS = {number(d.rest)} + {number(100.0 / d.span)} %/({d.command_unit}) x sum, every scan"
 
 
@@ -465,7 +465,7 @@ OPEN_END = 1e38  # an end of the output that is never reached, where the other e
 UTIL_PID = "CODESYS Util.PID_FIXCYCLE"
 
 
-def _codesys_settings(d: Design) -> list[Setting]:
+def _codesys_settings(d: BlockDesign) -> list[Setting]:
     Ti, Td = standard_times(d, UTIL_PID)
     direction(d, UTIL_PID)  # typed in with their sign, which must be one
     name, unit = ("PID_FIXCYCLE" if d.integrates else "PD"), d.command_unit
@@ -489,7 +489,7 @@ def _codesys_settings(d: Design) -> list[Setting]:
     return [Setting(f"{name}.{field}", value, formula) for field, value, formula in rows]
 
 
-def _codesys_states(d: Design) -> list[str]:
+def _codesys_states(d: BlockDesign) -> list[str]:
     rest = wire(d.centre, d)
     block = "Util.PID_FIXCYCLE" if d.integrates else "Util.PD, as there is no integral: TN = 0 has no meaning in PID"
     task = f"it must be called by a task of {number(d.sample_time)} s"
@@ -503,11 +503,11 @@ def _codesys_states(d: Design) -> list[str]:
     ]
 
 
-def _is_rough(d: Design) -> bool:
+def _is_rough(d: BlockDesign) -> bool:
     return d.differentiates and not d.integrates
 
 
-def _codesys_sum_input(d: Design) -> str:
+def _codesys_sum_input(d: BlockDesign) -> str:
     return f"Y_OFFSET = {number(d.centre)} {d.command_unit} + sum, every cycle"
 
 
@@ -543,7 +543,7 @@ def _time(seconds: float) -> str:
     return f"T#{round(seconds / TIME_GRAIN)}ms" if math.isfinite(seconds) else "T#0ms"
 
 
-def _beckhoff_settings(d: Design) -> list[Setting]:
+def _beckhoff_settings(d: BlockDesign) -> list[Setting]:
     Ti, Td = standard_times(d, FB_CTRL_PID)
     direction(d, FB_CTRL_PID)  # typed in with their sign, which must be one
     shown = write_value(Ti, "s") if math.isfinite(Ti) else ""
@@ -572,7 +572,7 @@ def _beckhoff_settings(d: Design) -> list[Setting]:
     ]
 
 
-def _beckhoff_states(d: Design) -> list[str]:
+def _beckhoff_states(d: BlockDesign) -> list[str]:
     rest = wire(d.centre, d)
     return [
         f"At error 0 from rest: fOut = 0, {rest} on the wire.",
@@ -602,7 +602,7 @@ BECKHOFF_FORM = BlockForm(
 """FB_CTRL_PID of the Controller Toolbox: its output is 0 whenever it does not control."""
 
 
-def _simulink_settings(d: Design) -> list[Setting]:
+def _simulink_settings(d: BlockDesign) -> list[Setting]:
     Tf, (low, high) = d.gains.Tf, d.limits
     kind = {(True, True): "PID", (True, False): "PI"}.get((d.integrates, d.differentiates), "PD")
     begin = f"where it starts at rest, here y0 = {number(d.start)} {d.measured_unit}"
@@ -641,7 +641,7 @@ def _simulink_settings(d: Design) -> list[Setting]:
     ]
 
 
-def _filter_settings(d: Design, begin: str) -> list[Setting]:
+def _filter_settings(d: BlockDesign, begin: str) -> list[Setting]:
     return [
         Setting("Use filtered derivative", "on", "as the design"),
         Setting("N", number(1 / d.gains.Tf), "1/Tf, a pole [rad/s], not ISA's ratio"),
@@ -650,14 +650,14 @@ def _filter_settings(d: Design, begin: str) -> list[Setting]:
     ]
 
 
-def _integral_settings(d: Design, begin: str) -> list[Setting]:
+def _integral_settings(d: BlockDesign, begin: str) -> list[Setting]:
     return [
         Setting("Integrator method", "Backward Euler", "as the design is sampled"),
         Setting("Integrator initial condition", number(d.gains.Kp * (1 - d.b) * d.start), f"P (1 - b) y0, {begin}"),
     ]
 
 
-def _limit_settings(low: float, high: float, d: Design) -> list[Setting]:
+def _limit_settings(low: float, high: float, d: BlockDesign) -> list[Setting]:
     back = math.isfinite(d.Tt)
     inside = math.isfinite(low) or math.isfinite(high)
     if d.is_open or not inside:
@@ -674,7 +674,7 @@ def _limit_settings(low: float, high: float, d: Design) -> list[Setting]:
     ]
 
 
-def _simulink_states(d: Design) -> list[str]:
+def _simulink_states(d: BlockDesign) -> list[str]:
     rest = wire(d.centre, d)
     return [
         f"At error 0 from rest: the output is 0, {rest} on the wire behind the Bias block.",

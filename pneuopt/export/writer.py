@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from pneuopt.control.controller import LARGEST_SIGNAL
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.controller import LARGEST_SIGNAL, Controller
 from pneuopt.control.pid import integrates, to_series, to_standard
 from pneuopt.dynamics.compiled.c_writer import DIVISIONS, Instruction, read_instructions
 from pneuopt.export.identifiers import Identifiers
@@ -377,7 +376,7 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Page:
+class ProgramText:
     """A program in one language.
 
     Attributes
@@ -403,7 +402,9 @@ class Page:
     operations: frozenset[int]
 
 
-def write_page(program: ControllerProgram, syntax: Syntax, places: Places, taken: Iterable[str] = ()) -> Page:
+def write_program_text(
+    program: ControllerProgram, syntax: Syntax, places: Places, taken: Iterable[str] = ()
+) -> ProgramText:
     """Word a program in a language; no value on the way has a name of the program or one that is `taken`."""
     parameters = [places.parameter.format(v.name) for v in program.parameters]
     inputs, states = [v.name for v in program.inputs], [v.name for v in program.states]
@@ -434,7 +435,7 @@ def write_page(program: ControllerProgram, syntax: Syntax, places: Places, taken
         if text not in local:
             own.append(Assignment(name, text))
         found[name] = text if text in local else name
-    return Page(
+    return ProgramText(
         tuple(step.coefficients),
         (*started.coefficients, *started.statements),
         tuple(Assignment(n, started.results[begun]) for n, begun in zip(states, first, strict=True)),
@@ -497,13 +498,15 @@ def check_name(name: str) -> None:
     )
 
 
-def make_header(name: str, loop: ClosedLoop, parameters: ParameterSet, centre: float, origin: Sequence[str]) -> Header:
+def make_header(
+    name: str, controller: Controller, parameters: ParameterSet, centre: float, origin: Sequence[str]
+) -> Header:
     """The header of a controller: where it comes from, its sample time, its gains in every form, what to mind.
 
     Parameters
     ----------
     name : str
-    loop : ClosedLoop
+    controller : Controller
     parameters : ParameterSet
     centre : float
         Of the valve [the command's unit].
@@ -516,7 +519,7 @@ def make_header(name: str, loop: ClosedLoop, parameters: ParameterSet, centre: f
         If the name is no identifier.
     """
     check_name(name)
-    h, signal = loop.pid.sample_time or 0.0, loop.feedback
+    h, signal = controller.pid.sample_time or 0.0, controller.feedback
     lines = [
         f"{name}: sampled PID controller of the {signal.name}, written by pneuopt {provenance()['pneuopt']}",
         *origin,
@@ -525,18 +528,23 @@ def make_header(name: str, loop: ClosedLoop, parameters: ParameterSet, centre: f
     lines += [
         f"Sample time: {write_value(h, 's')}. Call it once a sample, at equal times; the gains hold for no other."
     ]
-    of = f" of the inner loop, which controls the {loop.pid_signal.name}" if loop.outer else ""
+    of = f" of the inner loop, which controls the {controller.pid_signal.name}" if controller.outer else ""
     lines += ["Numbers are in SI units, as marked.", "", f"Gains{of}, in every form that controllers take:"]
-    lines += [*_gain_lines(loop, parameters), *_part_lines(loop, parameters), "", *_notes(loop, parameters, centre)]
+    lines += [
+        *_gain_lines(controller, parameters),
+        *_part_lines(controller, parameters),
+        "",
+        *_notes(controller, parameters, centre),
+    ]
     return Header(name, tuple(map(comment_text, lines)))
 
 
-def _gain_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
+def _gain_lines(controller: Controller, parameters: ParameterSet) -> list[str]:
     """The gains in the parallel, standard and series forms."""
-    gains, gain = loop.parallel_form(parameters), unit_ratio(loop.command.unit, loop.pid_signal.unit)
+    gains, gain = controller.parallel_form(parameters), unit_ratio(controller.command.unit, controller.pid_signal.unit)
     units = {"Kp": gain, "K": gain, "Ti": "s", "Td": "s", "Tf": "s", "N": ""}
-    units["Ki"] = unit_ratio(loop.command.unit, f"{difference_unit(loop.pid_signal.unit)}*s")
-    units["Kd"] = unit_ratio(f"{difference_unit(loop.command.unit)}*s", loop.pid_signal.unit)
+    units["Ki"] = unit_ratio(controller.command.unit, f"{difference_unit(controller.pid_signal.unit)}*s")
+    units["Kd"] = unit_ratio(f"{difference_unit(controller.command.unit)}*s", controller.pid_signal.unit)
 
     def line(name: str, convert: Callable[[], Any], formula: str) -> str:
         try:
@@ -554,10 +562,10 @@ def _gain_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
     ]
 
 
-def _part_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
-    """The parts beside the PID, each with its parameters, in the loop's order."""
-    complete, parts = loop.complete(parameters), dict[str, list[str]]()
-    for n in (n for n in loop.parameters if n not in loop.plant.parameters):
+def _part_lines(controller: Controller, parameters: ParameterSet) -> list[str]:
+    """The parts beside the PID, each with its parameters, in the controller's order."""
+    complete, parts = controller.complete(parameters), dict[str, list[str]]()
+    for n in controller.parameters:
         section, _, name = n.partition(".")
         parts.setdefault(section, []).append(f"{name} = {write_value(complete.value(n), complete[n].unit)}")
     parts.pop("pid", None)
@@ -565,42 +573,42 @@ def _part_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
     return ["", "Parts beside it, which belong to the design as much as its gains:", *lines] if lines else []
 
 
-def _notes(loop: ClosedLoop, parameters: ParameterSet, centre: float) -> list[str]:
+def _notes(controller: Controller, parameters: ParameterSet, centre: float) -> list[str]:
     """What the hardware around the block has to do."""
-    value = dict(zip(loop.parameters, loop.parameter_vector(parameters).tolist(), strict=True))
-    notes, unit = list[str](), loop.command.unit
+    value = controller.values(parameters)
+    notes, unit = list[str](), controller.command.unit
     if centre:
         notes += [f"The output is {write_value(centre, unit)}, where the valve is closed, plus the command."]
-    if loop.pid.limits and all(math.isfinite(value[n]) for n in ("pid.lower", "pid.upper")):
+    if controller.pid.limits and all(math.isfinite(value[n]) for n in ("pid.lower", "pid.upper")):
         low, high = (write_value(value[n] + centre, unit) for n in ("pid.lower", "pid.upper"))
         about = "; lower and upper count from the centre" if centre else ""
         notes += [f"The output runs from {low} to {high}{about}."]
-    notes += [*_start_notes(loop, parameters, value), *_fault_notes(loop, value, centre)]
-    if loop.pid.delay:
+    notes += [*_start_notes(controller, parameters, value), *_fault_notes(controller, value, centre)]
+    if controller.pid.delay:
         notes += ["The design counts on one sample from reading to acting."]
-    if loop.dither is not None and loop.dither.analogue:
-        size, frequency = write_value(value["dither.amplitude"], loop.command.unit), value["dither.frequency"]
-        shape = loop.dither.waveform.value
+    if controller.dither is not None and controller.dither.analogue:
+        size, frequency = write_value(value["dither.amplitude"], controller.command.unit), value["dither.frequency"]
+        shape = controller.dither.waveform.value
         notes += [
             f"A generator behind the block adds a {shape} of {size} peak at {frequency:.9g} Hz; it is not in here."
         ]
-    if loop.schedule is not None:
-        told = " and with the load told, schedule_load" if loop.schedule.load is not None else ""
-        gains = ", ".join(loop.schedule.gains)
+    if controller.schedule is not None:
+        told = " and with the load told, schedule_load" if controller.schedule.load is not None else ""
+        gains = ", ".join(controller.schedule.gains)
         notes += [
             f"Scheduled with the position{told}: {gains}. The gains above hold in the middle, at the nominal load."
         ]
-    if loop.sensor is not None:
-        notes += [f"Designed behind a sensor: {loop.sensor!r}."]
-    if loop.pid.limits and math.isinf(value["pid.lower"]) and math.isinf(value["pid.upper"]):
+    if controller.sensor is not None:
+        notes += [f"Designed behind a sensor: {controller.sensor!r}."]
+    if controller.pid.limits and math.isinf(value["pid.lower"]) and math.isinf(value["pid.upper"]):
         notes += ["The output has no limits; set lower and upper."]
     return notes
 
 
-def _start_notes(loop: ClosedLoop, parameters: ParameterSet, value: Mapping[str, float]) -> list[str]:
+def _start_notes(controller: Controller, parameters: ParameterSet, value: Mapping[str, float]) -> list[str]:
     """What a start does with the output so far, and why."""
-    time = write_value(float(loop.pid.emptying_time({n.removeprefix("pid."): v for n, v in value.items()})), "s")
-    if not integrates(loop.parallel_form(parameters).Ki):
+    time = write_value(float(controller.pid.emptying_time({n.removeprefix("pid."): v for n, v in value.items()})), "s")
+    if not integrates(controller.parallel_form(parameters).Ki):
         return [
             "A start, or restart, does not make the output jump: the output so far passes to the controller's own",
             f"with a time constant of {time}. Without an integral gain nothing is kept there, at a limit neither.",
@@ -611,11 +619,11 @@ def _start_notes(loop: ClosedLoop, parameters: ParameterSet, value: Mapping[str,
     ]
 
 
-def _fault_notes(loop: ClosedLoop, value: Mapping[str, float], centre: float) -> list[str]:
+def _fault_notes(controller: Controller, value: Mapping[str, float], centre: float) -> list[str]:
     """What happens at a sample that is no number, after how many, and how the controller recovers."""
-    count, h = math.ceil(value["pid.fault_samples"]), loop.pid.sample_time or 0.0
+    count, h = math.ceil(value["pid.fault_samples"]), controller.pid.sample_time or 0.0
     inside = min(max(value["pid.fault_output"], value.get("pid.lower", -math.inf)), value.get("pid.upper", math.inf))
-    safe, time = write_value(inside + centre, loop.command.unit), write_value(count * h, "s", 3)
+    safe, time = write_value(inside + centre, controller.command.unit), write_value(count * h, "s", 3)
     return [
         f"A sample is bad where an input is no number, or larger than {LARGEST_SIGNAL:g}: the output stays as it was,",
         "fault is set, and the next good sample goes on from there, its differences taken over the whole gap.",

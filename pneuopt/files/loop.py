@@ -199,7 +199,7 @@ def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensa
 
 
 def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centre: float) -> ParameterSet:
-    own = loop.parameters.select(n for n in loop.parameters if n.startswith(tuple(f"{s}." for s in LOOP_SECTIONS)))
+    own = loop.controller.parameters
     read = _read_limits(table["pid"], own, centre, f"{path}: [pid] limits")
     for section in TUNABLE_SECTIONS:
         read |= _section_parameters(table.get(section, {}), section, own, f"{path}: [{section}]")

@@ -8,7 +8,6 @@ from math import inf
 import numpy as np
 
 from pneuopt.control.averaging import is_affine
-from pneuopt.control.compensators import acting_always
 from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.linear_loop import ComposedLoops
 from pneuopt.control.loop import ClosedLoop, find_rest, set_sliding_direction
@@ -256,7 +255,7 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Spe
 def _shapes_linear_loop(loop: ClosedLoop, n: str) -> bool:
     """Whether the linearised loop depends on a parameter of the controller."""
     section, _, name = n.partition(".")
-    acting = {"dither", "position_loop", "schedule", *(part.section for part in acting_always(loop))}
+    acting = {"dither", "position_loop", "schedule", *(part.section for part in loop.controller.acting_always)}
     return section in acting or (section == "pid" and name in loop.pid.form.gains)
 
 

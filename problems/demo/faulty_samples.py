@@ -106,7 +106,7 @@ def draw_case(seed: int) -> Case:
     g = np.random.default_rng(seed + 2000)
     faults = {"pid.fault_samples": float(g.integers(1, 9)), "pid.fault_output": float(g.uniform(-3.0, 3.0))}
     parameters = parameters.with_values(faults)
-    return Case(loop, parameters, centre, controller_program(loop, parameters, centre))
+    return Case(loop, parameters, centre, controller_program(loop.controller, parameters, centre))
 
 
 def draw_sequence(case: Case, seed: int, samples: int = SAMPLES) -> Faulty:
@@ -297,7 +297,7 @@ def try_controller(
 ) -> None:
     """One controller over its sequences, in all languages."""
     case, wanted = draw_case(seed), set(languages)
-    header = make_header("pid_x", case.loop, case.parameters, case.centre, [])
+    header = make_header("pid_x", case.loop.controller, case.parameters, case.centre, [])
     given = [draw_sequence(case, 1000 * seed + k) for k in range(sequences)]
     runs: list[dict[str, Outputs]] = [{"library": run_library(case, s), "program": run_program(case, s)} for s in given]
     if "python" in wanted:

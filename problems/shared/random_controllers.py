@@ -105,7 +105,7 @@ def run_library(seed: int) -> Run:
     loop, parameters, centre = random_loop(seed)
     g, h, p = np.random.default_rng(seed + 1000), loop.pid.sample_time or 0.0, loop.parameter_vector(parameters)
     order, plant = names(loop.states), names(loop.plant.states)
-    program = controller_program(loop, parameters, centre)
+    program = controller_program(loop.controller, parameters, centre)
     motion = 0.05 * np.cumsum(g.normal(size=(SAMPLES, 2)), axis=0) * [0.02, 0.2]
     reference = 0.3 * np.repeat(g.normal(size=SAMPLES // 50), 50)
     more = g.normal(size=(SAMPLES, len(loop.motion_inputs))) * 0.1

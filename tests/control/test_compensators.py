@@ -16,11 +16,11 @@ from pneuopt.control.compensators import (
     PRESSURES,
     AccelerationFeedback,
     Compensator,
+    ControllerSnapshot,
     DeadZoneInverse,
     Direction,
     FrictionFeedforward,
     ImpulsiveControl,
-    Instant,
     Knocker,
     MotionFeedforward,
     PressureFeedback,
@@ -209,7 +209,7 @@ def test_derivatives_agree_with_finite_differences(section: str) -> None:
     x = {q.name: ca.SX.sym(q.name) for q in kind.states(SPEED, Quantity("u", "V"))}
     p = {n: ca.SX.sym(n) for n in kind.parameters(SPEED, "V")}
     rates, read = ({n: ca.SX.sym(n) for n in own} for own in (kind.motion_inputs(SPEED), kind.reads(SPEED)))
-    moved, added = kind.act(Instant(ca.SX(0.0), r, y, v, H, rates, read), x, p)
+    moved, added = kind.act(ControllerSnapshot(ca.SX(0.0), r, y, v, H, rates, read), x, p)
     assert list(moved) == list(x)
     smooth = [n for n in p if n not in kind.without_gradient]
     z = ca.vertcat(r, y, v, *rates.values(), *read.values(), *x.values(), *p.values())

@@ -18,7 +18,7 @@ from pneuopt.control.compensators import (
     MotionFeedforward,
     PressureFeedback,
 )
-from pneuopt.control.controller import Feedforward, PositionLoop
+from pneuopt.control.controller import Controller, Feedforward, PlantSignals, PositionLoop
 from pneuopt.control.dither import Dither
 from pneuopt.control.linear_loop import ComposedLoops, _exponentials, noise_path, open_loop
 from pneuopt.control.loop import ClosedLoop
@@ -35,6 +35,7 @@ from pneuopt.evaluation.record import record
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.evaluation.specification import specify
+from pneuopt.export.languages import Language, export_controller
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models import catalog
 from pneuopt.models.drive import ForceDrive
@@ -43,7 +44,7 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, ModelError
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.racing import Racing
@@ -669,3 +670,25 @@ def test_a_delay_is_a_whole_sample_of_a_sampled_controller() -> None:
     for delay in (0.5, 2, -1):
         with pytest.raises(InputError, match=f"delay is 0 or 1, whole samples, got {delay}"):
             PID(1e-3, delay=delay)  # type: ignore[arg-type]
+
+
+def test_a_controller_needs_no_plant_to_run_and_to_be_exported() -> None:
+    """Of the signals alone it is the same controller as in a loop, to the byte of its files."""
+    loop = ClosedLoop(
+        ForceDrive(Stribeck()).system(),
+        PID(sample_time=1e-3),
+        Dither(frequency=160.0),
+        measured="position",
+        sensor=Encoder(),
+        compensators=(MotionFeedforward(),),
+        outer=PositionLoop(),
+    )
+    command, outputs = Quantity("force", "N", 100.0), {q.name: q for q in loop.plant.outputs}
+    signals = PlantSignals(command, outputs["position"], outputs, loop.plant.axis)
+    alone = Controller(loop.pid, signals, loop.dither, loop.sensor, None, loop.compensators, loop.outer)
+    assert list(alone.parameters) == [n for n in loop.parameters if n not in loop.plant.parameters]
+    assert [*loop.plant.states, *alone.states] == [*loop.states]
+    parameters = alone.parameters.with_values({"pid.Kp": 300.0, "pid.Ki": 2000.0, "dither.amplitude": 3.0})
+    for language in Language:
+        files = export_controller(alone, parameters, language)
+        assert files == export_controller(loop, loop.parameters | parameters, language)

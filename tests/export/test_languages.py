@@ -70,8 +70,8 @@ QUICK = 0  # the seed whose structured text is short: blark takes seconds for a 
 
 def written(seed: int, language: str) -> tuple[dict[str, str], ReferenceRun, float]:
     run = run_library(seed)
-    program = controller_program(run.loop, run.parameters, run.centre)
-    header = make_header("pid_x", run.loop, run.parameters, run.centre, ["of tuned.toml"])
+    program = controller_program(run.loop.controller, run.parameters, run.centre)
+    header = make_header("pid_x", run.loop.controller, run.parameters, run.centre, ["of tuned.toml"])
     given = ReferenceRun(run.inputs, run.outputs)
     if language == "c":
         return write_c99(program, header, given), given, run.centre
@@ -118,7 +118,7 @@ def test_structured_text_parses_runs_and_equals_the_loop(seed: int) -> None:
     one = run_library(seed)
     block = FunctionBlock(files["pid_x.st"])
     block.variables["start_output"] = centre
-    given = [v.name for v in controller_program(one.loop, one.parameters, one.centre).inputs]
+    given = [v.name for v in controller_program(one.loop.controller, one.parameters, one.centre).inputs]
     found = [block.call(**dict(zip(given, row, strict=True)))["output"] for row in run.inputs.tolist()]
     assert largest_difference(found, run) <= TOLERANCE
 
@@ -244,13 +244,15 @@ def test_a_block_that_is_called_as_something_else_is_refused_with_a_name_that_go
 
 def test_a_value_on_the_way_is_not_called_as_the_block() -> None:
     run = run_library(0)
-    program = controller_program(run.loop, run.parameters, run.centre)
-    text = write_structured_text(program, make_header("v1", run.loop, run.parameters, run.centre, []))["v1.st"]
+    program = controller_program(run.loop.controller, run.parameters, run.centre)
+    text = write_structured_text(program, make_header("v1", run.loop.controller, run.parameters, run.centre, []))[
+        "v1.st"
+    ]
     assert wrong_names(text) == []
 
 
 def test_names_are_alike_in_every_language() -> None:
-    program = controller_program(LOOP, LOOP.parameters)
+    program = controller_program(LOOP.controller, LOOP.parameters)
     files = {n: t for kind in Language for n, t in export_controller(LOOP, LOOP.parameters, kind).items()}
     for v in (*program.parameters, *program.inputs, *program.states, *program.outputs):
         assert all(v.name in files[f"controller.{end}"] for end in ("h", "st", "py"))
@@ -272,8 +274,8 @@ def test_the_pages_script_has_no_reserved_or_doubled_name(seed: int) -> None:
 
 
 def test_restart_begins_a_block_anew() -> None:
-    program = controller_program(LOOP, LOOP.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 30.0}))
-    header = make_header("axis", LOOP, LOOP.parameters, 0.0, [])
+    program = controller_program(LOOP.controller, LOOP.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 30.0}))
+    header = make_header("axis", LOOP.controller, LOOP.parameters, 0.0, [])
     text = write_structured_text(program, header)["axis.st"]
     block, fresh = FunctionBlock(text), FunctionBlock(text)
     rows = np.random.default_rng(0).normal(size=(20, 2)).tolist()
@@ -298,7 +300,7 @@ def drawn(seed: int) -> tuple[Case, Faulty]:
 
 
 def sources(case: Case, language: str) -> dict[str, str]:
-    header = make_header("pid_x", case.loop, case.parameters, case.centre, [])
+    header = make_header("pid_x", case.loop.controller, case.parameters, case.centre, [])
     if language == "c":
         return write_c99(case.program, header, make_reference_run(case.program))
     return {"python": write_python, "st": write_structured_text}[language](case.program, header)

@@ -171,7 +171,7 @@ def test_the_header_tells_of_starts_and_faults(Ki: float, told: str) -> None:
     loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-2))
     values = {"pid.Ki": Ki, "pid.Tt": 0.25, "pid.lower": -5.0, "pid.upper": 5.0}
     p = loop.parameters.with_values({**values, "pid.fault_samples": 7.0, "pid.fault_output": -9.0})
-    text = " ".join(make_header("pid", loop, p, 5.0, []).lines)
+    text = " ".join(make_header("pid", loop.controller, p, 5.0, []).lines)
     assert told in text
     assert "a time constant of 250 ms" in text
     assert "After 7 bad samples in a row (fault_samples), 70 ms, the output goes to 0 V (fault_output)" in text
