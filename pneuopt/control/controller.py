@@ -319,8 +319,8 @@ class Controller:
     def is_composed(self) -> bool:
         """Whether more than a PID of one signal is fed back, so that the loop is linearised by `ComposedLoops`."""
         on = self.sensed_signal
-        states = (part for part in self.acting_always if part.states(on, self.command))
-        return bool(self.outer or self.schedule) or any(states)
+        remembers = any(part.states(on, self.command) for part in self.acting_always)
+        return bool(self.outer or self.schedule) or remembers
 
     @property
     def acting_always(self) -> tuple[Compensator, ...]:
@@ -337,7 +337,7 @@ class Controller:
             require(time > 0, f"feedforward.time must be positive, got {time:g} s; without it set its gain to zero")
         if self.schedule:
             self.schedule.check_values(without_prefix(value, "schedule"))
-        check_values(self.compensators, self.parameters, value, self.count_size(parameters))
+        check_values(self.compensators, self.parameters, value, self.sensor_resolution(parameters))
         self.pid.check({**without_prefix(value, "pid"), "Tf": self.parallel_form(parameters).Tf}, self.command.unit)
 
     def complete(self, parameters: ParameterSet) -> ParameterSet:
@@ -366,12 +366,12 @@ class Controller:
         """The sensor's time constant in the loop linearised [s]; its parameters are numbers or arrays."""
         return self.sensor.time_constant(self.sensed_signal, without_prefix(p, "sensor")) if self.sensor else 0.0
 
-    def count_size(self, parameters: ParameterSet) -> float:
+    def sensor_resolution(self, parameters: ParameterSet) -> float:
         """What one count of the sensor changes its reading by [feedback's unit]; 0 of a sensor without counts."""
         if self.sensor is None:
             return 0.0
         on = replace(self.sensed_signal, measured=self.feedback)
-        return self.sensor.count_size(on, without_prefix(self.values(parameters), "sensor"))
+        return self.sensor.reading_resolution(on, without_prefix(self.values(parameters), "sensor"))
 
     @property
     def dead_time(self) -> float:
@@ -664,7 +664,9 @@ class Controller:
         p = dict(self.schedule_gains(p, measured, seen, y))
         position = measured if self.outer is None else seen["count"] if "count" in seen else y[self.feedback.name]
         inner = self.inner_inputs(u, position, p)
-        x = {**x, **self._begin_anew(anew, x, inner, measured, y, p)}
+        begun = self.start(inner, measured, y, self.pid.sent(without_prefix(x, "pid")), p)
+        kept = ("pid.command", "pid.pending", _COUNT)  # what was sent stays; the count matters at bad samples alone
+        x = {**x, **_choose(anew, {n: v for n, v in begun.items() if n not in kept}, x)}
         if self.pid.reset:
             error = u["reference"] - position
             moved = reset_integral(without_prefix(x, "pid"), error, without_prefix(p, "pid"))
@@ -672,8 +674,8 @@ class Controller:
         moved, added = self._added_command(t, x, inner, measured, y, p)
         arguments = without_prefix(x, "pid"), inner["reference"], measured
         own = without_prefix(p, "pid")
-        kept = {} if isinstance(self.sensor, SensorLag) else with_prefix(seen, "sensor")
-        after = kept | with_prefix(self.pid.update(*arguments, added, own), "pid") | moved
+        read = {} if isinstance(self.sensor, SensorLag) else with_prefix(seen, "sensor")
+        after = read | with_prefix(self.pid.update(*arguments, added, own), "pid") | moved
         terms = self.pid.terms(*arguments, own) | self._added_terms(t, x, inner, measured, y, p)[1]
         gains = zip(Form.PARALLEL.gains, parallel_gains(self.pid.form, own), strict=True)
         terms |= {f"{n}_parallel": value for n, value in gains}
@@ -689,15 +691,6 @@ class Controller:
             x = {**x, **_choose(anew, with_prefix(self.sensor.rest(y, on, own), "sensor"), x)}
         elapsed = self.pid.elapsed_time(without_prefix(x, "pid"))
         return {**x}, self.sensor.update(without_prefix(x, "sensor"), y, on, own, elapsed)
-
-    def _begin_anew(self, anew: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols) -> Signals:
-        """The states with which the law begins where it begins anew, and as they are elsewhere.
-
-        But for what was sent, which stays, and the count, on which nothing depends where nothing has changed.
-        """
-        begun = self.start(u, measured, y, self.pid.sent(without_prefix(x, "pid")), p)
-        kept = ("pid.command", "pid.pending", _COUNT)
-        return _choose(anew, {n: v for n, v in begun.items() if n not in kept}, x)
 
 
 def signals_are_good(values: list[Any]) -> ca.SX:

@@ -318,9 +318,9 @@ class ClosedLoop:
         """The sensor's time constant in the loop linearised [s]; p of shape (n_parameters,) or (n_parameters, m)."""
         return self.controller.sensor_lag(dict(zip(self.parameters, p, strict=True)))
 
-    def count_size(self, parameters: ParameterSet) -> float:
+    def sensor_resolution(self, parameters: ParameterSet) -> float:
         """What one count of the sensor changes its reading by [feedback's unit]; 0 of a sensor without counts."""
-        return self.controller.count_size(parameters)
+        return self.controller.sensor_resolution(parameters)
 
     def dither_period(self, parameters: ParameterSet) -> float | None:
         """The time over which averages and ripple are taken [s] (`Dither.period`); None without dither."""

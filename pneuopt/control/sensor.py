@@ -122,7 +122,7 @@ class SensorLag:
         """Of the loop linearised [s]."""
         return p["lag"]
 
-    def count_size(self, _on: SensedSignal, _p: Mapping[str, float]) -> float:
+    def reading_resolution(self, _on: SensedSignal, _p: Mapping[str, float]) -> float:
         """What one count changes the reading by: nothing, it has no counts."""
         return 0.0
 
@@ -221,7 +221,7 @@ class Encoder:
         """Of the loop linearised [s]; half a sample of it is the difference's."""
         return p["filter"] + 0.5 * on.h if self.differentiates(on) else 0.0
 
-    def count_size(self, on: SensedSignal, p: Mapping[str, float]) -> float:
+    def reading_resolution(self, on: SensedSignal, p: Mapping[str, float]) -> float:
         """What one count changes the reading by [measured unit]; 0 without counts."""
         if not self.resolution:
             return 0.0
