@@ -393,13 +393,13 @@ PULSE_WIDTH, PAUSE = 0.018, 0.016  # [s] defaults: a valve's spool cannot follow
 LEAST_LIMIT, LEAST_TOLERANCE = 1e-9, 1e-12  # [command's unit, error's unit] by which is divided
 PULSE_TOLERANCE = 1e-4  # [error's unit] default: a tenth of a millimetre
 GROWTH, BRAKE = 1.1, 0.6  # [1] defaults: a larger growth arrives sooner, or beyond the reference; see `brake`
-SHARE = 0.5  # part of the error that a pulse shall take away: a larger one overshoots, a smaller one needs more pulses
+PULSE_SHARE = 0.5  # part of the error that a pulse shall take away: more overshoots, less needs more pulses
 # Exponents of the ratio of the way wanted to that of the last pulse, where the peak rises and where it falls. A force
 # that rises and falls at a given rate moves a body over (P - F)^3, F being the breakaway force: a peak of 1.2 F has a
 # slope of 18 in logarithms, one of 1.6 F of 8. With larger ones the body is thrown to and fro, with smaller ones the
 # peak learns slowly.
 RISE, FALL = 0.05, 0.15
-STILL = 0.2  # of the tolerance: changes of the error below count as standstill; an encoder's count must lie below
+STANDSTILL_SHARE = 0.2  # of the tolerance: changes of the error below are a standstill; an encoder's count lies below
 # Factor by which the peak rises at least towards one that has gone too far, and beyond it, should it no longer move the
 # body: a larger one throws it, a smaller one takes more pulses.
 LEAST_RISE = 1.02
@@ -501,7 +501,7 @@ class ImpulsiveControl:
         width, pause = (ca.fmax(1.0, ca.floor(p[n] / h + 0.5)) for n in ("width", "pause"))
         rests = ca.fabs(seen.rates.get(REFERENCE_SPEED, 0.0)) <= 0
         quiet = ca.logic_and(rests, x["phase"] + 1 >= x["length"])
-        stays = ca.logic_and(quiet, ca.fabs(e - x["error"]) < STILL * p["tolerance"])
+        stays = ca.logic_and(quiet, ca.fabs(e - x["error"]) < STANDSTILL_SHARE * p["tolerance"])
         standing = ca.if_else(stays, x["standing"] + 1, 0)
         fires = ca.logic_and(standing >= pause, ca.fabs(e) > p["tolerance"])
         last = ca.if_else(rests, x["peak"], 0)
@@ -531,7 +531,7 @@ def _next_peak(e: Any, last: Any, before: Any, ceiling: Any, p: Symbols) -> tupl
     Known are the last peak (0: none), the error before it, and the ceiling, the last peak that went too far (0: none).
     """
     way = ca.fmax((before - e) * ca.if_else(last < 0, -1, 1), LEAST_WAY * p["tolerance"])
-    ratio = ca.fmax(SHARE * ca.fabs(e), LEAST_WAY * p["tolerance"]) / way
+    ratio = ca.fmax(PULSE_SHARE * ca.fabs(e), LEAST_WAY * p["tolerance"]) / way
     size, turns = ca.fabs(last), last * e < 0
     known = ca.if_else(turns, 0, ca.if_else(ratio < 1, size, ceiling))
     halfway = ca.fmax(ca.sqrt(known / ca.fmax(size, LEAST_PEAK)), LEAST_RISE)
@@ -644,7 +644,7 @@ class PressureFeedback:
         >>> [(n, p.unit) for n, p in PressureFeedback().parameters(on, "V").items()]
         [('gain', 'V/Pa'), ('time', 's')]
         """
-        gain = unit_ratio(unit, difference_unit(_pressure(on).unit))
+        gain = unit_ratio(unit, difference_unit(_pressure_quantity(on).unit))
         return ParameterSet(
             {
                 "gain": Parameter(0.0, gain, meaning="command taken back per differential pressure"),
@@ -664,27 +664,27 @@ class PressureFeedback:
 
     def states(self, on: SensedSignal, _command: Quantity) -> tuple[Quantity, ...]:
         """The slow part of the differential pressure."""
-        return (Quantity("slow", difference_unit(_pressure(on).unit), PRESSURE_NOMINAL),)
+        return (Quantity("slow", difference_unit(_pressure_quantity(on).unit), PRESSURE_NOMINAL),)
 
     def start(self, _on: SensedSignal, seen: ControllerSnapshot) -> list[Any]:
         """The pressures so far are the slow part."""
-        return [_difference(seen)]
+        return [_differential_pressure(seen)]
 
     def act(self, seen: ControllerSnapshot, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The slow part's rate or next value, and u_p [the command's unit]."""
-        d, h, time = _difference(seen), seen.elapsed, p["time"]
+        d, h, time = _differential_pressure(seen), seen.elapsed, p["time"]
         if h is None:
             return {"slow": (d - x["slow"]) / time}, p["gain"] * (x["slow"] - d)
         slow = (time * x["slow"] + h * d) / (time + h)
         return {"slow": slow}, p["gain"] * (slow - d)
 
 
-def _difference(seen: ControllerSnapshot) -> Any:
+def _differential_pressure(seen: ControllerSnapshot) -> Any:
     a, b = (seen.readings[n] for n in PRESSURES)
     return a - b
 
 
-def _pressure(on: SensedSignal) -> Quantity:
+def _pressure_quantity(on: SensedSignal) -> Quantity:
     """The pressure's signal; a list of keys knows no plant."""
     return on.outputs.get(PRESSURES[0], Quantity(PRESSURES[0], "Pa(a)"))
 
