@@ -303,7 +303,7 @@ class Surroundings:
 
 def acting_controller(controller: Controller, parameters: ParameterSet) -> Controller:
     """The controller without the parts whose parameters make them add nothing."""
-    value = _values(controller, parameters)
+    value = controller.values(parameters)
     schedule, lead, dither = controller.schedule, controller.feedforward, controller.dither
     scheduled = schedule is not None and any(
         value[n]
@@ -350,7 +350,7 @@ def find_surroundings(
     InputError
         If a part of the design has no counterpart among the maker's standard blocks.
     """
-    value = _values(controller, parameters)
+    value = controller.values(parameters)
     low, high = _process_range(references, measured_span, controller.feedback.unit)
     outer = _outer_design(controller, value, references, (low, high))
     if outer is not None:
@@ -368,7 +368,7 @@ def find_surroundings(
 
 def design_of(controller: Controller, parameters: ParameterSet, centre: float) -> BlockDesign:
     """The numbers of a controller's PID."""
-    value = _values(controller, parameters)
+    value = controller.values(parameters)
     motion = any(isinstance(c, MotionFeedforward) for c in controller.compensators)
     sampled_dither = controller.dither is not None and (not controller.dither.analogue or value["dither.offset"] != 0)
     return BlockDesign(
@@ -385,10 +385,6 @@ def design_of(controller: Controller, parameters: ParameterSet, centre: float) -
         controller.command.unit,
         is_added_to=motion or sampled_dither,
     )
-
-
-def _values(controller: Controller, parameters: ParameterSet) -> dict[str, float]:
-    return {n: p.value for n, p in controller.complete(parameters).items()}
 
 
 def _acts(part: object, value: Mapping[str, float]) -> bool:

@@ -19,10 +19,7 @@ SAMPLE, CENTRE = "sample", "centre"  # the state that counts samples; the parame
 ADDED_TERMS = ("integral", "derivative", "proportional", "feedforward", "compensation", "dither")
 """Terms of the command, whose names end in _term: each is one summand, no state."""
 FIXED_NAMES = ("setpoint", "measured", "start_output")  # signals of every block
-C_NAMES = (
-    "c",
-    "p",
-)  # by which C reaches what is kept: a parameter, which is kept in a structure of its own, may have them
+C_NAMES = ("c", "p")  # by which C reaches what is kept; a parameter, in a structure of its own, may have them
 STATE_MEANINGS: Mapping[str, str] = {
     SAMPLE: "samples since the start",
     "sensor.reading": "filtered speed",
