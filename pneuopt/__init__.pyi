@@ -1,13 +1,27 @@
 """The public names and their homes, from which `__init__.py` loads them when they are first used."""
 
 from . import plotting
-from .control.acceleration_feedback import AccelerationFeedback
 from .control.averaging import average_dither, mean_start, ripple
 from .control.bumpless import bumpless_transfer
-from .control.dead_zone_inverse import DeadZoneInverse
+from .control.compensators import (
+    AccelerationFeedback,
+    DeadZoneInverse,
+    Direction,
+    FrictionFeedforward,
+    ImpulsiveControl,
+    Knocker,
+    MotionFeedforward,
+    PressureFeedback,
+)
+from .control.controller import Feedforward, PositionLoop
 from .control.dither import Dither, Waveform
-from .control.feedforward import Feedforward
-from .control.forms import (
+from .control.gain_schedule import GainSchedule
+from .control.linear_loop import linear_plant, open_loop
+from .control.loop import ClosedLoop
+from .control.moves import MotionPath, Move, MoveProfile, MoveSequence
+from .control.pid import (
+    PID,
+    AntiWindup,
     Form,
     ParallelForm,
     SeriesForm,
@@ -18,19 +32,6 @@ from .control.forms import (
     to_series,
     to_standard,
 )
-from .control.friction_feedforward import Direction, FrictionFeedforward
-from .control.gain_schedule import GainSchedule
-from .control.impulsive_control import ImpulsiveControl
-from .control.knocker import Knocker
-from .control.linear_loop import linear_plant, open_loop
-from .control.loop import ClosedLoop
-from .control.motion_feedforward import MotionFeedforward
-from .control.motion_path import MotionPath
-from .control.move_sequence import MoveSequence
-from .control.moves import Move, MoveProfile
-from .control.pid import PID, AntiWindup
-from .control.position_loop import PositionLoop
-from .control.pressure_feedback import PressureFeedback
 from .control.reference import Reference, Step
 from .control.sensor import Encoder, SensorLag
 from .dynamics.python_control import from_control, to_control
@@ -78,10 +79,10 @@ from .evaluation.rest_check import NoHunting, RestCase, RestCheck, RestKind, che
 from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.sampling import Sampling
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
-from .export.block_settings import export_settings
+from .export.blocks import export_settings
 from .export.fmu import export_fmu
-from .export.targets import Language, export_controller
-from .export.vendor_blocks import Block
+from .export.languages import Language, export_controller
+from .export.makers import Block
 from .files.drive import read_drive, write_fit
 from .files.path import read_path
 from .files.results import load_result

@@ -13,8 +13,8 @@ import hypothesis
 import numpy as np
 import pytest
 
+from pneuopt.control.controller import Feedforward
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step

@@ -11,10 +11,10 @@ from pneuopt.cli.exit_status import EXIT_SUCCESS
 from pneuopt.cli.init import write_files
 from pneuopt.cli.shared import read_fit_and_tuning, warn
 from pneuopt.cli.terminal import make_console, show_output_files
-from pneuopt.export.block_settings import export_settings
+from pneuopt.export.blocks import export_settings
 from pneuopt.export.fmu import export_fmu
-from pneuopt.export.targets import Language, export_controller
-from pneuopt.export.vendor_blocks import Block
+from pneuopt.export.languages import Language, export_controller
+from pneuopt.export.makers import Block
 from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import check_names, require

@@ -195,7 +195,7 @@ def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, A
     source = Source(title, file_hashes(*job.inputs), warnings=describe_status(job.fit))
     place = job.outputs.output if result.status.converged else None
     task = job.task
-    design = (task.loop, result.parameters, task.references, task.centre)
+    design = (task.loop.controller, result.parameters, task.references, task.centre)
     exports = Report() if place is None else report_exports(*design, job.fit, place)
     return tuning_page(source, result, job.view(result), exports=exports, **told)
 

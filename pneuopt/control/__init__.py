@@ -2,5 +2,5 @@
 
 A `ClosedLoop` joins them to one system, continuous or sampled. `evaluation`, `tuning`, `identification` and the rooms
 above may import it; it imports `dynamics` and `quantities` and knows no plant. A newcomer adds a form of the controller
-in `forms`, a sensor in `sensor`, a waveform in `dither`, a compensator beside `knocker` and in `compensators`.
+in `pid`, a sensor in `sensor`, a waveform in `dither`, a compensator in `compensators`. Read `controller` first.
 """

@@ -1,23 +1,31 @@
-"""`average_dither`: the mean motion of a plant under a fast dither, without the dither's own oscillation.
+"""The mean motion of a plant under a fast dither, without the dither's own oscillation: simulated, and linearised.
 
 Every state swings about its mean, ``x = m + X(theta)``; the means obey ``dm/dt = mean over theta of f(m + X, u + A sin
-theta)``, or with a triangle in place of the sine. That smooths at once what the spool's ripple does to the openings and
-the piston's to its friction. X is the first harmonic (`ripple`), about one operating point. Valid where the dither is
-fast against the loop: the error is of the order of its period. Zames & Shneydor, IEEE Trans. Autom. Control 21, 1976.
+theta)``, or with a triangle in place of the sine (`average_dither`). That smooths at once what the spool's ripple does
+to the openings and the piston's to its friction. X is the first harmonic (`ripple`), about one operating point. Valid
+where the dither is fast against the loop: the error is of the order of its period.
+
+What a slow signal sees of the plant (`AveragedPlant`) is the mean over theta of its Jacobian at ``m + X, u + U``, the
+controller's reaction to the ripple included; a sampled wave is held from sample to sample. At amplitude zero it is the
+plant's own linearisation. Zames & Shneydor, IEEE Trans. Autom. Control 21, 1976.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import pi
+from functools import cached_property, lru_cache
+from math import ceil, pi
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET, Waveform
+from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET, Dither, Waveform
+from pneuopt.control.linear_controller import controller_response
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import ConvergenceError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
@@ -315,3 +323,311 @@ def _sum_with_weights(values: Sequence[ca.SX], weights: Array) -> ca.SX:
 
 def _by_name(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
     return {q.name: column[k] for k, q in enumerate(quantities)}
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """The waves on the commands of m plants at one frequency, phase by phase.
+
+    Attributes
+    ----------
+    frequency : float
+        [rad/s]; 0 where nothing swings.
+    amplitudes : ndarray, shape (m,)
+        [command's unit]
+    phases, weights, shape : ndarray, shape (n,)
+        Phases [rad] and their weights in a mean, and the wave there as the plant gets it, of amplitude 1.
+    feedback : ndarray of complex, shape (m,)
+        The controller's response to the measured output at this frequency.
+    """
+
+    frequency: float
+    amplitudes: Array
+    phases: Array
+    weights: Array
+    shape: Array
+    feedback: NDArray[np.complex128]
+
+    def select(self, rows: Indices) -> "Waves":
+        """The waves on some of the commands."""
+        return replace(self, amplitudes=self.amplitudes[rows], feedback=self.feedback[rows])
+
+
+class Moments(NamedTuple):
+    """Means over the phases of m plants, in states scaled by their nominal values; J is [A B], B the command's column.
+
+    Attributes
+    ----------
+    swing : ndarray, shape (m, 2 n)
+        The swing ``a sin theta + b cos theta``, a before b.
+    rates : ndarray, shape (m, 2 n)
+        The rates times sin theta, then times cos theta.
+    J, J_ss, J_sc : ndarray, shape (m, n, n + 1)
+        The Jacobian, and that times ``sin^2`` and times ``sin cos``.
+    output : ndarray, shape (m, n + 2)
+        [C D] of the measured output, then the output itself.
+    """
+
+    swing: Array
+    rates: Array
+    J: Array
+    J_ss: Array
+    J_sc: Array
+    output: Array
+
+    def select(self, rows: Indices) -> "Moments":
+        """The moments of some of the plants."""
+        return Moments(*(field[rows] for field in self))
+
+
+@dataclass(frozen=True, eq=False)
+class RippleMoments:
+    """Function that computes `Moments`: a rollout in which a phase takes the place of a sample.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    compiled : bool
+        Machine code in place of the CasADi VM.
+    """
+
+    loop: ClosedLoop
+    compiled: bool = False
+
+    @cached_property
+    def scale(self) -> Array:
+        """The nominal values of the plant's states."""
+        return np.array([q.nominal for q in self.loop.plant.states])
+
+    def __call__(self, q: Array, x: Array, u: Array, waves: Waves, swing: Array) -> Moments:
+        """Sum up.
+
+        Parameters
+        ----------
+        q : ndarray, shape (m, n_plant_parameters)
+        x : ndarray, shape (m, n)
+        u : ndarray, shape (m, n_plant_inputs)
+            Means, the command among the inputs.
+        waves : Waves
+        swing : ndarray, shape (m, 2 n)
+        """
+        (m, n), count = x.shape, len(waves.phases)
+        start = np.zeros((m, self._rollout.n_states))
+        start[:, : 3 * n] = np.concatenate([x, swing], axis=1)
+        along = np.empty((m, count, u.shape[1] + 4))
+        along[:, :, : u.shape[1]], along[:, :, -4] = u[:, None], waves.amplitudes[:, None] * waves.shape
+        along[:, :, -3:] = np.array([np.sin(waves.phases), np.cos(waves.phases), waves.weights]).T
+        p = np.column_stack([q, waves.feedback.real, waves.feedback.imag])
+        t = np.zeros((m, count))
+        sums = self._rollout.run(start, along, p, t, t).x_end[:, 3 * n :]
+        ends = np.cumsum([2 * n, *[n * (n + 1)] * 3])
+        rates, J, J_ss, J_sc, output = np.split(sums, ends, axis=1)
+        shape = (m, n, n + 1)
+        return Moments(swing, rates, J.reshape(shape), J_ss.reshape(shape), J_sc.reshape(shape), output)
+
+    @cached_property
+    def _rollout(self) -> Rollout:
+        """The plant's rates and Jacobians summed up as states, the means and the swing before them."""
+        plant, scale = self.loop.plant, ca.DM(self.scale)
+        n, k = len(plant.states), names(plant.inputs).index(self.loop.command.name)
+        x, a, b, u = (ca.SX.sym(s, size) for s, size in (("x", n), ("a", n), ("b", n), ("u", len(plant.inputs))))
+        q, feedback = ca.SX.sym("q", len(plant.parameters)), ca.SX.sym("feedback", 2)
+        wave, s, c, weight = (ca.SX.sym(name) for name in ("wave", "sine", "cosine", "weight"))
+        jacobians = self._jacobians
+        C = ca.transpose(jacobians(x, u, q)[2])
+        ya, yb = ca.dot(C[:n], a), ca.dot(C[:n], b)
+        at = ca.SX(u)
+        at[k] += wave - s * (feedback[0] * ya - feedback[1] * yb) - c * (feedback[1] * ya + feedback[0] * yb)
+        f, J, output = jacobians(x + scale * (a * s + b * c), at, q)
+        terms = ca.vertcat(s * f, c * f, *(ca.vec(ca.transpose(w * J)) for w in (1, s * s, s * c)), ca.vec(output))
+        sums = ca.SX.sym("sums", terms.numel())
+        z, inputs, p = ca.vertcat(x, a, b, sums), ca.vertcat(u, wave, s, c, weight), ca.vertcat(q, feedback)
+        t, h = ca.SX.sym("t"), ca.SX.sym("h")
+        step = ca.Function(
+            "step", [t, h, z, inputs, p], [ca.vertcat(x, a, b, sums + weight * terms), ca.SX(0, 1)], {"cse": True}
+        )
+        return Rollout(Pieces(step), lanes=None if self.compiled else 0)
+
+    @cached_property
+    def _jacobians(self) -> ca.Function:
+        """``(x, u, q) -> rates, [A B], [C D y]`` in scaled states, from command to measured output."""
+        plant = self.loop.plant
+        x, u, q = (ca.SX.sym(s, plant.ode.size1_in(i)) for i, s in enumerate("xuq", 1))
+        k, j = (names(plant.inputs).index(self.loop.command.name), names(plant.outputs).index(self.loop.feedback.name))
+        xdot, y = plant.ode(0, x, u, q)
+        inward, outward = ca.diag(1 / ca.DM(self.scale)), ca.diag(ca.DM(self.scale))
+        J = ca.horzcat(inward @ ca.jacobian(xdot, x) @ outward, inward @ ca.jacobian(xdot, u[k]))
+        output = ca.horzcat(ca.jacobian(y[j], x) @ outward, ca.jacobian(y[j], u[k]), y[j])
+        return ca.Function("jacobians", [x, u, q], [ca.densify(v) for v in (inward @ xdot, J, output)])
+
+
+# Phases of a dither period over which is averaged, at least: fewer miss the edge of a dead zone between two of them,
+# more cost time in proportion.
+RIPPLE_PHASES = 32
+# Newton steps, halved ones included, that the balance of the first harmonic may take. With fewer, a swing across
+# Stribeck's minimum is left unbalanced; more are spent on lanes that have no balance at all.
+MAX_BALANCE_STEPS = 40
+# Newton step at which the balance counts as solved, a fraction of the swing; what is left is about its square. A larger
+# one shows in Ms (0.01: 1e-4); a smaller one costs a step and changes nothing.
+BALANCE_TOLERANCE = 1e-4
+MIN_BALANCE_FRACTION = 1e-3  # of a Newton step: a swing that a smaller one does not improve is kept as it is
+
+
+class PlantMatrices(NamedTuple):
+    """Plants from command to measured output, shapes (m, n, n), (m, n), (m, n), (m,), and that output, shape (m,)."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    measured: Array
+
+
+@dataclass(frozen=True, eq=False)
+class AveragedPlant:
+    """Function that linearises the plants of many loops, averaged over the ripple of their dithers.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    compiled : bool
+        Whether machine code is made of the plant's Jacobian, which pays for many plants, not for one.
+    phases : int
+        Phases over which is averaged, at least.
+    """
+
+    loop: ClosedLoop
+    compiled: bool = False
+    phases: int = RIPPLE_PHASES
+
+    def __call__(self, p: Array, x: Array, u: Array) -> PlantMatrices:
+        """Linearise.
+
+        Parameters
+        ----------
+        p : ndarray, shape (m, n_parameters)
+            In the order of ``loop.parameters``.
+        x : ndarray, shape (m, n_plant_states)
+        u : ndarray, shape (m, n_plant_inputs)
+            Means under dither, the command among the inputs.
+
+        Returns
+        -------
+        PlantMatrices
+        """
+        (m, n), scale = x.shape, self._moments.scale
+        J, output = np.empty((m, n, n + 1)), np.empty((m, n + 2))
+        for rows, found in self._balances(p, x, u):
+            J[rows], output[rows] = found.J, found.output
+        A, B = J[:, :, :n] * scale[:, None] / scale, J[:, :, n] * scale
+        return PlantMatrices(A, B, output[:, :n] / scale, output[:, n], output[:, n + 1])
+
+    def swings(self, p: Array, x: Array, u: Array) -> NDArray[np.complex128]:
+        """First harmonics of the plants' states, shape (m, n_plant_states), each as `ripple` gives it."""
+        n, found = x.shape[1], np.zeros(x.shape, dtype=np.complex128)
+        for rows, moments in self._balances(p, x, u):
+            found[rows] = (moments.swing[:, :n] + 1j * moments.swing[:, n:]) * self._moments.scale
+        return found
+
+    @cached_property
+    def _moments(self) -> RippleMoments:
+        return RippleMoments(self.loop, self.compiled)
+
+    def _balances(self, p: Array, x: Array, u: Array) -> Iterator[tuple[Mask, Moments]]:
+        """Rows of one frequency, and their moments along the swing that balances."""
+        for rows, waves in self._waves(p):
+            yield rows, self._balance(p[rows], x[rows], u[rows], waves)
+
+    def _waves(self, p: Array) -> Iterator[tuple[Mask, Waves]]:
+        """Rows of one frequency, and their waves; one phase is enough where nothing swings, or a swing does nothing."""
+        order, dither = list(self.loop.parameters), self.loop.dither
+        amplitudes = np.zeros(len(p)) if dither is None else p[:, order.index(DITHER_AMPLITUDE)]
+        moving = np.logical_and(amplitudes != 0, not is_affine(self.loop.plant))
+        if not moving.all():
+            still, count = (np.zeros(1), np.ones(1), np.zeros(1)), int((~moving).sum())
+            yield ~moving, Waves(0.0, np.zeros(count), *still, np.zeros(count, dtype=np.complex128))
+        if dither is None or not moving.any():
+            return
+        rates = p[:, order.index(DITHER_FREQUENCY)]
+        for rate in np.unique(rates[moving]).tolist():
+            rows, w = moving & (rates == rate), 2 * pi * rate
+            yield rows, Waves(w, amplitudes[rows], *self._phases(dither, rate), np.zeros(int(rows.sum()), complex))
+
+    def _phases(self, dither: Dither, rate: float) -> tuple[Array, Array, Array]:
+        """Phases of the swing, their weights, and the wave there, which is held over whole periods and samples."""
+        h = self.loop.pid.sample_time
+        if h is None or dither.analogue:
+            phases, weights = phase_quadrature(self.phases, dither.waveform)
+            return phases, weights, dither.waveform.at(phases)
+        samples = max(1, round(dither.period(rate, h) / h))
+        each = ceil(self.phases / samples)
+        t = (np.arange(samples * each) + 0.5) * (h / each)
+        w = 2 * pi * rate
+        return np.asarray(w * t), np.full(len(t), 1 / len(t)), dither.waveform.at(np.asarray(w * h * np.floor(t / h)))
+
+    def _balance(self, p: Array, x: Array, u: Array, waves: Waves) -> Moments:
+        """Moments along the first harmonic that balances, by Newton's method, each row halving its own steps."""
+        loop, q = self.loop, p[:, [list(self.loop.parameters).index(n) for n in self.loop.plant.parameters]]
+        best = self._moments(q, x, u, waves, np.zeros((len(x), 2 * x.shape[1])))
+        if not waves.frequency:
+            return best
+        point = best.output[:, -1], u[:, names(loop.plant.inputs).index(loop.command.name)]
+        if not loop.is_composed:  # far above its bandwidth such a controller is taken not to react
+            waves = replace(waves, feedback=controller_response(loop, p, waves.frequency, *point))
+        left = _imbalance(best, waves)
+        step, size = _newton_step(best, waves, left), np.linalg.norm(left, axis=1)
+        fraction, k = np.ones(len(x)), np.arange(len(x))
+        for _ in range(MAX_BALANCE_STEPS):
+            moved = fraction[k, None] * step[k]
+            trial = self._moments(q[k], x[k], u[k], waves.select(k), best.swing[k] + moved)
+            left = _imbalance(trial, waves.select(k))
+            after = np.linalg.norm(left, axis=1)
+            better = after < size[k]
+            for mine, theirs in ((best.swing, trial.swing), (best.J, trial.J), (best.output, trial.output)):
+                mine[k[better]] = theirs[better]
+            size[k[better]], fraction[k] = after[better], np.where(better, 1.0, fraction[k] / 2)
+            done = np.abs(moved).max(axis=1) <= BALANCE_TOLERANCE * np.abs(trial.swing).max(axis=1)
+            goes_on = ~done & (fraction[k] >= MIN_BALANCE_FRACTION)
+            new = np.flatnonzero(better & goes_on)
+            step[k[new]] = _newton_step(trial.select(new), waves.select(k[new]), left[new])
+            k = k[goes_on]
+            if not len(k):
+                break
+        return best
+
+
+@lru_cache(maxsize=32)
+def is_affine(plant: System) -> bool:
+    """Whether the plant's Jacobian is the same in every state, so that neither motion nor ripple changes it."""
+    x, u, p = (ca.SX.sym(s, plant.ode.size1_in(i)) for i, s in enumerate("xup", 1))
+    z = ca.vertcat(x, u)
+    return not ca.depends_on(ca.jacobian(ca.vertcat(*plant.ode(0, x, u, p)), z), z)
+
+
+def _imbalance(found: Moments, waves: Waves) -> Array:
+    """What is left of the balance ``2 mean(f sin) = -w b`` and ``2 mean(f cos) = w a``, over w, shape (m, 2 n)."""
+    n, w = found.J.shape[1], waves.frequency
+    a, b = found.swing[:, :n], found.swing[:, n:]
+    return np.concatenate([2 / w * found.rates[:, :n] + b, 2 / w * found.rates[:, n:] - a], axis=1)
+
+
+def _newton_step(found: Moments, waves: Waves, imbalance: Array) -> Array:
+    """Newton's step of the swing that removes the imbalance, shape (m, 2 n).
+
+    The command swings by -feedback times the output.
+    """
+    n, w = found.J.shape[1], waves.frequency
+    C, real, imaginary = found.output[:, None, :n], waves.feedback.real, waves.feedback.imag
+    ss, sc, cc = (2 / w * M for M in (found.J_ss, found.J_sc, found.J - found.J_ss))
+    into_sine, into_cosine = ((-real, imaginary), (-imaginary, -real))  # of the command, by a and by b
+
+    def block(by_sine: Array, by_cosine: Array, direct: Array, column: int) -> Array:
+        """Slope of a half of the imbalance to a half of the swing: directly, and through the command."""
+        s, c = into_sine[column][:, None, None], into_cosine[column][:, None, None]
+        return np.asarray(direct[:, :, :n] + (by_sine[:, :, n:] * s + by_cosine[:, :, n:] * c) * C)
+
+    one = np.eye(n)
+    above = np.concatenate([block(ss, sc, ss, 0), block(ss, sc, sc, 1) + one], axis=2)
+    below = np.concatenate([block(sc, cc, sc, 0) - one, block(sc, cc, cc, 1)], axis=2)
+    slope = np.concatenate([above, below], axis=1)
+    return np.asarray(np.linalg.solve(slope, -imbalance[..., None])[..., 0])

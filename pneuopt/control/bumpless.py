@@ -6,11 +6,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.control.compensation import invert_increasing
+from pneuopt.control.controller import invert_increasing
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import integrates
-from pneuopt.control.sampled import controller_update
-from pneuopt.control.wiring import Signals, evaluate_plant
+from pneuopt.control.sensor import Signals
 from pneuopt.dynamics.system import names, stack, symbols
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -95,8 +94,8 @@ def _distance_share(loop: ClosedLoop, x: Array, parameters: ParameterSet, refere
     """The part of the next command that is due to the distance from the set point, Kp b (r - y) as the PID sees it."""
     t, state, u = ca.SX.sym("t"), symbols(loop.states), symbols(loop.inputs)
     p: Signals = {n: ca.SX.sym(n) for n in loop.parameters}
-    y = evaluate_plant(loop.plant, loop.command.name, t, state, u, p, ca.SX(0))[1]
-    terms = controller_update(loop, t, state, u, y, p).terms
+    y = loop.evaluate_plant(t, state, u, p, ca.SX(0))[1]
+    terms = loop.controller.update(t, state, u, y, p).terms
     of = ca.Function("share", [t, *map(stack, (state, u, p))], [terms["Kp_parallel"] * p["pid.b"] * terms["error"]])
     given = np.zeros(len(loop.inputs))
     given[0] = reference

@@ -3,13 +3,10 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from math import inf
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import casadi as ca
 
-from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
-from pneuopt.dynamics.hooks import Axis
-from pneuopt.dynamics.system import System
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
@@ -99,12 +96,6 @@ class GainSchedule:
         for name in ("load", "nominal_load") if self.load is not None else ():
             require(0 < p[name] < inf, f"schedule.{name} must be positive, got {p[name]:g}")
 
-    def plant_parameters(self, plant: System) -> ParameterSet:
-        """The parameters in a plant's units; refuses one without the position."""
-        units, inertia = {q.name: q.unit for q in plant.outputs}, plant.parameters.get((plant.axis or Axis()).inertia)
-        check_names("output", [self.position], units, "GainSchedule: position")
-        return self.parameters(units[self.position], inertia.unit if inertia else "1")
-
     def parameters(self, position_unit: str, load_unit: str) -> ParameterSet:
         """The ends of the stroke, the load told and the nominal one, and the coefficients of each gain.
 
@@ -156,48 +147,6 @@ class GainSchedule:
             exponent = (slope + curve * xi) * xi
             found[gain] = p[gain] * ca.exp(exponent + load[0] * heavier if load else exponent)
         return found
-
-
-class ScheduledParts(Protocol):
-    """What of a `ClosedLoop` its schedule depends on."""
-
-    @property
-    def schedule(self) -> GainSchedule | None:
-        """None of fixed gains."""
-        ...
-
-    @property
-    def sensor(self) -> SensorLag | Encoder | None:
-        """Through which the controller sees the measured signal."""
-        ...
-
-    @property
-    def sensed_signal(self) -> SensedSignal:
-        """What the sensor reads."""
-        ...
-
-
-def schedule_gains(
-    parts: ScheduledParts, p: Mapping[str, Any], measured: Any, seen: Mapping[str, Any], y: Mapping[str, Any]
-) -> Mapping[str, Any]:
-    """The loop's parameters with the gains of this instant; as they are without a schedule.
-
-    Parameters
-    ----------
-    parts : ClosedLoop
-    p : mapping of str to casadi.SX
-        The loop's parameters.
-    measured : casadi.SX
-        What the PID sees.
-    seen, y : mapping of str to casadi.SX
-        The sensor's states after reading, and the plant's outputs, one of which has the position.
-    """
-    schedule = parts.schedule
-    if schedule is None:
-        return p
-    if schedule.position == parts.sensed_signal.measured.name:
-        return schedule.set_gains(p, measured)
-    return schedule.set_gains(p, seen["count"] if "count" in seen else y[schedule.position])
 
 
 def _short(gain: str) -> str:

@@ -7,9 +7,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.compensation import acting_always, compensation_slopes
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.rest import find_rest
+from pneuopt.control.loop import ClosedLoop, find_rest
 from pneuopt.dynamics.system import Linearisation, names, parameter_vector
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -37,9 +35,10 @@ def linear_gains(loop: ClosedLoop, p: Any, measured: ArrayLike = 0.0, command: A
     """
     gains, half = loop.gains(p), 0.5 * (loop.pid.sample_time or 0.0)
     found = ca.vertcat(gains[0, :] + half * gains[1, :], gains[1:3, :], gains[3, :] + half)
-    if not acting_always(loop):
+    if not loop.controller.acting_always:
         return found
-    slope, feedback = compensation_slopes(loop, np.asarray(p, dtype=float), measured, command)
+    own = loop.controller_part(np.asarray(p, dtype=float))
+    slope, feedback = loop.controller.compensation_slopes(own, measured, command)
     scaled = [ca.DM(slope).T * found[k, :] for k in range(3)]
     return ca.vertcat(scaled[0] - ca.DM(feedback).T, *scaled[1:], found[3, :])
 

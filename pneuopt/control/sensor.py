@@ -12,6 +12,8 @@ from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
 
+Signals = dict[str, ca.SX]
+"""Symbolic values by name."""
 REFERENCE_SPEED, REFERENCE_ACCELERATION = "reference_speed", "reference_acceleration"
 """The loop's inputs with the rates of the motion that its reference describes; a loop has those that it uses."""
 MIN_SENSOR_LAG = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast sensors are refused
@@ -120,7 +122,7 @@ class SensorLag:
         """Of the loop linearised [s]."""
         return p["lag"]
 
-    def count_size(self, _on: SensedSignal, _p: Mapping[str, float]) -> float:
+    def reading_resolution(self, _on: SensedSignal, _p: Mapping[str, float]) -> float:
         """What one count changes the reading by: nothing, it has no counts."""
         return 0.0
 
@@ -219,7 +221,7 @@ class Encoder:
         """Of the loop linearised [s]; half a sample of it is the difference's."""
         return p["filter"] + 0.5 * on.h if self.differentiates(on) else 0.0
 
-    def count_size(self, on: SensedSignal, p: Mapping[str, float]) -> float:
+    def reading_resolution(self, on: SensedSignal, p: Mapping[str, float]) -> float:
         """What one count changes the reading by [measured unit]; 0 without counts."""
         if not self.resolution:
             return 0.0

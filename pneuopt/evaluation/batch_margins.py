@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.averaged_plant import AveragedPlant
-from pneuopt.control.composed_loops import ComposedLoops
+from pneuopt.control.averaging import AveragedPlant
 from pneuopt.control.linear_controller import controller_matrices, linear_gains, pade_delay_response
+from pneuopt.control.linear_loop import ComposedLoops
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.margins import (

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.simulate import MAX_STEPS, simulate
 from pneuopt.evaluation.band import Band

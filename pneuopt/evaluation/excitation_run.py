@@ -12,8 +12,7 @@ import numpy as np
 
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.move_sequence import MoveSequence
-from pneuopt.control.moves import Move
+from pneuopt.control.moves import Move, MoveSequence
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.centre import command_centre
 from pneuopt.dynamics.compiled.rollout import Rollout

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
-from pneuopt.control.compensation import acting_always
 from pneuopt.control.linear_controller import linear_gains, pade_delay_response
 from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
@@ -278,7 +277,7 @@ def sensitivity_terms(
         If a parameter of the plant is free: the terms do not depend on it; or a compensator's slope, which is no
         smooth function of the gains, counts.
     """
-    shaping = ", ".join(type(c).__name__ for c in acting_always(loop))
+    shaping = ", ".join(type(c).__name__ for c in loop.controller.acting_always)
     told = "a cascade's speed loop has a response of its own; use margins(open_loop(...))"
     require(loop.outer is None, told, ModelError)
     told = "scheduled gains change with the operating point; use margins(open_loop(...))"

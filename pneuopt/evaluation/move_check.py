@@ -14,8 +14,7 @@ from math import copysign, inf
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.move_sequence import MoveSequence
-from pneuopt.control.moves import Move
+from pneuopt.control.moves import Move, MoveSequence
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.cases import TuningCase

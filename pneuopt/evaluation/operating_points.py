@@ -22,12 +22,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.control.averaged_plant import is_affine
+from pneuopt.control.averaging import is_affine
 from pneuopt.control.linear_controller import operating_gains
 from pneuopt.control.linear_loop import noise_path, open_loop
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, find_rest, set_sliding_direction
 from pneuopt.control.reference import Reference, disturbance_input
-from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.dynamics.system import Linearisation, names
 from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.dither_ripple import remove_ripple

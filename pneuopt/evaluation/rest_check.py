@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.simulate import simulate_stick_slip
 from pneuopt.dynamics.stick_slip import Event, EventKind

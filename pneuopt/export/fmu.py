@@ -12,7 +12,7 @@ from pathlib import Path
 import casadi as ca
 
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
-from pneuopt.export.header import check_name
+from pneuopt.export.writer import check_name
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet

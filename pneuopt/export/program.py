@@ -1,4 +1,4 @@
-"""`ControllerProgram`: a loop's sampled controller as named numbers and two symbolic functions."""
+"""`ControllerProgram`: a sampled controller as named numbers and two symbolic functions."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -6,17 +6,10 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from pneuopt.control.command import pid_reference
-from pneuopt.control.compensation import Compensator
+from pneuopt.control.controller import Controller, signals_are_good
 from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.gain_schedule import GainSchedule, schedule_gains
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import BAD_SAMPLES, PID
-from pneuopt.control.position_loop import PositionLoop
-from pneuopt.control.sampled import begin_controller, controller_update, signals_are_good
-from pneuopt.control.sensor import Encoder, SensedSignal
-from pneuopt.control.wiring import Signals
+from pneuopt.control.pid import BAD_SAMPLES
+from pneuopt.control.sensor import Encoder, Signals
 from pneuopt.dynamics.system import Symbols, symbols
 from pneuopt.export.identifiers import Identifiers
 from pneuopt.quantities.errors import ModelError, require
@@ -26,10 +19,7 @@ SAMPLE, CENTRE = "sample", "centre"  # the state that counts samples; the parame
 ADDED_TERMS = ("integral", "derivative", "proportional", "feedforward", "compensation", "dither")
 """Terms of the command, whose names end in _term: each is one summand, no state."""
 FIXED_NAMES = ("setpoint", "measured", "start_output")  # signals of every block
-C_NAMES = (
-    "c",
-    "p",
-)  # by which C reaches what is kept: a parameter, which is kept in a structure of its own, may have them
+C_NAMES = ("c", "p")  # by which C reaches what is kept; a parameter, in a structure of its own, may have them
 STATE_MEANINGS: Mapping[str, str] = {
     SAMPLE: "samples since the start",
     "sensor.reading": "filtered speed",
@@ -139,14 +129,14 @@ class ControllerProgram:
         return {} if self.sample_time in _UNNAMED_CONSTANTS else {self.sample_time: "SAMPLE_TIME"}
 
 
-def controller_program(loop: ClosedLoop, parameters: ParameterSet, centre: float = 0.0) -> ControllerProgram:
-    """The program of a loop's controller.
+def controller_program(controller: Controller, parameters: ParameterSet, centre: float = 0.0) -> ControllerProgram:
+    """The program of a controller.
 
     Parameters
     ----------
-    loop : ClosedLoop
-        With a sample time. What is behind the controller, an analogue dither say, and before it, a sensor's lag or
-        steps, is hardware and not in it; what an `Encoder` computes of a position is.
+    controller : Controller
+        With a sample time. What is behind it, an analogue dither say, and before it, a sensor's lag or steps, is
+        hardware and not in the program; what an `Encoder` computes of a position is.
     parameters : ParameterSet
     centre : float
         On the wire to the valve while the command is zero [the command's unit]; 0 for nothing.
@@ -158,11 +148,15 @@ def controller_program(loop: ClosedLoop, parameters: ParameterSet, centre: float
     InputError
         If the parameters cannot run.
     """
-    h = loop.pid.sample_time
+    check_sampled(controller)
+    controller.check(parameters)
+    return _assemble(_law(controller), controller, parameters, centre)
+
+
+def check_sampled(controller: Controller) -> None:
+    """Refuse a continuous controller: `ModelError`."""
     told = "a continuous controller cannot be exported: give it a sample time, sample_time under [pid], and tune again"
-    require(h is not None, told, ModelError)
-    loop.check(parameters)
-    return _assemble(_law(loop), loop, parameters, centre)
+    require(controller.pid.sample_time is not None, told, ModelError)
 
 
 @dataclass(frozen=True)
@@ -175,21 +169,6 @@ class _WrappedDither(Dither):
             return super().wave(t, p)  # its own turns are wrapped
         turns = p["frequency"] * t
         return super().wave(turns - ca.floor(turns), {**p, "frequency": ca.SX(1)})
-
-
-@dataclass(frozen=True)
-class _ComputedParts:
-    """The parts of a loop that its controller computes, as `controller_update` asks for them."""
-
-    pid: PID
-    dither: Dither | None
-    feedforward: Feedforward | None
-    compensators: tuple[Compensator, ...]
-    sensor: Encoder | None
-    sensed_signal: SensedSignal
-    outer: PositionLoop | None
-    feedback: Quantity
-    schedule: GainSchedule | None
 
 
 @dataclass(frozen=True)
@@ -215,28 +194,27 @@ class _Law:
     terms: Signals
 
 
-def _law(loop: ClosedLoop) -> _Law:
+def _law(controller: Controller) -> _Law:
     """What is computed at a sample, and at the start."""
-    sensed = loop.sensed_signal
-    counts = isinstance(loop.sensor, Encoder) and loop.sensor.differentiates(sensed)
-    encoder = replace(loop.sensor, resolution=0.0) if counts and isinstance(loop.sensor, Encoder) else None
-    dither = None if loop.dither is None else _WrappedDither(**vars(loop.dither))
-    lead, added = loop.feedforward, loop.compensators
-    parts = _ComputedParts(loop.pid, dither, lead, added, encoder, sensed, loop.outer, loop.feedback, loop.schedule)
-    measured = sensed.outputs[encoder.position] if encoder else loop.pid_signal
-    known = loop.states[len(loop.plant.states) :]
-    x = symbols([q for q in known if encoder or not q.name.startswith("sensor.")]) | {SAMPLE: ca.SX.sym(SAMPLE)}
-    p: Signals = {n: ca.SX.sym(n) for n in (*loop.parameters, CENTRE)}
-    rates = [q.name for q in loop.motion_inputs]
-    u: Signals = {n: ca.SX.sym(n) for n in ("reference", "measured", *rates, *map(_reading, loop.readings), "output")}
-    t = (loop.pid.sample_time or 0.0) * x[SAMPLE]
-    shown = {n: u[_reading(n)] for n in loop.readings} | {measured.name: u["measured"]}
-    found = controller_update(parts, t, x, u, shown, p)
+    sensor, dither = controller.sensor, controller.dither
+    counts = isinstance(sensor, Encoder) and sensor.differentiates(controller.sensed_signal)
+    encoder = replace(sensor, resolution=0.0) if counts and isinstance(sensor, Encoder) else None
+    wrapped = None if dither is None else _WrappedDither(**vars(dither))
+    computed = replace(controller, dither=wrapped, sensor=encoder)
+    measured = controller.signals.outputs[encoder.position] if encoder else controller.pid_signal
+    x = symbols([q for q in controller.states if encoder or not q.name.startswith("sensor.")])
+    x |= {SAMPLE: ca.SX.sym(SAMPLE)}
+    p: Signals = {n: ca.SX.sym(n) for n in (*controller.parameters, CENTRE)}
+    rates, readings = [q.name for q in controller.motion_inputs], controller.readings
+    u: Signals = {n: ca.SX.sym(n) for n in ("reference", "measured", *rates, *map(_reading, readings), "output")}
+    t = (controller.pid.sample_time or 0.0) * x[SAMPLE]
+    shown = {n: u[_reading(n)] for n in readings} | {measured.name: u["measured"]}
+    found = computed.update(t, x, u, shown, p)
     after = {**found.states, SAMPLE: x[SAMPLE] + 1}
     renamed = {"reference_read": "setpoint_read", f"{measured.name}_read": "measured_read"}
     renamed |= {n: f"{n}_term" for n in ADDED_TERMS}
     terms = {renamed.get(n, n): v for n, v in found.terms.items() if n not in _NOT_READ}
-    return _Law(u, x, p, measured, after, _start(parts, u, measured.name, loop.readings, p), terms)
+    return _Law(u, x, p, measured, after, _start(computed, u, measured.name, readings, p), terms)
 
 
 def _reading(name: str) -> str:
@@ -244,7 +222,7 @@ def _reading(name: str) -> str:
     return f"reading {name}"
 
 
-def _start(parts: _ComputedParts, u: Signals, measured: str, readings: Iterable[str], p: Signals) -> Signals:
+def _start(computed: Controller, u: Signals, measured: str, readings: Iterable[str], p: Signals) -> Signals:
     """The first states, as `ClosedLoop.initial` has them, from what the actuator has got so far.
 
     Where a signal is bad, nothing is known: the controller begins anew with the first good sample, and its output is
@@ -254,19 +232,19 @@ def _start(parts: _ComputedParts, u: Signals, measured: str, readings: Iterable[
     good, told = signals_are_good([u[n] for n in signals]), signals_are_good([u["output"]])
     u = {n: ca.if_else(good, u[n], 1) for n in signals} | {"output": u["output"]}
     own, shown = without_prefix(p, "pid"), {n: u[_reading(n)] for n in readings} | {measured: u["measured"]}
-    command = ca.if_else(told, u["output"] - p[CENTRE], parts.pid.clip(own["fault_output"], own))
-    given: Signals = {"count": u["measured"]} if parts.sensor else {}
-    frozen = schedule_gains(parts, p, u["measured"], given, shown)
-    inner = pid_reference(parts, u, shown[parts.feedback.name], frozen) if parts.outer else u
-    seen = ca.SX(0) if parts.sensor else u["measured"]  # a position says no speed: the start is at rest
+    command = ca.if_else(told, u["output"] - p[CENTRE], computed.pid.clip(own["fault_output"], own))
+    given: Signals = {"count": u["measured"]} if computed.sensor else {}
+    frozen = computed.schedule_gains(p, u["measured"], given, shown)
+    inner = computed.inner_inputs(u, shown[computed.feedback.name], frozen) if computed.outer else u
+    seen = ca.SX(0) if computed.sensor else u["measured"]  # a position says no speed: the start is at rest
     begun: Signals = {"sensor.reading": seen, "sensor.count": u["measured"]}
-    begun |= begin_controller(parts, inner, seen, shown, command, frozen)
+    begun |= computed.start(inner, seen, shown, command, frozen)
     return {**begun, f"pid.{BAD_SAMPLES}": ca.if_else(good, 0, own["fault_samples"]), SAMPLE: ca.SX(0)}
 
 
-def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: float) -> ControllerProgram:
+def _assemble(law: _Law, controller: Controller, parameters: ParameterSet, centre: float) -> ControllerProgram:
     """The program of a law, with the states and parameters that it needs and no others."""
-    outputs = _outputs(law, loop, centre)
+    outputs = _outputs(law, controller, centre)
     states = _needed_states(ca.vertcat(*(v for v, _ in outputs.values())), law.states, law.after)
     after, first = (ca.densify(ca.vertcat(*(v[n] for n in states))) for v in (law.after, law.start))
     results = ca.vertcat(*(v for v, _ in outputs.values()), after)
@@ -276,17 +254,17 @@ def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: flo
     x, p = (ca.vertcat(*(own[n] for n in chosen)) for own, chosen in ((law.states, states), (law.parameters, given)))
     signals = ca.vertcat(*(v for n, v in law.inputs.items() if n != "output"))
     begin = ca.vertcat(signals, law.inputs["output"])
-    value = dict(zip(loop.parameters, loop.parameter_vector(parameters).tolist(), strict=True))
-    value[CENTRE] = centre
-    unit, wanted = loop.command.unit, Variable("setpoint", loop.feedback.unit, f"the {loop.feedback.name} wanted")
+    value = {**controller.values(parameters), CENTRE: centre}
+    unit, signal = controller.command.unit, controller.feedback
+    wanted = Variable("setpoint", signal.unit, f"the {signal.name} wanted")
     measured = Variable("measured", law.measured.unit, f"the {law.measured.name}, as the controller's input shows it")
-    names = _claim_names(loop, outputs, given, states, terms)
-    inputs = (wanted, measured, *_more_inputs(loop, names.readings))
-    declared = {n: (q.unit, q.meaning or n) for n, q in loop.parameters.items()}
+    names = _claim_names(controller, outputs, given, states, terms)
+    inputs = (wanted, measured, *_more_inputs(controller, names.readings))
+    declared = {n: (q.unit, q.meaning or n) for n, q in controller.parameters.items()}
     declared[CENTRE] = (unit, "output while the command is zero, as a valve's centre")
-    units = {q.name: q.unit for q in loop.states} | {SAMPLE: "1"}
+    units = {q.name: q.unit for q in controller.states} | {SAMPLE: "1"}
     return ControllerProgram(
-        loop.pid.sample_time or 0.0,
+        controller.pid.sample_time or 0.0,
         tuple(Variable(names.parameters[n], *declared[n], value[n], n) for n in given),
         inputs,
         tuple(Variable(names.states[n], units[n], STATE_MEANINGS.get(n, n), 0.0, n) for n in states),
@@ -308,19 +286,19 @@ class _Names(NamedTuple):
 
 
 def _claim_names(
-    loop: ClosedLoop, outputs: Iterable[str], given: Iterable[str], states: Iterable[str], terms: Iterable[str]
+    controller: Controller, outputs: Iterable[str], given: Iterable[str], states: Iterable[str], terms: Iterable[str]
 ) -> _Names:
     """The shortest name of each that is free.
 
     The signals of the block come first, so that they are called alike in every program, then the parameters.
     """
-    taken = Identifiers([*FIXED_NAMES, *outputs, *(_rate_name(q.name) for q in loop.motion_inputs)])
+    taken = Identifiers([*FIXED_NAMES, *outputs, *(_rate_name(q.name) for q in controller.motion_inputs)])
     parameters = {n: taken.claim(_short_name(n), n) for n in sorted(given, key=lambda n: n != CENTRE)}
     taken.take(*C_NAMES)
     return _Names(
         parameters,
         {n: taken.claim(_short_name(n), n) for n in states},
-        {n: taken.claim(n, f"{n}_reading") for n in loop.readings},
+        {n: taken.claim(n, f"{n}_reading") for n in controller.readings},
         {n: taken.claim(n, f"{n}_term") for n in terms},
     )
 
@@ -329,21 +307,21 @@ def _rate_name(name: str) -> str:
     return name.replace("reference", "setpoint")
 
 
-def _more_inputs(loop: ClosedLoop, names: Mapping[str, str]) -> tuple[Variable, ...]:
+def _more_inputs(controller: Controller, names: Mapping[str, str]) -> tuple[Variable, ...]:
     """The rates of the reference and the readings that compensators use, as their parts name them."""
-    units = {q.name: q.unit for q in (*loop.motion_inputs, *loop.plant.outputs)}
+    units = {q.name: q.unit for q in (*controller.motion_inputs, *controller.signals.outputs.values())}
     rates = (
         Variable(_rate_name(q.name), q.unit, f"the {q.name.partition('_')[2]} of the setpoint")
-        for q in loop.motion_inputs
+        for q in controller.motion_inputs
     )
-    shown = (n.replace("_", " ") if names[n] == n else n for n in loop.readings)  # a renamed one is told as it is
-    read = zip(loop.readings, shown, strict=True)
+    shown = (n.replace("_", " ") if names[n] == n else n for n in controller.readings)  # a renamed one is told as it is
+    read = zip(controller.readings, shown, strict=True)
     return (*rates, *(Variable(names[n], units[n], f"{told}, as its sensor shows it") for n, told in read))
 
 
-def _outputs(law: _Law, loop: ClosedLoop, centre: float) -> dict[str, tuple[ca.SX, str]]:
+def _outputs(law: _Law, controller: Controller, centre: float) -> dict[str, tuple[ca.SX, str]]:
     """What the controller gives: the value, and what it is."""
-    delayed, wire = bool(loop.pid.delay), law.parameters[CENTRE] if centre else ca.SX(0)
+    delayed, wire = bool(controller.pid.delay), law.parameters[CENTRE] if centre else ca.SX(0)
     command = law.after["pid.pending" if delayed else "pid.command"]
     later = ": write it at once, the design counts on one sample until it acts" if delayed else ""
     found = {"output": (command + wire, f"what the actuator gets{later}")}

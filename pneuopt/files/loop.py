@@ -7,15 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pneuopt.control.compensation import Compensator
-from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.compensators import COMPENSATORS, Compensator
+from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import FAULT_SAMPLES, PID, AntiWindup
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import FAULT_SAMPLES, PID, AntiWindup, Form
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import System
@@ -202,7 +199,7 @@ def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensa
 
 
 def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centre: float) -> ParameterSet:
-    own = loop.parameters.select(n for n in loop.parameters if n.startswith(tuple(f"{s}." for s in LOOP_SECTIONS)))
+    own = loop.controller.parameters
     read = _read_limits(table["pid"], own, centre, f"{path}: [pid] limits")
     for section in TUNABLE_SECTIONS:
         read |= _section_parameters(table.get(section, {}), section, own, f"{path}: [{section}]")

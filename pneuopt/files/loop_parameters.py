@@ -4,12 +4,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
 from pneuopt.control.gain_schedule import SCHEDULED_GAINS, GainSchedule
-from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import PID, Form
 from pneuopt.control.sensor import SensedSignal
 from pneuopt.files.tuning_keys import TUNING_KEYS
 from pneuopt.quantities.keys import Key, Takes, parameter_key

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pneuopt.control.motion_path import MotionPath
+from pneuopt.control.moves import MotionPath
 from pneuopt.files.toml import construct_at
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.errors import check_names, require

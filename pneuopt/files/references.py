@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.move_sequence import MoveSequence
-from pneuopt.control.moves import Move
+from pneuopt.control.moves import Move, MoveSequence
 from pneuopt.control.reference import Reference, Step
 from pneuopt.files.path import read_path_of
 from pneuopt.files.reference_keys import MOVE_KEYS, OWN_MOVE_KEYS, PATH_KEYS, REFERENCE_KEYS, STEP_KEYS

@@ -9,11 +9,10 @@ from dataclasses import fields
 from enum import Enum
 
 from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.dither import Waveform
-from pneuopt.control.forms import Form
 from pneuopt.control.gain_schedule import GainSchedule
-from pneuopt.control.pid import AntiWindup
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import AntiWindup, Form
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect

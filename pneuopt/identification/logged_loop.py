@@ -13,18 +13,15 @@ import casadi as ca
 import numpy as np
 from scipy.signal import savgol_filter
 
-from pneuopt.control.command import pid_reference
-from pneuopt.control.compensation import Instant
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, unobservable_states
 from pneuopt.control.reset_integral import RESET_STATES
-from pneuopt.control.rest import unobservable_states
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import DiscreteSystem, Motion, Symbols, System, define, names
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, ModelError, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
+from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 MOTION = ("speed", "position")  # signals of which one follows from the other where a log lacks it
@@ -240,19 +237,13 @@ class LoggedLoop:
 
     def _controller_start(self, log: Log, first: Mapping[str, float], *, was_at_rest: bool) -> dict[str, float]:
         """The controller's states before a log whose first signals are known: of a rest, or with an empty integral."""
-        alone = self._controller[2]
-        pid, known = alone.pid, dict(zip(alone.parameters, alone.parameter_vector(log.parameters), strict=True))
+        alone = self._controller[2].controller
+        known = alone.values(log.parameters)
         shown = {n: first[f"logged.{n}"] for n in self._seen}
         measured, position = shown[alone.pid_signal.name], shown[alone.feedback.name]
-        wanted = float(pid_reference(alone, {"reference": first["reference"]}, position, known)["reference"])
-        begun = [float(state) for state in pid.start(wanted, measured, 0.0, without_prefix(known, "pid"))]
-        x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.pid_signal, alone.command), begun, strict=True)}
-        x0 |= {"sensor.reading": measured, "feedforward.filter": wanted}
-        for part in alone.compensators:
-            seen = Instant(0.0, wanted, measured, 0.0, pid.sample_time, {}, shown)
-            states = part.states(alone.sensed_signal, alone.command)
-            remembered = zip(states, part.start(alone.sensed_signal, seen), strict=True)
-            x0 |= {f"{part.section}.{q.name}": v for q, v in remembered}
+        inner = alone.inner_inputs({"reference": first["reference"]}, position, known)
+        x0 = {n: float(v) for n, v in alone.start(inner, measured, shown, 0.0, known).items()}
+        x0 |= {"sensor.reading": measured}
         rested = x0["pid.integral"] + x0["pid.transfer"]  # noise keeps the error of a rest from being zero
         return x0 | {"pid.integral": rested if was_at_rest else 0.0, "pid.transfer": 0.0}
 

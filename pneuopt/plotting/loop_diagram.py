@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.control.dither import Waveform
-from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.pid import AntiWindup
+from pneuopt.control.pid import AntiWindup, Form
 from pneuopt.control.sensor import Encoder
 from pneuopt.plotting.diagram import (
     BLOCK_HEIGHT,

@@ -1,14 +1,14 @@
-"""`report_forms`: a loop's gains in every form that controllers take, and its settings that are not tuned."""
+"""`report_forms`: a controller's gains in every form that controllers take, and its settings that are not tuned."""
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from pneuopt.control.forms import ParallelForm, to_series, to_standard
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.controller import Controller
+from pneuopt.control.pid import ParallelForm, to_series, to_standard
 from pneuopt.control.reference import Reference
-from pneuopt.export.block_settings import describe_refusal
-from pneuopt.export.vendor_blocks import BLOCK_FORMS, Block
+from pneuopt.export.blocks import describe_refusal
+from pneuopt.export.makers import BLOCK_FORMS, Block
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Line, Report, Table, text_columns
@@ -34,17 +34,17 @@ EXPORTS = {
 N_NOTE = "N of the standard form is ISA's ratio Td/Tf. Simulink's N is the filter's pole in rad/s, 1/Tf."
 
 
-def report_forms(loop: ClosedLoop, parameters: ParameterSet) -> Report:
+def report_forms(controller: Controller, parameters: ParameterSet) -> Report:
     """The gains in the parallel, the standard and the series form; why one of them has none.
 
     Parameters
     ----------
-    loop : ClosedLoop
+    controller : Controller
     parameters : ParameterSet
-        Every parameter of the loop.
+        Every parameter of the controller.
     """
-    parallel = loop.parallel_form(parameters)
-    unit = unit_ratio(loop.command.unit, loop.pid_signal.unit)
+    parallel = controller.parallel_form(parameters)
+    unit = unit_ratio(controller.command.unit, controller.pid_signal.unit)
     units = {"Kp": unit, "K": unit, "Ki": unit_ratio(unit, "s"), "Kd": unit_ratio(f"({unit})*s", "1"), "N": "1"}
     rows, refused = [], []
     for (name, law), convert in zip(LAW_TEXTS.items(), (_as_given, to_standard, to_series), strict=True):
@@ -60,13 +60,18 @@ def report_forms(loop: ClosedLoop, parameters: ParameterSet) -> Report:
 
 
 def report_exports(
-    loop: ClosedLoop, parameters: ParameterSet, references: Sequence[Reference], centre: float, fit: Path, tuned: Path
+    controller: Controller,
+    parameters: ParameterSet,
+    references: Sequence[Reference],
+    centre: float,
+    fit: Path,
+    tuned: Path,
 ) -> Report:
     """The commands that take a design to a controller, and the makers whose block cannot hold it.
 
     Parameters
     ----------
-    loop : ClosedLoop
+    controller : Controller
     parameters : ParameterSet
         Of the design.
     references : sequence of Reference
@@ -75,9 +80,9 @@ def report_exports(
     fit, tuned : Path
         The files of the plant and of the design.
     """
-    if loop.pid.sample_time is None:
+    if controller.pid.sample_time is None:
         return Report((Line("A continuous controller has no export: give it a sample_time, and tune it so."),))
-    refused = [block for block in Block if describe_refusal(loop, parameters, block, references, centre)]
+    refused = [block for block in Block if describe_refusal(controller, parameters, block, references, centre)]
     taken = {form: what for form, what in EXPORTS.items() if form not in {block.value for block in refused}}
     rows = tuple((what, f"pneuopt export {fit} {tuned} --to {form}") for form, what in taken.items())
     makers = ", ".join(BLOCK_FORMS[block].maker for block in refused)
@@ -85,12 +90,11 @@ def report_exports(
     return Report((Table(text_columns("what it takes", "command"), rows), *([Line(told)] if refused else [])))
 
 
-def report_settings(loop: ClosedLoop, parameters: ParameterSet) -> Report:
+def report_settings(controller: Controller, parameters: ParameterSet) -> Report:
     """What else a controller is set to, the numbers that are not tuned, and how it computes."""
-    own = [n for n in loop.parameters if n not in loop.plant.parameters]
-    full = loop.complete(parameters)
-    rows = tuple((n, write_value(full.value(n), full[n].unit)) for n in own if not full[n].free)
-    pid, lines = loop.pid, []
+    full = controller.complete(parameters)
+    rows = tuple((n, write_value(full.value(n), full[n].unit)) for n in controller.parameters if not full[n].free)
+    pid, lines = controller.pid, []
     if pid.sample_time is None:
         lines.append("a continuous controller")
     else:

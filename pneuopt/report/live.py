@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, Step, disturbance_input
 from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.evaluate import relevant_units
-from pneuopt.export.javascript import write_loop_javascript
+from pneuopt.export.languages import write_loop_javascript
 from pneuopt.models.load import GRAVITY
 from pneuopt.plotting.canvas import PLOT_UNITS
 from pneuopt.quantities.errors import ConvergenceError, InputError

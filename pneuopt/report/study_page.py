@@ -42,6 +42,6 @@ def study_page(
     """
     verdict, table = Report(report.parts[:1]), Report(report.parts[1:])
     pictures = () if draw is None else (Picture(draw, alt, alt),)
-    settings = () if design is None else (report_settings(design[0], design[1].fixed("*")),)
+    settings = () if design is None else (report_settings(design[0].controller, design[1].fixed("*")),)
     sections = Section(what, (*pictures, table)), Section("The design", settings)
     return Page(source.title, verdict, (*sections, provenance_section({}, source.hashes)), source.warnings)

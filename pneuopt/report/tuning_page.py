@@ -187,7 +187,7 @@ def _refusal_sections(result: TuningResult, stands: str, steps: Picture | None) 
 
 
 def _form_section(view: LoopView | None) -> Section:
-    parts = () if view is None else (report_forms(view.loop, view.parameters),)
+    parts = () if view is None else (report_forms(view.loop.controller, view.parameters),)
     return Section("Gains in every form", parts)
 
 
@@ -207,7 +207,7 @@ def _margin_section(found: Certificate | None, bode: Picture | None) -> Section:
 def _loop_section(view: LoopView | None) -> Section:
     if view is None:
         return Section("The loop", ())
-    return Section("The loop", (diagram_picture(view.loop), report_settings(view.loop, view.parameters)))
+    return Section("The loop", (diagram_picture(view.loop), report_settings(view.loop.controller, view.parameters)))
 
 
 def _broken_limits(metrics: "pd.DataFrame", limits: Mapping[str, float]) -> Iterator[str]:

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runnable import check_smooth

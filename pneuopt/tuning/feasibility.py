@@ -7,14 +7,12 @@ from math import inf
 
 import numpy as np
 
-from pneuopt.control.averaged_plant import is_affine
-from pneuopt.control.compensation import acting_always
-from pneuopt.control.composed_loops import ComposedLoops
+from pneuopt.control.averaging import is_affine
 from pneuopt.control.dither import DITHER_AMPLITUDE
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.linear_loop import ComposedLoops
+from pneuopt.control.loop import ClosedLoop, find_rest, set_sliding_direction
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Reference, Step
-from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.counts import describe_counts, sees_speed
@@ -257,7 +255,7 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Spe
 def _shapes_linear_loop(loop: ClosedLoop, n: str) -> bool:
     """Whether the linearised loop depends on a parameter of the controller."""
     section, _, name = n.partition(".")
-    acting = {"dither", "position_loop", "schedule", *(part.section for part in acting_always(loop))}
+    acting = {"dither", "position_loop", "schedule", *(part.section for part in loop.controller.acting_always)}
     return section in acting or (section == "pid" and name in loop.pid.form.gains)
 
 

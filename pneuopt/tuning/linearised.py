@@ -10,7 +10,6 @@ from functools import cached_property
 
 import numpy as np
 
-from pneuopt.control.compensation import acting_always
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
 from pneuopt.evaluation.band import band_share
@@ -305,7 +304,7 @@ class LinearisedProblem:
         loop = self._simulator.loop
         outer = (loop.outer,) if loop.outer else ()
         scheduled = (loop.schedule,) if loop.schedule else ()
-        sections = tuple(f"{c.section}." for c in (*outer, *scheduled, *acting_always(loop)))
+        sections = tuple(f"{c.section}." for c in (*outer, *scheduled, *loop.controller.acting_always))
         felt = {*(f"pid.{gain}" for gain in loop.pid.form.gains), DITHER_AMPLITUDE, DITHER_FREQUENCY}
         shaping = [k for k, name in enumerate(names) if name in felt or name.startswith(sections)]
         found: dict[type, tuple[Array, Array]] = {

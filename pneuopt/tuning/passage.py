@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pneuopt.control.averaged_plant import is_affine
+from pneuopt.control.averaging import is_affine
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.rollout import Rollout

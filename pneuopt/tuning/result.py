@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
+from pneuopt.control.pid import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.evaluation.certificate import Certificate, report_margins, report_notes
 from pneuopt.evaluation.evaluate import report_metrics
 from pneuopt.evaluation.metric import Requirement, Sense

@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.dynamics.simulate import MAX_STEPS

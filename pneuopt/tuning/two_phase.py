@@ -9,7 +9,6 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from pneuopt.control.compensation import acting_always
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, Step
@@ -170,7 +169,7 @@ class Optima:
 
 def is_linear(loop: ClosedLoop) -> bool:
     """Whether the loop without its clip is a linear ODE: its Jacobian depends on neither states nor inputs."""
-    if loop.pid.sample_time is not None or loop.is_composed or acting_always(loop):
+    if loop.pid.sample_time is not None or loop.is_composed or loop.controller.acting_always:
         return False
     ode = without_clip(loop).system().ode
     t, x, u, p = (ca.SX.sym(k, ode.size1_in(i)) for i, k in enumerate("txup"))

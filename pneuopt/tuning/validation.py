@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.certificate import Defect, certificate

@@ -32,13 +32,10 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.export.block_settings import run_as_block
-from pneuopt.export.c99 import write_c99
-from pneuopt.export.header import make_header
+from pneuopt.export.blocks import run_as_block
+from pneuopt.export.languages import ReferenceRun, make_reference_run, write_c99, write_python, write_structured_text
 from pneuopt.export.program import controller_program
-from pneuopt.export.python_class import write_python
-from pneuopt.export.reference_run import ReferenceRun, make_reference_run
-from pneuopt.export.structured_text import write_structured_text
+from pneuopt.export.writer import make_header
 from problems.shared.claims import Claim, arguments, finish, frame
 from problems.shared.random_controllers import COUNT, Run, run_library
 from problems.shared.structured_text_run import FunctionBlock
@@ -68,8 +65,8 @@ class Job:
 
 def files_of(run: Run) -> tuple[dict[str, str], dict[str, str], dict[str, str]]:
     """C, Python and structured text of a controller, the C with the library's run in its test."""
-    program = controller_program(run.loop, run.parameters, run.centre)
-    header = make_header("pid_x", run.loop, run.parameters, run.centre, [])
+    program = controller_program(run.loop.controller, run.parameters, run.centre)
+    header = make_header("pid_x", run.loop.controller, run.parameters, run.centre, [])
     given = ReferenceRun(run.inputs, run.outputs)
     return write_c99(program, header, given), write_python(program, header), write_structured_text(program, header)
 
@@ -103,7 +100,7 @@ def compare_languages(seeds: Iterable[int]) -> tuple[dict[str, float], int]:
         controller, block = space["PidX"](), FunctionBlock(text["pid_x.st"])
         controller.start(*run.inputs[0].tolist(), run.centre)
         block.variables["start_output"] = run.centre
-        given = [v.name for v in controller_program(run.loop, run.parameters, run.centre).inputs]
+        given = [v.name for v in controller_program(run.loop.controller, run.parameters, run.centre).inputs]
         rows = [dict(zip(given, row, strict=True)) for row in run.inputs.tolist()]
         outputs = [block.call(**row)["output"] for row in rows]
         found = {
@@ -117,8 +114,8 @@ def compare_languages(seeds: Iterable[int]) -> tuple[dict[str, float], int]:
 
 def costs_of(loop: po.ClosedLoop) -> tuple[float, float]:
     """Instructions of a step, and bytes of the machine code; NaN where valgrind or size is not there."""
-    program = controller_program(loop, loop.parameters)
-    header = make_header("pid_x", loop, loop.parameters, 0.0, [])
+    program = controller_program(loop.controller, loop.parameters)
+    header = make_header("pid_x", loop.controller, loop.parameters, 0.0, [])
     with tempfile.TemporaryDirectory() as folder:
         for name, text in write_c99(program, header, make_reference_run(program)).items():
             (Path(folder) / name).write_text(text, "ascii")

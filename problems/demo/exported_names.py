@@ -60,7 +60,7 @@ def check_text(run: Run, text: str, counts: Counts) -> None:
     counts.literals += len(wrong_literals(text))
     block = FunctionBlock(text)
     block.variables["start_output"] = run.centre
-    given = [v.name for v in controller_program(run.loop, run.parameters, run.centre).inputs]
+    given = [v.name for v in controller_program(run.loop.controller, run.parameters, run.centre).inputs]
     found = [block.call(**dict(zip(given, row, strict=True)))["output"] for row in run.inputs.tolist()]
     counts.add("structured_text", relative_difference(found, run))
 

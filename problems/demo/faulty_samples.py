@@ -30,12 +30,9 @@ from numpy.typing import NDArray
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
-from pneuopt.export.c99 import write_c99
-from pneuopt.export.header import make_header
+from pneuopt.export.languages import make_reference_run, write_c99, write_python, write_structured_text
 from pneuopt.export.program import SAMPLE, ControllerProgram, controller_program
-from pneuopt.export.python_class import write_python
-from pneuopt.export.reference_run import make_reference_run
-from pneuopt.export.structured_text import write_structured_text
+from pneuopt.export.writer import make_header
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from problems.shared.claims import Claim, arguments, finish, frame
@@ -109,7 +106,7 @@ def draw_case(seed: int) -> Case:
     g = np.random.default_rng(seed + 2000)
     faults = {"pid.fault_samples": float(g.integers(1, 9)), "pid.fault_output": float(g.uniform(-3.0, 3.0))}
     parameters = parameters.with_values(faults)
-    return Case(loop, parameters, centre, controller_program(loop, parameters, centre))
+    return Case(loop, parameters, centre, controller_program(loop.controller, parameters, centre))
 
 
 def draw_sequence(case: Case, seed: int, samples: int = SAMPLES) -> Faulty:
@@ -300,7 +297,7 @@ def try_controller(
 ) -> None:
     """One controller over its sequences, in all languages."""
     case, wanted = draw_case(seed), set(languages)
-    header = make_header("pid_x", case.loop, case.parameters, case.centre, [])
+    header = make_header("pid_x", case.loop.controller, case.parameters, case.centre, [])
     given = [draw_sequence(case, 1000 * seed + k) for k in range(sequences)]
     runs: list[dict[str, Outputs]] = [{"library": run_library(case, s), "program": run_program(case, s)} for s in given]
     if "python" in wanted:

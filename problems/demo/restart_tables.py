@@ -30,17 +30,13 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 
 import numpy as np
 
-from pneuopt.control.forms import Form, ParallelForm, to_series, to_standard
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID, AntiWindup
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import PID, AntiWindup, Form, ParallelForm, to_series, to_standard
 from pneuopt.dynamics.system import System, discretise, names
-from pneuopt.export.c99 import write_c99
-from pneuopt.export.header import make_header
+from pneuopt.export.languages import make_reference_run, write_c99, write_python, write_structured_text
 from pneuopt.export.program import ControllerProgram, controller_program
-from pneuopt.export.python_class import write_python
-from pneuopt.export.reference_run import make_reference_run
-from pneuopt.export.structured_text import write_structured_text
+from pneuopt.export.writer import make_header
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive
@@ -225,7 +221,7 @@ def compare_languages(
     loop: ClosedLoop, parameters: ParameterSet, program: ControllerProgram, run: Run, text: bool
 ) -> float:
     """The largest difference of the exported languages, over the largest output."""
-    header = make_header("pid", loop, parameters, 0.0, [])
+    header = make_header("pid", loop.controller, parameters, 0.0, [])
     found = {
         "python": run_python(write_python(program, header)["pid.py"], run),
         "c": run_c(write_c99(program, header, make_reference_run(program)), program, run),
@@ -241,14 +237,16 @@ def end_of_running(trial: Trial) -> float:
     """Where the loop ends that ran without limits when its setpoint changed."""
     free = trial._replace(windup="unlimited")
     loop, parameters = make_loop(free)
-    return float(run_loop(free, loop, parameters, controller_program(loop, parameters), runs=True).measured[-1])
+    return float(
+        run_loop(free, loop, parameters, controller_program(loop.controller, parameters), runs=True).measured[-1]
+    )
 
 
 def try_restart(trial: Trial, text: bool) -> tuple[float, float, float]:
     """The jump, the error at the end, and the languages' difference (with structured text or without)."""
     own, far = trial.structure, trial.situation == "saturation"
     loop, parameters = make_loop(trial)
-    program = controller_program(loop, parameters)
+    program = controller_program(loop.controller, parameters)
     run = run_loop(trial, loop, parameters, program, runs=far)
     error = abs(run.measured[-1] - end_of_running(trial)) / (own.far if far else own.away)
     same = trial.situation in ("rest", "saturation")

@@ -23,7 +23,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.control.disturbance import add_disturbances
+from pneuopt.control.loop import add_disturbances
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from problems.shared.arrays import Array

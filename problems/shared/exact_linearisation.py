@@ -13,9 +13,8 @@ from typing import Any, ClassVar
 import casadi as ca
 
 import pneuopt as po
-from pneuopt.control.compensation import Instant
-from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, SensedSignal
-from pneuopt.control.wiring import Signals
+from pneuopt.control.compensators import ControllerSnapshot
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, SensedSignal, Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.cylinder import areas, volumes
@@ -81,11 +80,11 @@ class ExactLinearisation:
         """What has been learned of the friction, and of the mass."""
         return (Quantity("friction", "N", 10.0), Quantity("mass", "kg")) if self.adapts else ()
 
-    def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, _seen: ControllerSnapshot) -> list[Any]:
         """Nothing so far."""
         return [0.0, 0.0] if self.adapts else []
 
-    def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def act(self, seen: ControllerSnapshot, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """What is learned after the sample, and the voltage."""
         known: dict[str, Any] = {n: self.drive.value(n) for n in self.drive}
         y, a, b = (seen.readings[n] for n in ("position", "pressure_a", "pressure_b"))

@@ -7,12 +7,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pneuopt.control.compensation import Instant
+from pneuopt.control.compensators import ControllerSnapshot
+from pneuopt.control.controller import Feedforward
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
+from pneuopt.control.pid import PID, Form
 from pneuopt.control.sensor import SensedSignal
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import System, define, names
@@ -76,11 +75,11 @@ class HostileCompensator:
         """A filtered value a reading."""
         return tuple(Quantity(n, "1") for n in self.kept)
 
-    def start(self, _on: SensedSignal, seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, seen: ControllerSnapshot) -> list[Any]:
         """The readings so far."""
         return [seen.readings[n] for n in self.readings]
 
-    def act(self, seen: Instant, x: Mapping[str, Any], p: Mapping[str, Any]) -> tuple[dict[str, Any], ca.SX]:
+    def act(self, seen: ControllerSnapshot, x: Mapping[str, Any], p: Mapping[str, Any]) -> tuple[dict[str, Any], ca.SX]:
         """The filtered readings, and the sum."""
         after, added = {}, ca.SX(0)
         for read, gain, kept in zip(self.readings, self.gains, self.kept, strict=True):
@@ -129,7 +128,7 @@ def hostile_run(seed: int, samples: int = SAMPLES, words: Sequence[str] = ()) ->
 
 def _run(loop: ClosedLoop, parameters: ParameterSet, centre: float, g: np.random.Generator, samples: int) -> Run:
     order, plant, p = names(loop.states), names(loop.plant.states), loop.parameter_vector(parameters)
-    program = controller_program(loop, parameters, centre)
+    program = controller_program(loop.controller, parameters, centre)
     shown = np.cumsum(g.normal(size=(samples, len(plant))), axis=0) * 0.05
     reference = 0.3 * np.repeat(g.normal(size=samples // 50 + 1), 50)[:samples]
     read = [plant.index(n) for n in loop.readings]

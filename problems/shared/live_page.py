@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.response import loop_inputs, sample_spacing

@@ -7,7 +7,7 @@ from math import inf
 import numpy as np
 
 import pneuopt as po
-from pneuopt.control.composed_loops import ComposedLoops
+from pneuopt.control.linear_loop import ComposedLoops
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from problems.shared.arrays import Array

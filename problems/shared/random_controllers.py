@@ -5,13 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID, AntiWindup
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import PID, AntiWindup, Form
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
 from pneuopt.export.program import controller_program
@@ -107,7 +105,7 @@ def run_library(seed: int) -> Run:
     loop, parameters, centre = random_loop(seed)
     g, h, p = np.random.default_rng(seed + 1000), loop.pid.sample_time or 0.0, loop.parameter_vector(parameters)
     order, plant = names(loop.states), names(loop.plant.states)
-    program = controller_program(loop, parameters, centre)
+    program = controller_program(loop.controller, parameters, centre)
     motion = 0.05 * np.cumsum(g.normal(size=(SAMPLES, 2)), axis=0) * [0.02, 0.2]
     reference = 0.3 * np.repeat(g.normal(size=SAMPLES // 50), 50)
     more = g.normal(size=(SAMPLES, len(loop.motion_inputs))) * 0.1

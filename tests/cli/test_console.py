@@ -9,9 +9,8 @@ import pytest
 from rich.console import Console
 
 from pneuopt.cli.terminal import make_console, progress, show_report, show_sentence
-from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
+from pneuopt.control.pid import PID, Form
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import report_margins
 from pneuopt.evaluation.dither_effect import DitherEffect

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from pneuopt.control.bumpless import bumpless_transfer
+from pneuopt.control.controller import Feedforward
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
+from pneuopt.control.pid import PID, Form
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.models.drive import ForceDrive

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from pneuopt.control.bumpless import bumpless_transfer
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.gain_schedule import SCHEDULED_GAINS, GainSchedule
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.simulate import simulate

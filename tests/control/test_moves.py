@@ -1,4 +1,7 @@
+"""Moves, sequences of them and paths through points."""
+
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from pneuopt.control.moves import Move, MoveProfile
-from pneuopt.control.profiles import plan_s_curve
+from pneuopt.control.moves import MotionPath, Move, MoveProfile, MoveSequence, plan_s_curve
 from pneuopt.control.reference import Reference
 from pneuopt.quantities.errors import InputError
 
@@ -130,3 +132,96 @@ def test_a_move_is_a_reference() -> None:
 def test_impossible_moves_are_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         Move(**({"distance": 0.1, "speed": 1.0, "acceleration": 1.0} | fields))
+
+
+MOVE = Move(0.2, speed=0.5, acceleration=5.0, dwell=0.25, initial=0.1, at=0.1)
+NEXT = Move(-0.3, speed=0.5, acceleration=5.0, jerk=200.0, dwell=0.5)
+
+
+def test_moves_follow_each_other() -> None:
+    both = MoveSequence([MOVE, NEXT])
+    assert isinstance(both, Reference)
+    first, second = both.chain
+    assert (second.at, second.initial) == (MOVE.horizon, MOVE.final)
+    assert (both.origin, both.initial, both.final) == (0.1, MOVE.final, second.final)
+    t = np.linspace(0, both.horizon, 3001)
+    r, v, a = both.motion(t)
+    before = t < second.at
+    np.testing.assert_array_equal(r[before], first.values(t)[before])
+    np.testing.assert_array_equal(r[~before], second.values(t)[~before])
+    assert np.abs(np.diff(r)).max() < 0.5 * (t[1] - t[0]) * 1.001
+    assert (np.abs(v).max(), np.abs(a).max()) == (pytest.approx(0.5), pytest.approx(5.0))
+    assert [part.label for part in both.parts] == ["0.1 to 0.3", "0.1 to 0.3 to 0"]
+
+
+def test_a_sequence_runs_on_any_grid() -> None:
+    run = MoveSequence([MOVE, NEXT]).trajectory(1e-2)
+    assert run.names == ("reference", "reference_speed", "reference_acceleration")
+    assert run["reference"][0] == 0.1
+    assert run["reference_speed"][-1] == 0.0
+
+
+def test_a_disturbance_comes_with_the_last_move() -> None:
+    push = replace(NEXT, disturbance={"load.force": 20.0})
+    both = MoveSequence([MOVE, push])
+    run = both.trajectory(1e-2)
+    assert run["disturbance.load.force"].tolist() == np.where(run.t >= both.at - 1e-12, 20.0, 0.0).tolist()
+    with pytest.raises(InputError, match="only the last move may have a disturbance, move 1 has one"):
+        MoveSequence([push, NEXT])
+
+
+def test_a_horizon_is_that_of_the_last_dwell() -> None:
+    both = MoveSequence([MOVE, NEXT]).with_horizon(9.0)
+    assert both.horizon == pytest.approx(9.0)
+    assert both.moves[0] == MOVE
+
+
+@pytest.mark.parametrize("own", [{"at": 0.1}, {"initial": 0.1}, {"start": {"pressure_b": 3e5}}])
+def test_a_later_move_has_no_beginning_of_its_own(own: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="move 2 begins where the one before ends"):
+        MoveSequence([MOVE, replace(NEXT, **own)])  # type: ignore[arg-type]
+
+
+def test_no_move_is_refused() -> None:
+    with pytest.raises(InputError, match="there is no move"):
+        MoveSequence([])
+
+
+T = np.array([0.0, 0.5, 1.0, 1.5])
+
+
+def test_a_path_goes_through_its_points_and_nowhere_beyond() -> None:
+    points = np.array([0.0, 0.1, 0.1, 0.3])
+    path = MotionPath(T, points)
+    assert isinstance(path, Reference)
+    np.testing.assert_allclose(path.values(T), points, atol=1e-15)
+    t = np.linspace(0, path.horizon, 2001)
+    r, v, _ = path.motion(t)
+    assert (r.min(), v[-1]) == (0.0, 0.0)
+    assert [r.max(), r[-1]] == pytest.approx([0.3, 0.3], rel=1e-12)
+    np.testing.assert_allclose(r[(t >= 0.5) & (t <= 1.0)], 0.1, atol=1e-15)
+    np.testing.assert_allclose(np.gradient(r, t)[5:1480], v[5:1480], atol=5e-3)
+    assert path.with_horizon(0.9).trajectory(0.1)["reference"] == pytest.approx(path.values(np.linspace(0.0, 0.9, 10)))
+
+
+def test_a_path_that_returns_is_measured_by_its_range() -> None:
+    path = MotionPath(T, [0.1, 0.3, 0.2, 0.1])
+    assert (path.size, path.changes) == (0.0, False)
+    assert path.nominal_size == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"points": [0.0, 1.0]}, "rows of two or more, got shapes"),
+        ({"t": [0.0, 1.0, 1.0, 2.0]}, "does not at point 3"),
+        ({"t": [1.0, 2.0, 3.0, 4.0]}, "time begins at 0, got 1 s"),
+        ({"points": [1.0, 1.0, 1.0, 1.0]}, "nothing moves"),
+        ({"points": [1.0, np.nan, 1.0, 1.0]}, "not finite"),
+        ({"dwell": -2.0}, "ends the experiment before it begins"),
+    ],
+)
+def test_impossible_paths_are_refused(fields: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {"t": T, "points": [0.0, 0.1, 0.2, 0.3]}
+    with pytest.raises(InputError, match=message):
+        MotionPath(**(given | fields))

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import simulate_stick_slip

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pneuopt.control.dead_zone_inverse import DeadZoneInverse
+from pneuopt.control.compensators import DeadZoneInverse
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step

@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.move_sequence import MoveSequence
-from pneuopt.control.moves import Move
+from pneuopt.control.moves import Move, MoveSequence
 from pneuopt.control.pid import PID
 from pneuopt.evaluation.move_check import check_move, scale_move, shortest_move
 from pneuopt.evaluation.requirements import SettlingTime

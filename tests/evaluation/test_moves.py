@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.motion_path import MotionPath
-from pneuopt.control.move_sequence import MoveSequence
-from pneuopt.control.moves import Move
+from pneuopt.control.moves import MotionPath, Move, MoveSequence
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import certificate

@@ -6,10 +6,9 @@ import control
 import numpy as np
 import pytest
 
-from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import Dither
 from pneuopt.control.linear_loop import open_loop
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System, define

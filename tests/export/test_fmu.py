@@ -17,7 +17,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names
 from pneuopt.export.fmu import export_fmu
-from pneuopt.export.targets import Language, export_controller
+from pneuopt.export.languages import Language, export_controller
 from pneuopt.models import catalog
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck

@@ -5,9 +5,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form, SeriesForm, to_parallel
-from pneuopt.control.pid import PID
+from pneuopt.control.controller import Feedforward
+from pneuopt.control.pid import PID, Form, SeriesForm, to_parallel
 from pneuopt.control.sensor import Encoder
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuned import write_tuned

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import tomlkit
 
-from pneuopt.control.motion_path import MotionPath
-from pneuopt.control.move_sequence import MoveSequence
-from pneuopt.control.moves import Move, MoveProfile
+from pneuopt.control.moves import MotionPath, Move, MoveProfile, MoveSequence
 from pneuopt.evaluation.band import Tolerance
 from pneuopt.files.references import move_paths
 from pneuopt.files.toml import read_toml

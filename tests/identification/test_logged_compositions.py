@@ -8,15 +8,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pneuopt.control.acceleration_feedback import AccelerationFeedback
-from pneuopt.control.friction_feedforward import FrictionFeedforward
+from pneuopt.control.compensators import AccelerationFeedback, FrictionFeedforward, MotionFeedforward, PressureFeedback
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.motion_feedforward import MotionFeedforward
-from pneuopt.control.move_sequence import MoveSequence
-from pneuopt.control.moves import Move
+from pneuopt.control.moves import Move, MoveSequence
 from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
-from pneuopt.control.pressure_feedback import PressureFeedback
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.identify import identify

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.control.dead_zone_inverse import DeadZoneInverse
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.knocker import Knocker
+from pneuopt.control.compensators import DeadZoneInverse, Knocker
+from pneuopt.control.controller import Feedforward
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import SensorLag

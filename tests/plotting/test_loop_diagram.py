@@ -9,13 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
 from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import PID, Form
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import System, define
 from pneuopt.models.drive import ForceDrive

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pneuopt as po
-from pneuopt.control.compensation import Instant
+from pneuopt.control.compensators import ControllerSnapshot
 from problems.shared.exact_linearisation import ExactLinearisation
 from problems.shared.p32 import SAMPLE_TIME, drive, fresh_plants, plants, trips
 from problems.shared.p32_margins import Margins
@@ -106,7 +106,7 @@ def test_the_linearisation_gives_the_force_the_rate_that_it_asks_for() -> None:
         state = {"position": 0.1, "speed": speed, "pressure_a": 4.6e5, "pressure_b": 4.9e5}
         p: Any = {"speed_gain": 30.0, "force_gain": 80.0, "friction": 20.0, "smoothing": 1e-3, "rise": 0.5}
         rates = {"reference_speed": 0.2, "reference_acceleration": 1.0}
-        voltage = float(law.act(Instant(0.0, wanted, speed, 0.0, SAMPLE_TIME, rates, state), {}, p)[1])
+        voltage = float(law.act(ControllerSnapshot(0.0, wanted, speed, 0.0, SAMPLE_TIME, rates, state), {}, p)[1])
         opening = voltage / given.value("valve.span")
         spool = opening + np.sign(opening) * given.value("valve.dead_zone")
         x = [{**state, "valve.spool": spool}.get(q.name, 0.0) for q in drive_.states]

@@ -10,18 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pneuopt.control.disturbance import add_disturbances
+from pneuopt.control.controller import Feedforward
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import Form
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
+from pneuopt.control.loop import ClosedLoop, add_disturbances
+from pneuopt.control.pid import PID, Form
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import SensorLag
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.response import loop_inputs, sample_spacing
-from pneuopt.export.javascript import write_loop_javascript
+from pneuopt.export.languages import write_loop_javascript
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive

@@ -91,10 +91,10 @@ def test_forms_are_those_of_the_conversions_and_a_form_that_does_not_exist_says_
     loop: tuple[ClosedLoop, ParameterSet],
 ) -> None:
     made, parameters = loop
-    text = report_forms(made, parameters).to_text(200)
+    text = report_forms(made.controller, parameters).to_text(200)
     for words in ("Ki 0.1 V/m", "Ti 200 ms", "Td 25 ms", "N 25", "K 0.0170502"):
         assert words in text, text
-    text = report_forms(made, parameters.with_values({"pid.Ki": 1.0})).to_text(200)
+    text = report_forms(made.controller, parameters.with_values({"pid.Ki": 1.0})).to_text(200)
     assert "no series form has these gains" in text
 
 

@@ -5,9 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import define

@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
-from pneuopt.control.dead_zone_inverse import DeadZoneInverse
+from pneuopt.control.compensators import DeadZoneInverse
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.dither import Dither
-from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
+from pneuopt.control.pid import PID, Form
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import SensorLag
 from pneuopt.dynamics.system import System, define

@@ -5,9 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pneuopt.control.compensation import Compensator
-from pneuopt.control.compensators import COMPENSATORS
-from pneuopt.control.friction_feedforward import Direction, FrictionFeedforward
+from pneuopt.control.compensators import COMPENSATORS, Compensator, Direction, FrictionFeedforward
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID

@@ -1,26 +1,63 @@
-"""What comes from files and names stays a comment, whatever it holds."""
+"""The walk over a graph: its text computes what the graph computes, in its order, with divisions where needed."""
 
 import ast
 import shutil
 import subprocess
 from pathlib import Path
 
+import casadi as ca
+import numpy as np
 import pytest
 
+from pneuopt.control.compensators import FrictionFeedforward
+from pneuopt.control.controller import PositionLoop
 from pneuopt.control.dither import Dither
-from pneuopt.control.forms import Form
-from pneuopt.control.friction_feedforward import FrictionFeedforward
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
-from pneuopt.control.position_loop import PositionLoop
-from pneuopt.export.header import comment_text, make_header
-from pneuopt.export.targets import Language, export_controller
+from pneuopt.control.pid import PID, Form
+from pneuopt.export.languages import PYTHON, Language, export_controller
+from pneuopt.export.writer import Names, Written, comment_text, make_header, write_expressions
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.units import write_value
 from problems.shared.structured_text_run import FunctionBlock
+
+a, b, c = (ca.SX.sym(n) for n in "abc")
+EXPRESSIONS = [
+    a - (b - c), a - b - c, a - (b + c), a / (b / c), a / b / c, a * (b / c), -(a + b) * c, -a - -b, (a * b) ** 2,
+    (a - b) * (a + b), 2 * (a + b), 1 / (a + b), ca.if_else(a > b, a - b, c), (a < b) * c, ca.fmin(ca.fmax(a, -b), c),
+    ca.if_else(ca.logic_and(a > 0, b < c), a, b + c), ca.if_else(ca.logic_not(a > b), 1, ca.fabs(c)), (a + b) + (c + a),
+]  # fmt: skip
+
+
+def write(expression: ca.SX, parameters: frozenset[str] = frozenset()) -> Written:
+    function = ca.Function("f", [ca.vertcat(a, b, c)], [expression])
+    return write_expressions(function, Names([["a", "b", "c"]], ["y"], parameters=parameters), PYTHON)
+
+
+def value(written: Written, given: dict[str, float]) -> float:
+    space = dict(given)
+    for line in (*written.coefficients, *written.statements):
+        space[line.name] = eval(line.text, {"math": __import__("math")}, space)
+    return float(eval(written.results["y"], {"math": __import__("math")}, space))
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
+@pytest.mark.parametrize("parameters", [frozenset(), frozenset("b"), frozenset("bc")], ids=len)
+def test_the_text_is_the_expression(expression: ca.SX, parameters: frozenset[str]) -> None:
+    function = ca.Function("f", [ca.vertcat(a, b, c)], [expression])
+    for given in np.random.default_rng(0).normal(size=(5, 3)):
+        own = value(write(expression, parameters), dict(zip("abc", given.tolist(), strict=True)))
+        assert own == pytest.approx(float(function(given)), rel=1e-14)
+
+
+def test_a_division_by_a_parameter_is_a_factor_but_not_before_a_jump() -> None:
+    assert "/" not in write(a / b, frozenset("b")).results["y"]
+    exact = write(ca.floor(a / b), frozenset("b"))
+    assert value(exact, {"a": 49.0, "b": 49.0, "c": 0.0}) == 1.0
+    assert 49.0 * (1 / 49.0) < 1.0  # which a factor would have made 0
+
 
 HOSTILE = [
     "a */ int evil; /*",
@@ -134,7 +171,7 @@ def test_the_header_tells_of_starts_and_faults(Ki: float, told: str) -> None:
     loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-2))
     values = {"pid.Ki": Ki, "pid.Tt": 0.25, "pid.lower": -5.0, "pid.upper": 5.0}
     p = loop.parameters.with_values({**values, "pid.fault_samples": 7.0, "pid.fault_output": -9.0})
-    text = " ".join(make_header("pid", loop, p, 5.0, []).lines)
+    text = " ".join(make_header("pid", loop.controller, p, 5.0, []).lines)
     assert told in text
     assert "a time constant of 250 ms" in text
     assert "After 7 bad samples in a row (fault_samples), 70 ms, the output goes to 0 V (fault_output)" in text

@@ -1,0 +1,728 @@
+"""`Controller`: everything of a loop but the plant, its parameters, its states and one law for loops and exports.
+
+Read `Controller.update` first: what is computed at a sample. A `ClosedLoop` joins a controller to its plant, an export
+writes it for another machine.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from math import inf
+from operator import or_
+from typing import Any, ClassVar, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pneuopt.control.compensators import (
+    Compensator,
+    ControllerSnapshot,
+    check_compensators,
+    check_values,
+    compensate,
+)
+from pneuopt.control.dither import DITHER_OFFSET, Dither
+from pneuopt.control.gain_schedule import GainSchedule
+from pneuopt.control.pid import BAD_SAMPLES, PID, Form, ParallelForm, parallel_gains
+from pneuopt.control.reset_integral import reset_integral
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag, Signals
+from pneuopt.dynamics.hooks import Axis
+from pneuopt.dynamics.system import Symbols, stack
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError, check_names, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, with_prefix, without_prefix
+from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
+
+LARGEST_SIGNAL = 1e30
+"""A signal beyond it, or that compares with nothing, is no number: larger than any reading, a literal everywhere."""
+ERROR = "error"
+"""Beside the inputs of a cascade's inner controller: the error of the outer one."""
+_COUNT = f"pid.{BAD_SAMPLES}"
+MAX_BISECTIONS = 120  # halvings of a bracket: fewer than some 60 leave digits of a double, more cost time
+MAX_DOUBLINGS = 60  # of a bracket from 1 [command's unit] on: fewer than some 20 miss large commands
+
+
+@dataclass(frozen=True)
+class PlantSignals:
+    """What a controller knows of a plant: the signals between the two.
+
+    Parameters
+    ----------
+    command : Quantity
+        The plant's input that the controller drives.
+    feedback : Quantity
+        The plant's output that the loop is judged by.
+    outputs : mapping of str to Quantity
+        All of the plant's, some of which the controller reads.
+    axis : Axis, optional
+        What the outputs of an axis are called.
+    load_unit : str
+        Of the axis's mass or inertia.
+    """
+
+    command: Quantity
+    feedback: Quantity
+    outputs: Mapping[str, Quantity]
+    axis: Axis | None = None
+    load_unit: str = "1"
+
+
+MIN_FEEDFORWARD_TIME = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast leads are refused
+
+
+@dataclass(frozen=True)
+class Feedforward:
+    """A set-point lead: ``u_ff = gain (r - r_f)``, ``d(r_f)/dt = (r - r_f)/time``, added to the PID's command.
+
+    A step R of the reference adds ``gain R e^(-t/time)``: a push that the controller need not wait for its error's
+    integral to give. It sees the reference alone, so the loop's margins do not change, and at rest it adds nothing.
+
+    With a sampled PID it is computed with it, h = `PID.sample_time` (backward Euler, the suffix _ marks the previous
+    sample): ``r_f = (time r_f_ + h r)/(time + h)``.
+
+    Parameters
+    ----------
+    time : float
+        Default of the parameter "feedforward.time" [s].
+    """
+
+    time: float = 0.05
+
+    def __post_init__(self) -> None:
+        require(
+            MIN_FEEDFORWARD_TIME <= self.time < inf,
+            f"Feedforward: time must be at least {MIN_FEEDFORWARD_TIME:g} s, got {self.time:g} s",
+        )
+
+    def parameters(self, input_unit: str, output_unit: str) -> ParameterSet:
+        """The gain [output_unit/input_unit], zero by default, and the time [s].
+
+        Examples
+        --------
+        >>> [(n, p.unit) for n, p in Feedforward().parameters("m/s", "V").items()]
+        [('gain', 'V*s/m'), ('time', 's')]
+        """
+        gain = Parameter(
+            0.0, unit_ratio(output_unit, input_unit), meaning="command per jump of the reference, which decays again"
+        )
+        return ParameterSet(
+            {
+                "gain": gain,
+                "time": Parameter(self.time, "s", lower=MIN_FEEDFORWARD_TIME, meaning="time constant of that decay"),
+            }
+        )
+
+    def states(self, measured: Quantity) -> tuple[Quantity, ...]:
+        """The filtered reference r_f, as "filter"."""
+        return (Quantity("filter", measured.unit, measured.nominal),)
+
+    def rates(self, x: Symbols, r: ca.SX, p: Symbols) -> tuple[dict[str, ca.SX], ca.SX]:
+        """The continuous law: d(r_f)/dt, and u_ff [output unit]."""
+        lead = r - x["filter"]
+        return {"filter": lead / p["time"]}, p["gain"] * lead
+
+    def update(self, x: Symbols, r: ca.SX, p: Symbols, elapsed: ca.SX | float) -> tuple[dict[str, ca.SX], ca.SX]:
+        """The sampled law at a sample, `elapsed` [s] after the last good one: the next r_f, and u_ff [output unit]."""
+        slow = (p["time"] * x["filter"] + elapsed * r) / (p["time"] + elapsed)
+        return {"filter": slow}, p["gain"] * (r - slow)
+
+
+POSITION_GAIN = 10.0  # [1/s] default: a small one creeps in, one near the speed loop's own bandwidth swings
+
+
+@dataclass(frozen=True)
+class PositionLoop:
+    """``v_r = Kp (r - y) + weight reference_speed``: the reference of the speed that the PID then controls.
+
+    r and y are the position wanted and the position measured. With a weight of 1 a motion at constant speed is followed
+    without an error, with 0 it trails by its speed over Kp. It has no integral: that of a PI of the speed lets no error
+    rest, and two integrals in series swing. It is proportional, so there is nothing to start, and nothing to wind up
+    beside the PID's integral.
+
+    K. J. Åström and T. Hägglund, Advanced PID Control, ISA 2006, section 12.4 (cascade control).
+    """
+
+    section: ClassVar[str] = "position_loop"
+
+    def parameters(self, position_unit: str, speed_unit: str) -> ParameterSet:
+        """The gain [1/s] and the weight of the reference's speed [1].
+
+        Examples
+        --------
+        >>> [(n, p.value, p.unit) for n, p in PositionLoop().parameters("m", "m/s").items()]
+        [('Kp', 10.0, '1/s'), ('weight', 1.0, '1')]
+        """
+        gain = unit_ratio(speed_unit, difference_unit(position_unit))
+        return ParameterSet(
+            {
+                "Kp": Parameter(POSITION_GAIN, gain, lower=0.0, meaning="speed per error of the position"),
+                "weight": Parameter(1.0, "1", lower=0.0, meaning="weight of the reference's speed"),
+            }
+        )
+
+    def set_point(self, reference: Any, speed: Any, position: Any, p: Any) -> Any:
+        """The PID's reference v_r, from the reference, its speed, the position measured and the own parameters."""
+        return p["Kp"] * (reference - position) + p["weight"] * speed
+
+
+class ControllerUpdate(NamedTuple):
+    """What is computed at a sample, by name.
+
+    Attributes
+    ----------
+    states : dict of str to casadi.SX
+        The states of sensor, PID, feedforward and compensators after the sample, by the loop's names.
+    terms : dict of str to casadi.SX
+        What the command is made of: "error", "proportional", "integral" (before back-calculation), "derivative",
+        "feedforward", "compensation", "dither", and their sum before the clip, "unlimited"; the gains of this instant,
+        "Kp_parallel" and so on; and the signals as they are computed with, "reference_read" for instance.
+    """
+
+    states: Signals
+    terms: Signals
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """A PID and all that acts beside it.
+
+    Its methods take states, inputs, outputs and parameters by their names in a loop ("pid.Kp"), in mappings that may
+    hold others, too.
+
+    Parameters
+    ----------
+    pid : PID
+    signals : PlantSignals
+    dither, sensor, feedforward, compensators, outer, schedule
+        As for `ClosedLoop`.
+
+    Raises
+    ------
+    ModelError
+        If a part does not fit the signals or another part.
+    InputError
+        If the dither cannot be sampled.
+    """
+
+    pid: PID
+    signals: PlantSignals
+    dither: Dither | None = None
+    sensor: SensorLag | Encoder | None = None
+    feedforward: Feedforward | None = None
+    compensators: tuple[Compensator, ...] = ()
+    outer: PositionLoop | None = None
+    schedule: GainSchedule | None = None
+
+    def __post_init__(self) -> None:
+        if self.sensor is not None:
+            self.sensor.check(self.sensed_signal)
+        if self.outer is not None:
+            position = (self.signals.axis or Axis()).position
+            told = f"a PositionLoop controls the {position}, this loop {self.feedback.name!r}"
+            require(self.feedback.name == position, f"{told}; take measured={position!r}", ModelError)
+            told = "a Feedforward is of jumps of what the PID follows, in a cascade a speed; take MotionFeedforward"
+            require(self.feedforward is None, told, ModelError)
+        check_compensators(self.compensators, self.sensed_signal, self.signals.axis)
+        own = self.parameters  # raises where a part cannot be built: a dither beyond the Nyquist frequency, say
+        if self.schedule:
+            self.schedule.check(own)
+
+    @property
+    def command(self) -> Quantity:
+        """The plant's input that it drives."""
+        return self.signals.command
+
+    @property
+    def feedback(self) -> Quantity:
+        """The plant's output that the loop is judged by, and an outer loop controls."""
+        return self.signals.feedback
+
+    @cached_property
+    def pid_signal(self) -> Quantity:
+        """The plant's output that the PID controls."""
+        if self.outer is None:
+            return self.feedback
+        speed = (self.signals.axis or Axis()).speed
+        check_names("output", [speed], self.signals.outputs, "ClosedLoop measured")
+        return self.signals.outputs[speed]
+
+    @cached_property
+    def sensed_signal(self) -> SensedSignal:
+        """What the sensor reads."""
+        axis = self.signals.axis or Axis()
+        order = {axis.position: 0, axis.speed: 1}.get(self.pid_signal.name, None if self.signals.axis else 1)
+        return SensedSignal(
+            self.pid_signal, self.signals.outputs, self.pid.sample_time, order, cascade=bool(self.outer)
+        )
+
+    @cached_property
+    def parameters(self) -> ParameterSet:
+        """Those of its parts: "pid.*", "dither.*", "sensor.*", "feedforward.*" and so on, all defaults."""
+        on, measured, unit = self.sensed_signal, self.pid_signal.unit, self.command.unit
+        parts = {
+            "pid": self.pid.parameters(measured, unit, self.feedback.unit),
+            "dither": self.dither.parameters(unit, self.pid.sample_time) if self.dither else ParameterSet(),
+            "sensor": self.sensor.parameters(on) if self.sensor else ParameterSet(),
+            "feedforward": self.feedforward.parameters(measured, unit) if self.feedforward else ParameterSet(),
+            **{c.section: c.parameters(on, unit) for c in self.compensators},
+        }
+        if self.outer:
+            parts[self.outer.section] = self.outer.parameters(self.feedback.unit, measured)
+        if self.schedule:
+            outputs, position = self.signals.outputs, self.schedule.position
+            check_names("output", [position], outputs, "GainSchedule: position")
+            parts["schedule"] = self.schedule.parameters(outputs[position].unit, self.signals.load_unit)
+        return reduce(or_, (own.with_prefix(name) for name, own in parts.items()), ParameterSet())
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """The sensor's ("sensor.reading"), the PID's ("pid.*"), "feedforward.filter" and the compensators'."""
+        parts = {
+            "sensor": self.sensor.states(self.sensed_signal) if self.sensor else (),
+            "pid": self.pid.states(self.pid_signal, self.command),
+            "feedforward": self.feedforward.states(self.feedback) if self.feedforward else (),
+            **{c.section: c.states(self.sensed_signal, self.command) for c in self.compensators},
+        }
+        return tuple(replace(q, name=f"{name}.{q.name}") for name, quantities in parts.items() for q in quantities)
+
+    @property
+    def tunable_sections(self) -> tuple[str, ...]:
+        """Prefixes of the parameters that a tuning may change: not the sensor's."""
+        outer = (self.outer.section,) if self.outer else ()
+        return ("pid", *outer, "dither", "feedforward", *(c.section for c in self.compensators), "schedule")
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """The reference, then its rates that a compensator uses."""
+        return (replace(self.feedback, name="reference"), *self.motion_inputs)
+
+    @property
+    def motion_inputs(self) -> tuple[Quantity, ...]:
+        """Of "reference_speed" and "reference_acceleration" those that a compensator uses."""
+        on = self.sensed_signal
+        units = {REFERENCE_SPEED: on.speed_unit, REFERENCE_ACCELERATION: unit_ratio(on.speed_unit, "s")}
+        used = {n for part in self.compensators for n in part.motion_inputs(on)}
+        used |= {REFERENCE_SPEED} if self.outer else set()
+        return tuple(Quantity(n, unit) for n, unit in units.items() if n in used)
+
+    @cached_property
+    def readings(self) -> tuple[str, ...]:
+        """The plant's outputs that it reads beside what its PID controls, in the plant's order."""
+        used = {n for part in self.compensators for n in part.reads(self.sensed_signal)}
+        if not isinstance(self.sensor, Encoder):  # which has the position itself
+            used |= {self.feedback.name} if self.outer else set()
+            used |= {self.schedule.position} - {self.pid_signal.name} if self.schedule else set()
+        return tuple(n for n in self.signals.outputs if n in used)
+
+    @property
+    def is_composed(self) -> bool:
+        """Whether more than a PID of one signal is fed back, so that the loop is linearised by `ComposedLoops`."""
+        on = self.sensed_signal
+        remembers = any(part.states(on, self.command) for part in self.acting_always)
+        return bool(self.outer or self.schedule) or remembers
+
+    @property
+    def acting_always(self) -> tuple[Compensator, ...]:
+        """The compensators that count in a loop's rest and margins."""
+        return tuple(c for c in self.compensators if c.acts_always)
+
+    def check(self, parameters: ParameterSet) -> None:
+        """Refuse values that no controller can run with, whatever their bounds: `InputError` names the parameter."""
+        value = self.values(parameters)
+        if self.dither:
+            self.dither.check(value["dither.frequency"], self.pid.sample_time)
+        if self.feedforward:
+            time = value["feedforward.time"]
+            require(time > 0, f"feedforward.time must be positive, got {time:g} s; without it set its gain to zero")
+        if self.schedule:
+            self.schedule.check_values(without_prefix(value, "schedule"))
+        check_values(self.compensators, self.parameters, value, self.sensor_resolution(parameters))
+        self.pid.check({**without_prefix(value, "pid"), "Tf": self.parallel_form(parameters).Tf}, self.command.unit)
+
+    def complete(self, parameters: ParameterSet) -> ParameterSet:
+        """A set with every parameter of the controller: the given ones, and its defaults for those that are missing."""
+        return self.parameters | parameters
+
+    def parameter_vector(self, parameters: ParameterSet) -> Array:
+        """The vector p of `parameters` in the controller's order; a missing one keeps its default."""
+        return np.array([parameters.value(n) if n in parameters else q.value for n, q in self.parameters.items()])
+
+    def values(self, parameters: ParameterSet) -> dict[str, float]:
+        """The values of its own parameters by name; a missing one keeps its default."""
+        return dict(zip(self.parameters, self.parameter_vector(parameters).tolist(), strict=True))
+
+    @cached_property
+    def gains(self) -> ca.Function:
+        """``p -> [Kp, Ki, Kd, Tf]`` of the parallel form, which is what runs, from the parameters of any `Form`."""
+        p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
+        return ca.Function("gains", [stack(p)], [ca.vertcat(*parallel_gains(self.pid.form, without_prefix(p, "pid")))])
+
+    def parallel_form(self, parameters: ParameterSet) -> ParallelForm:
+        """The gains in the parallel form, from the parameters of any `Form`."""
+        return ParallelForm(*self.gains(self.parameter_vector(parameters)).full().ravel().tolist())
+
+    def sensor_lag(self, p: Mapping[str, Any]) -> Any:
+        """The sensor's time constant in the loop linearised [s]; its parameters are numbers or arrays."""
+        return self.sensor.time_constant(self.sensed_signal, without_prefix(p, "sensor")) if self.sensor else 0.0
+
+    def sensor_resolution(self, parameters: ParameterSet) -> float:
+        """What one count of the sensor changes its reading by [feedback's unit]; 0 of a sensor without counts."""
+        if self.sensor is None:
+            return 0.0
+        on = replace(self.sensed_signal, measured=self.feedback)
+        return self.sensor.reading_resolution(on, without_prefix(self.values(parameters), "sensor"))
+
+    @property
+    def dead_time(self) -> float:
+        """Of the loop linearised [s]: half a sample for the hold, and the computing delay."""
+        return (0.5 + self.pid.delay) * (self.pid.sample_time or 0.0)
+
+    def dither_period(self, parameters: ParameterSet) -> float | None:
+        """The time over which averages and ripple are taken [s] (`Dither.period`); None without dither."""
+        value = self.values(parameters)
+        if self.dither is None or value["dither.amplitude"] == 0:
+            return None
+        return self.dither.period(value["dither.frequency"], self.pid.sample_time)
+
+    def rates(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+        """The law of a continuous controller: the rates of its states, the sensor's apart, and its command."""
+        seen = x["sensor.reading"] if self.sensor else y[self.pid_signal.name]
+        p = self.schedule_gains(p, seen, {}, y)
+        inner = self.inner_inputs(u, y[self.feedback.name], p)
+        moved, added = self._added_command(t, x, inner, seen, y, p)
+        arguments = without_prefix(x, "pid"), inner["reference"], seen, added, without_prefix(p, "pid")
+        rates, command = self.pid.rates(*arguments)
+        return with_prefix(rates, "pid") | moved, command
+
+    def sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
+        """The rates of the sensor's states between samples."""
+        if self.sensor is None:
+            return {}
+        own = without_prefix(x, "sensor"), y, self.sensed_signal, without_prefix(p, "sensor")
+        return with_prefix(self.sensor.rates(*own), "sensor")
+
+    def update(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> ControllerUpdate:
+        """What a sampled controller computes at a sample.
+
+        A sample is bad where any signal that the controller reads is no number, or beyond `LARGEST_SIGNAL`. At a bad
+        sample all states stay as they are, and with them the output; `PID.hold` counts it, and gives the safe output
+        once fault_samples have been bad in a row. The next good sample goes on from those states if there were fewer,
+        with what takes a difference or filters counting the time since the last good one; else it begins anew as at a
+        start, from the output that was sent last. Time, and a dither with it, goes on.
+
+        Parameters
+        ----------
+        t : casadi.SX
+            [s]
+        x, u, p : mapping of str to casadi.SX
+            The loop's states, inputs (the "reference", and its rates where a part uses them) and parameters.
+        y : mapping of str to casadi.SX
+            The plant's outputs: the measured one, or what an `Encoder` counts, and those that compensators read.
+        """
+        is_good = self._signals_are_good(x, u, y)
+        count = ca.if_else(is_good, 0, x[_COUNT] + 1)
+        good = count <= 0  # read where it is needed; the condition above is computed once
+        seen = self._good_signals(good, x, u, y)
+        found = self._sampled_law(t, *seen, p)
+        held = {**x, **with_prefix(self.pid.hold(without_prefix(x, "pid"), count, without_prefix(p, "pid")), "pid")}
+        after = _choose(good, found.states, held) | {_COUNT: count}
+        read = {f"{n}_read": v for own in seen[1:] for n, v in own.items()}
+        return ControllerUpdate(after, read | found.terms)
+
+    def start(
+        self, u: Mapping[str, Any], measured: Any, y: Mapping[str, Any], command: Any, p: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """The first states, sensor apart, from what the actuator has got so far [output unit], by the loop's names.
+
+        Parameters
+        ----------
+        u : mapping of str to float or casadi.SX
+            The inputs as `inner_inputs` gives them.
+        measured : float or casadi.SX
+            As the PID sees it.
+        y : mapping of str to float or casadi.SX
+            The plant's outputs that compensators read.
+        command : float or casadi.SX
+            The PID's, which the compensators that act always add to.
+        p : mapping of str to float or casadi.SX
+            The loop's parameters, with the gains of this instant.
+        """
+        unit = Quantity("command", "1")
+        pid = self.pid.start(u["reference"], measured, command, without_prefix(p, "pid"))
+        begun = {f"pid.{q.name}": v for q, v in zip(self.pid.states(unit, unit), pid, strict=True)}
+        if self.feedforward is not None:
+            begun["feedforward.filter"] = u["reference"]
+        for part in self.compensators:
+            known = ControllerSnapshot(0.0, u["reference"], measured, command, self.pid.sample_time, {}, y)
+            own = zip(part.states(self.sensed_signal, unit), part.start(self.sensed_signal, known), strict=True)
+            begun |= {f"{part.section}.{q.name}": v for q, v in own}
+        return begun
+
+    def rest_states(
+        self, parameters: ParameterSet, y: Mapping[str, float], reference: float, command: float
+    ) -> list[float]:
+        """The states with which it goes on from a command and the plant's outputs at rest, or in steady motion."""
+        value: Mapping[str, Any] = self.values(parameters)
+        sensor = (
+            self.sensor.start(y, self.sensed_signal, without_prefix(value, "sensor")) if self.sensor else list[float]()
+        )
+        seen = sensor[0] if sensor else y[self.pid_signal.name]
+        value = self.schedule_gains(value, seen, {}, y)
+        wanted = float(self.inner_inputs({"reference": reference}, y[self.feedback.name], value)["reference"])
+        p = np.array([float(v) for v in value.values()])
+        v = float(self.uncompensated_command(p, wanted, seen, command, [y[n] for n in self.readings])[0])
+        return [*sensor, *map(float, self.start({"reference": wanted}, seen, y, v, value).values())]
+
+    def inner_inputs(self, u: Mapping[str, Any], position: Any, p: Mapping[str, Any]) -> dict[str, Any]:
+        """The inputs as PID and compensators see them: a cascade's reference is a speed, and `ERROR` a position's.
+
+        Parameters
+        ----------
+        u, p : mapping of str to float or casadi.SX
+            The loop's inputs and parameters.
+        position : float or casadi.SX
+            What the loop is judged by, as the controller sees it.
+        """
+        if self.outer is None:
+            return dict(u)
+        own = without_prefix(p, self.outer.section)
+        speed = self.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, own)
+        return {**u, "reference": speed, ERROR: u["reference"] - position}
+
+    def schedule_gains(
+        self, p: Mapping[str, Any], measured: Any, seen: Mapping[str, Any], y: Mapping[str, Any]
+    ) -> Mapping[str, Any]:
+        """The loop's parameters with the gains of this instant; as they are without a schedule.
+
+        Parameters
+        ----------
+        p : mapping of str to float or casadi.SX
+            The loop's parameters.
+        measured : float or casadi.SX
+            What the PID sees.
+        seen, y : mapping of str to float or casadi.SX
+            The sensor's states after reading, and the plant's outputs, one of which has the position.
+        """
+        if self.schedule is None:
+            return p
+        if self.schedule.position == self.pid_signal.name:
+            return self.schedule.set_gains(p, measured)
+        return self.schedule.set_gains(p, seen["count"] if "count" in seen else y[self.schedule.position])
+
+    @cached_property
+    def compensation(self) -> ca.Function:
+        """The compensators that act always, under constant signals and a reference at rest, of the PID's command.
+
+        ``(command, reference, measured, readings, p) -> [compensated, slope, feedback]``: the command that they make
+        of the PID's, and its derivatives to the PID's command and to the measured signal.
+        """
+        v, r, y = (ca.SX.sym(n) for n in ("command", "reference", "measured"))
+        p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
+        shown: Signals = {n: ca.SX.sym(n) for n in self.readings}
+        on, made = self.sensed_signal, v
+        for part in self.acting_always:
+            rates = dict.fromkeys(part.motion_inputs(on), ca.SX(0))
+            seen = ControllerSnapshot(ca.SX(0), r, y, made, None, rates, shown)
+            names = (q.name for q in part.states(on, self.command))
+            x = dict(zip(names, map(ca.SX, part.start(on, seen)), strict=True))
+            made = made + part.act(seen, x, without_prefix(p, part.section))[1]
+        slopes = (ca.densify(ca.jacobian(made, signal)) for signal in (v, y))
+        return ca.Function("compensation", [v, r, y, stack(shown), stack(p)], [made, *slopes])
+
+    def uncompensated_command(
+        self, p: Array, reference: Any, measured: Any, command: ArrayLike, readings: ArrayLike = ()
+    ) -> Array:
+        """The PID's command of which the compensators that act always make another one.
+
+        Parameters
+        ----------
+        p : ndarray, shape (n_parameters,) or (n_parameters, m)
+            In the order of `Controller.parameters`.
+        reference, measured : float or array_like, shape (m,)
+            The signals at that instant.
+        command : float or array_like, shape (m,)
+            What the compensators make, which grows with the PID's command.
+        readings : array_like, shape (n_readings,) or (n_readings, m)
+            The outputs `Controller.readings`.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+        """
+        wanted = np.atleast_1d(np.asarray(command, dtype=float))
+        if not self.acting_always:
+            return wanted
+        shown = np.asarray(readings, dtype=float)
+        return invert_increasing(lambda v: self._evaluate_compensation(p, reference, measured, v, shown)[0], wanted)
+
+    def compensation_slopes(self, p: Array, measured: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
+        """Slopes of the compensators that act always, at a steady operating point without dither.
+
+        Parameters
+        ----------
+        p : ndarray, shape (n_parameters,) or (n_parameters, m)
+            In the order of `Controller.parameters`.
+        measured : float or array_like, shape (m,)
+            The measured signal, which the reference equals there.
+        command : float or array_like, shape (m,)
+            What the actuator gets, the dither's offset included.
+
+        Returns
+        -------
+        slope, feedback : ndarray, shape (m,)
+            Derivatives of what they make to the PID's command and to the measured signal.
+        """
+        order = list(self.parameters)
+        offset = p[order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0
+        v = self.uncompensated_command(p, measured, measured, np.asarray(command) - offset)
+        _, slope, feedback = self._evaluate_compensation(p, measured, measured, v)
+        return slope, feedback
+
+    def _evaluate_compensation(
+        self, p: Array, reference: Any, measured: Any, v: Array, readings: ArrayLike = ()
+    ) -> list[Array]:
+        """What `compensation` gives for m points at once, shape (m,) each."""
+        rows = [np.broadcast_to(a, v.shape)[None] for a in (v, reference, measured)]
+        shown = np.asarray(readings, dtype=float)
+        rows.append(np.broadcast_to(shown[:, None] if shown.ndim == 1 else shown, (len(self.readings), len(v))))
+        given = p if np.ndim(p) > 1 else np.repeat(np.reshape(p, (-1, 1)), len(v), axis=1)
+        return [np.asarray(found, dtype=float).ravel() for found in self.compensation(*rows, given)]
+
+    def _added_command(
+        self, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
+    ) -> tuple[Signals, ca.SX]:
+        """The rates or next values of the parts' states, and what feedforward, compensators and dither add."""
+        moved, terms = self._added_terms(t, x, u, measured, y, p)
+        return moved, terms["dither"] + (terms["feedforward"] + terms["compensation"])
+
+    def _added_terms(
+        self, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
+    ) -> tuple[Signals, Signals]:
+        """The terms of `_added_command`, "feedforward", "compensation" and "dither", in place of their sum."""
+        moved, lead = self._feedforward_terms(x, u, p)
+        bent = ca.SX(0)
+        if self.compensators:
+            v = self.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
+            rates = {n: u[n] for n in (REFERENCE_SPEED, REFERENCE_ACCELERATION) if n in u}
+            error = u.get(ERROR, u["reference"] - measured)
+            h, elapsed = self.pid.sample_time, self._elapsed_time(x)
+            seen = ControllerSnapshot(t, u["reference"], measured, v + lead, h, rates, y, error, elapsed)
+            own, bent = compensate(self.compensators, seen, x, p)
+            moved = moved | own
+        return moved, {"feedforward": lead, "compensation": bent, "dither": self._dither_command(t, p)}
+
+    def _dither_command(self, t: ca.SX, p: Symbols) -> ca.SX:
+        """What the controller itself adds."""
+        if self.dither is None:
+            return ca.SX(0)
+        own = without_prefix(p, "dither")
+        sampled_apart = self.dither.analogue and self.pid.sample_time is not None
+        return own["offset"] if sampled_apart else own["offset"] + self.dither.wave(t, own)
+
+    def _feedforward_terms(self, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+        """The feedforward's state, its rate or with a sampled PID its next value, and what it adds to the command."""
+        if self.feedforward is None:
+            return {}, ca.SX(0)
+        own = (without_prefix(x, "feedforward"), u["reference"], without_prefix(p, "feedforward"))
+        elapsed = self._elapsed_time(x)
+        moved, added = self.feedforward.rates(*own) if elapsed is None else self.feedforward.update(*own, elapsed)
+        return with_prefix(moved, "feedforward"), added
+
+    def _elapsed_time(self, x: Symbols) -> ca.SX | float | None:
+        """The time since the last good sample [s]; None of a continuous PID."""
+        return None if self.pid.sample_time is None else self.pid.elapsed_time(without_prefix(x, "pid"))
+
+    def _read_names(self, u: Symbols) -> tuple[set[str], set[str], set[str]]:
+        """Which states, inputs and outputs of the plant are signals that the controller reads."""
+        inputs = {"reference", REFERENCE_SPEED, REFERENCE_ACCELERATION} & set(u)
+        if isinstance(self.sensor, SensorLag):
+            return {"sensor.reading"}, inputs, set(self.readings)
+        return set(), inputs, {*self.readings, self.sensor.position if self.sensor else self.pid_signal.name}
+
+    def _signals_are_good(self, x: Symbols, u: Symbols, y: Symbols) -> ca.SX:
+        read = zip((x, u, y), self._read_names(u), strict=True)
+        return signals_are_good([v for of, own in read for n, v in of.items() if n in own])
+
+    def _good_signals(self, good: ca.SX, x: Symbols, u: Symbols, y: Symbols) -> tuple[Signals, Signals, Signals]:
+        """States, inputs and outputs with a number in place of a bad sample's signals: no operation sees what is none.
+
+        The number is any but 0, with which CasADi would put products of the signals into the choice.
+        """
+        states, inputs, outputs = self._read_names(u)
+
+        def read(of: Symbols, own: set[str]) -> Signals:
+            return {n: ca.if_else(good, v, 1) if n in own else v for n, v in of.items()}
+
+        return read(x, states), read(u, inputs), read(y, outputs)
+
+    def _sampled_law(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> ControllerUpdate:
+        """The states after a good sample."""
+        anew = x[_COUNT] >= p["pid.fault_samples"]
+        x, seen = self._read_sensor(anew, x, y, p)
+        measured = seen["reading"] if seen else y[self.pid_signal.name]
+        p = dict(self.schedule_gains(p, measured, seen, y))
+        position = measured if self.outer is None else seen["count"] if "count" in seen else y[self.feedback.name]
+        inner = self.inner_inputs(u, position, p)
+        begun = self.start(inner, measured, y, self.pid.sent(without_prefix(x, "pid")), p)
+        kept = ("pid.command", "pid.pending", _COUNT)  # what was sent stays; the count matters at bad samples alone
+        x = {**x, **_choose(anew, {n: v for n, v in begun.items() if n not in kept}, x)}
+        if self.pid.reset:
+            error = u["reference"] - position
+            moved = reset_integral(without_prefix(x, "pid"), error, without_prefix(p, "pid"))
+            x = {**x, **with_prefix(moved, "pid")}
+        moved, added = self._added_command(t, x, inner, measured, y, p)
+        arguments = without_prefix(x, "pid"), inner["reference"], measured
+        own = without_prefix(p, "pid")
+        read = {} if isinstance(self.sensor, SensorLag) else with_prefix(seen, "sensor")
+        after = read | with_prefix(self.pid.update(*arguments, added, own), "pid") | moved
+        terms = self.pid.terms(*arguments, own) | self._added_terms(t, x, inner, measured, y, p)[1]
+        gains = zip(Form.PARALLEL.gains, parallel_gains(self.pid.form, own), strict=True)
+        terms |= {f"{n}_parallel": value for n, value in gains}
+        sum_before_clip = self.pid.output(*arguments, own) + added
+        return ControllerUpdate(after, {"error": inner["reference"] - measured, **terms, "unlimited": sum_before_clip})
+
+    def _read_sensor(self, anew: ca.SX, x: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+        """The loop's states, those of an encoder at rest where it begins anew; and the sensor's after the sample."""
+        if self.sensor is None:
+            return {**x}, {}
+        on, own = self.sensed_signal, without_prefix(p, "sensor")
+        if isinstance(self.sensor, Encoder):
+            x = {**x, **_choose(anew, with_prefix(self.sensor.rest(y, on, own), "sensor"), x)}
+        elapsed = self.pid.elapsed_time(without_prefix(x, "pid"))
+        return {**x}, self.sensor.update(without_prefix(x, "sensor"), y, on, own, elapsed)
+
+
+def signals_are_good(values: list[Any]) -> ca.SX:
+    """Whether each of these is a number: the positive form, as what is none compares false."""
+    good: ca.SX = abs(values[0]) <= LARGEST_SIGNAL
+    for value in values[1:]:
+        good = ca.logic_and(good, abs(value) <= LARGEST_SIGNAL)
+    return good
+
+
+def _choose(condition: ca.SX, values: Signals, others: Symbols) -> Signals:
+    """Values where a condition holds, else the others of the same names."""
+    return {n: ca.if_else(condition, v, others[n]) for n, v in values.items()}
+
+
+def invert_increasing(function: Callable[[Array], Array], wanted: Array) -> Array:
+    """Where an increasing function of shape (m,) takes the values wanted, entry by entry, by bisection.
+
+    Examples
+    --------
+    >>> invert_increasing(lambda v: v**3, np.array([8.0, 0.0, -1.0])).round(12).tolist()
+    [2.0, 0.0, -1.0]
+    """
+    reach = np.ones_like(wanted)
+    for _ in range(MAX_DOUBLINGS):
+        outside = (function(wanted - reach) > wanted) | (function(wanted + reach) < wanted)
+        if not outside.any():
+            break
+        reach[outside] *= 2
+    low, high = wanted - reach, wanted + reach
+    for _ in range(MAX_BISECTIONS):
+        middle = (low + high) / 2
+        above = function(middle) > wanted
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return np.asarray(low)
