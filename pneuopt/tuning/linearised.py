@@ -13,7 +13,7 @@ import numpy as np
 from pneuopt.control.compensation import acting_always
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
-from pneuopt.evaluation.band import band_share
+from pneuopt.evaluation.band import SettlingBand, band_share
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
 from pneuopt.evaluation.requirements import (
@@ -144,8 +144,9 @@ class LinearisedProblem:
             k = np.searchsorted(t, times)
             late = np.maximum(late, np.append(after, 0.0)[k])
             crossings = np.maximum(crossings, np.append(_band_entry_times(t, size, self._band), np.inf)[k])
-        excess = np.maximum(late - self._band, 0.0)
-        times = np.where(excess == 0, np.minimum(crossings, times), times)
+        inside = SettlingBand(0.0, self._band).contains(late)
+        excess = np.where(inside, 0.0, late - self._band)
+        times = np.where(inside, np.minimum(crossings, times), times)
         costs = np.where(
             times <= self.bounds[-1, 1] * self.horizon, weight * times + self._band_weight * excess, np.inf
         )
@@ -355,10 +356,10 @@ def _band_entry_times(t: Array, size: Array, band: float) -> Array:
 
     Where that segment does not enter the band it is the time at which the segment begins.
     """
-    before, after = size[:, :-1], size[:, 1:]
+    before, after, inside = size[:, :-1], size[:, 1:], SettlingBand(0.0, band).contains(size)
     with np.errstate(all="ignore"):
-        share = np.where((before > band) & (after <= band), (before - band) / (before - after), 0.0)
-    entered = np.where(before > band, t[:-1] + share * np.diff(t), t[:-1])
+        share = np.where(~inside[:, :-1] & inside[:, 1:], (before - band) / (before - after), 0.0)
+    entered = np.where(inside[:, :-1], t[:-1], t[:-1] + share * np.diff(t))
     return np.asarray(np.append(t[0], entered.max(axis=0)))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pneuopt.dynamics.compiled.race import RACE_VALUES, RaceCourse, RaceField, RaceMerit, race
-from pneuopt.evaluation.band import Band, band_number, band_unit
+from pneuopt.evaluation.band import EDGE_ROUNDING, Band, band_number, band_unit
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     ROBUSTNESS_REQUIREMENTS,
@@ -195,6 +195,5 @@ def _course(simulator: Simulator, band: Band) -> RaceCourse:
 def _merit_bounds(spec: Specification, bands: Sequence[Band]) -> RaceMerit:
     kinds = [next(kind for kind in REQUIREMENT_KINDS if kind.metric.name == n) for n in RACE_VALUES]
     weights, limits = np.array([[spec.weight(kind), spec.limit(kind)] for kind in kinds]).T
-    return RaceMerit(
-        np.array([band_number(band) for band in bands]), weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL
-    )
+    edges = (1 + EDGE_ROUNDING) * np.array([band_number(band) for band in bands])
+    return RaceMerit(edges, weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL)
