@@ -180,7 +180,7 @@ def may_be_cut(spec: Specification) -> bool:
 def _course(simulator: Simulator, band: Band) -> RaceCourse:
     """The cases of a simulator, as a race in machine code takes them."""
     grids = simulator.grids
-    n, grid = max(len(g.t) for g in grids), np.array([simulator.grid_of(k) for k in range(len(simulator.cases))])
+    n, grid = max(len(g.t) for g in grids), np.array([simulator.grid_index(k) for k in range(len(simulator.cases))])
     u, t, h = (np.array(arrays) for arrays in zip(*(g.pad(n) for g in grids), strict=True))
     settings = [
         (r.final, r.nominal_size, r.initial, g.spacing, g.t[g.step_index] - r.at, float(r.changes), band_unit(band, r))

@@ -89,7 +89,7 @@ class Simulator:
         scenarios: Scenarios = NO_SCENARIOS,
         spec: Specification | None = None,
     ) -> None:
-        linearised, kinds = [k.metric.name for k in ROBUSTNESS_REQUIREMENTS], spec.kinds if spec else ()
+        linearised, kinds = [k.metric.name for k in ROBUSTNESS_REQUIREMENTS], spec.metric_names if spec else ()
         self.response_metrics = tuple(dict.fromkeys((*BASE_METRICS, *(k for k in kinds if k not in linearised))))
         self.margin_metrics = tuple(dict.fromkeys((*BASE_MARGINS, *(k for k in kinds if k in linearised))))
         self._envelope = spec.envelope if spec else ()
@@ -102,7 +102,7 @@ class Simulator:
         self.meter_channels = needed_channels(self.response_metrics)
         self.rollout = Rollout(loop_pieces(loop, self.meter_channels))
         self.grids = reference_grids(loop, references, space.parameters)
-        self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
+        self._grid_index = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
         self.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in self.grids]
         self.robustness = self._margin_function(references)  # about `operating_points`
@@ -117,7 +117,7 @@ class Simulator:
         part = copy.copy(self)
         part._wider = tuple(bands)
         part.response_metrics = tuple(
-            dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.kinds if n in self.response_metrics)))
+            dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.metric_names if n in self.response_metrics)))
         )
         if not self._is_refined:
             part.grids = reference_grids(
@@ -168,7 +168,7 @@ class Simulator:
 
     def cases_by_grid(self) -> list[Mask]:
         """Which cases run on each grid, that is on each reference: a mask of shape (n_cases,) a grid."""
-        return [self._grid_of == g for g in range(len(self.grids))]
+        return [self._grid_index == g for g in range(len(self.grids))]
 
     def dither_periods(self) -> list[float]:
         """The time over which each case is averaged [s]; 0 without dither, or where its amplitude is fixed at 0."""
@@ -223,7 +223,8 @@ class Simulator:
 
     def operating_points(self, p: Array, case: Indices, passage: Passage) -> tuple[Array, Array]:
         """The plant's states and inputs at the lanes' operating points; see `PointFinder`."""
-        lanes = [(self.grids[g], np.flatnonzero(self._grid_of[case] == g)) for g in np.unique(self._grid_of[case])]
+        own = self._grid_index[case]
+        lanes = [(self.grids[g], np.flatnonzero(own == g)) for g in np.unique(own)]
         return self._find_points(lanes, p, self.lane_periods(p), passage)
 
     def lanes(self, points: Array, rows: Indices, case: Indices) -> tuple[Array, Array]:
@@ -263,9 +264,9 @@ class Simulator:
             periods[rows] = period or 0.0
         return periods
 
-    def grid_of(self, case: int) -> int:
+    def grid_index(self, case: int) -> int:
         """The number of the grid on which a case runs."""
-        return int(self._grid_of[case])
+        return int(self._grid_index[case])
 
     def lanes_by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
         """Each averaging time [s], None without dither, and a mask of the sound lanes that it is for."""
@@ -279,7 +280,7 @@ class Simulator:
 
         Their shapes are (m, n, n_inputs), (m, n) and (m, n).
         """
-        own = self._grid_of[case]
+        own = self._grid_index[case]
         n = max(len(self.grids[g].t) for g in np.unique(own))
         full = {g: self.grids[g].pad(n) for g in np.unique(own).tolist()}
         u, t, h = (np.array([full[g][k] for g in own.tolist()]) for k in range(3))
@@ -296,7 +297,7 @@ class Simulator:
             yield np.arange(len(case))
             return
         for g in range(len(self.grids)):
-            own = np.flatnonzero(self._grid_of[case] == g)
+            own = np.flatnonzero(self._grid_index[case] == g)
             yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
 
     def _measure(self, out: LaneMetrics, chunk: Indices, case: Indices, starts: Array, p: Array, band: Band) -> None:
@@ -332,8 +333,8 @@ class Simulator:
         states, outputs, ends = run
         out.passage.states[chunk, : states.shape[1]], out.passage.ends[chunk] = states, ends
         planes = np.ascontiguousarray(np.moveaxis(outputs, 2, 0))  # reading is over time, several times faster so
-        for g in np.unique(self._grid_of[case]).tolist():
-            own, grid = self._grid_of[case] == g, self.grids[g]
+        for g in np.unique(self._grid_index[case]).tolist():
+            own, grid = self._grid_index[case] == g, self.grids[g]
             y = np.moveaxis(planes[:, own, : len(grid.t)], 0, 2)
             sound = is_sound(y, ends[own])
             out.sound[chunk[own]], out.passage.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
