@@ -1,4 +1,4 @@
-"""`Fleet`: the plants of a batch as rows of numbers, run in SIMD lanes, and the metrics read off their responses."""
+"""`PlantBatch`: the plants of a batch as rows of numbers, run in SIMD lanes, and the metrics read off their responses."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import nan
@@ -30,7 +30,7 @@ SAME_START = 1e-9
 RAN_AWAY = "the response runs away"
 
 
-class Fleet:
+class PlantBatch:
     """The plants of a batch as rows of numbers, and the grids on which they run."""
 
     def __init__(

@@ -25,7 +25,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
-from pneuopt.tuning.passage import KEPT_STATES, Passage
+from pneuopt.tuning.passage import KEPT_STATES, ResponsePoints
 from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, loop_pieces
 from pneuopt.tuning.responses import is_sound
 from pneuopt.tuning.rows import Lanes, reading_times
@@ -269,7 +269,7 @@ class LinearisedProblem:
         for period, rows in self._simulator.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
             fastest[rows] = self._simulator.fastest_samples(grid, found.y[rows], period)
         assert found.x is not None
-        passage = Passage(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
+        passage = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
         return self._simulator.operating_points(p, case, passage)
 
     def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:

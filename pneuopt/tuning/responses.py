@@ -7,7 +7,7 @@ import numpy as np
 
 from pneuopt.evaluation.requirements import larger_is_better, requirement_values
 from pneuopt.quantities.arrays import Array, Indices, Mask
-from pneuopt.tuning.passage import Passage
+from pneuopt.tuning.passage import ResponsePoints
 
 # Size of an output [its unit] from which a response counts as running away. A lower level may be reached by sound
 # signals in small units (pressures in Pa); beyond a higher one the metrics of a diverging response lose their digits.
@@ -81,17 +81,17 @@ class LaneMetrics:
         graded; infinite where the response runs away.
     sound : ndarray of bool, shape (m,)
         False where the response runs away.
-    passage : Passage
+    passage : ResponsePoints
     """
 
     metrics: dict[str, Array]
     sound: Mask
-    passage: Passage
+    passage: ResponsePoints
 
     @staticmethod
     def empty(m: int, n: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
         """Metrics of m lanes of n samples to be filled in; until then they read as running away."""
-        passage = Passage.empty(m, n, n_states)
+        passage = ResponsePoints.empty(m, n, n_states)
         return LaneMetrics({name: np.full(m, np.inf) for name in read}, np.zeros(m, dtype=bool), passage)
 
 
@@ -126,4 +126,4 @@ class MarginReader:
     """
 
     names: tuple[str, ...]
-    read: Callable[[Array, Indices, Passage], Mapping[str, Array]]
+    read: Callable[[Array, Indices, ResponsePoints], Mapping[str, Array]]

@@ -21,7 +21,7 @@ from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.grids import reference_grids, refine_grids
-from pneuopt.tuning.passage import KEPT_STATES, Passage, PointFinder, fastest_samples
+from pneuopt.tuning.passage import KEPT_STATES, ResponsePoints, PointFinder, fastest_samples
 from pneuopt.tuning.readings import (
     CONTROL_OUTPUT,
     SIGNAL_OUTPUT,
@@ -217,11 +217,11 @@ class Simulator:
         margins = {n: table[0] for n, table in responses.margin_metrics(np.ones(1, dtype=bool)).items()}
         return to_records({n: responses.table(n)[0] for n in self.response_metrics} | margins)
 
-    def _read_margins(self, p: Array, case: Indices, passage: Passage) -> dict[str, Array]:
+    def _read_margins(self, p: Array, case: Indices, passage: ResponsePoints) -> dict[str, Array]:
         """Margins and peaks of loops, the worst over their lanes' operating points."""
         return self.robustness(p, *self.operating_points(p, case, passage), self.margin_metrics)
 
-    def operating_points(self, p: Array, case: Indices, passage: Passage) -> tuple[Array, Array]:
+    def operating_points(self, p: Array, case: Indices, passage: ResponsePoints) -> tuple[Array, Array]:
         """The plant's states and inputs at the lanes' operating points; see `PointFinder`."""
         own = self._grid_index[case]
         lanes = [(self.grids[g], np.flatnonzero(own == g)) for g in np.unique(own)]
@@ -353,7 +353,7 @@ class Simulator:
                 out.passage.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
 
     def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float | None) -> Indices:
-        """Samples of the largest speed, as `Passage` has them; zeros for a plant without an axis."""
+        """Samples of the largest speed, as `ResponsePoints` has them; zeros for a plant without an axis."""
         k = speed_output(self.loop, self.meter_channels)
         return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period or 0.0)
 
