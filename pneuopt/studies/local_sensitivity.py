@@ -8,6 +8,7 @@ signal enters the band, ``dt = -(dy/dp) / (dy/dt)``; of an overshoot it is the s
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,6 @@ from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.band import Band
-from pneuopt.evaluation.meter import needed_channels
 from pneuopt.evaluation.scenarios import SampleSpreads, axis_labels, values_at
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.arrays import Array
@@ -28,8 +28,7 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, 
 from pneuopt.quantities.shown import Shown
 from pneuopt.studies.batch import check_lanes
 from pneuopt.studies.fleet import PlantBatch
-from pneuopt.tuning.readings import ReferenceGrid, has_integral, loop_pieces, read_metrics
-from pneuopt.tuning.responses import is_sound
+from pneuopt.tuning.readings import LoopLanes, ReferenceGrid, read_metrics
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -180,11 +179,10 @@ def _measure(
     axes: Mapping[str, Mapping[str, float]],
 ) -> dict[str, tuple[float, Array]]:
     """By metric its value and its change for one standard deviation of each axis."""
-    channels = needed_channels(batch.metrics)
-    y, along = _run_with_sensitivities(loop, batch, grid, substeps, axes, channels)
+    y, along = _run_with_sensitivities(loop, batch, grid, substeps, axes)
     moved = np.concatenate([y[None], y + SIDE * along, y - SIDE * along])
     period = loop.dither_period(loop.complete(parameters))
-    found = read_metrics(grid, moved, (batch.band,), period, batch.metrics, (), channels)
+    found = read_metrics(grid, moved, (batch.band,), period, batch.metrics, (), batch.lanes.channels)
     m = len(along)
     return {n: (float(v[0]), (v[1 : 1 + m] - v[1 + m :]) / (2 * SIDE)) for n, v in found.items()}
 
@@ -195,31 +193,26 @@ def _run_with_sensitivities(
     grid: ReferenceGrid,
     substeps: int,
     axes: Mapping[str, Mapping[str, float]],
-    channels: Sequence[str],
 ) -> tuple[Array, Array]:
     """The outputs, shape (n, n_outputs), and their change along each axis, shape (axes, n, n_outputs)."""
     order = list(loop.parameters)
     names = list(dict.fromkeys(n for steps in axes.values() for n in steps))
-    rollout = Rollout(loop_pieces(loop, channels), wrt=[order.index(n) for n in names], start=True)
-    more = int(has_integral(loop))
-    x0 = np.pad(batch.start({}, grid.reference), (0, more))
-    u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-    run = rollout.run(x0[None], u, batch.nominal, t, h, substeps=substeps)
-    require(
-        bool(is_sound(run.y, run.x_end)[0]), "the response runs away; no figure of it has a slope", ConvergenceError
-    )
+    lanes = LoopLanes(loop, batch.metrics, partial(Rollout, wrt=[order.index(n) for n in names], start=True))
+    x0 = lanes.with_integral(batch.start({}, grid.reference)[None])
+    run, sound = lanes.run(grid, x0, batch.nominal, substeps)
+    require(bool(sound[0]), "the response runs away; no figure of it has a slope", ConvergenceError)
     assert run.dy is not None
     along = [
-        run.dy[0] @ np.concatenate([_start_change(batch, grid.reference, s, more), [s.get(n, 0.0) for n in names]])
+        run.dy[0] @ np.concatenate([_start_change(batch, grid.reference, s), [s.get(n, 0.0) for n in names]])
         for s in axes.values()
     ]
     return run.y[0], np.array(along)
 
 
-def _start_change(batch: PlantBatch, reference: Reference, steps: Mapping[str, float], more: int) -> Array:
+def _start_change(batch: PlantBatch, reference: Reference, steps: Mapping[str, float]) -> Array:
     """How the state before the step changes with an axis."""
     ends = [
         batch.start({n: batch.nominal_value(n) + side * START_SIDE * s for n, s in steps.items()}, reference)
         for side in (1, -1)
     ]
-    return np.pad((ends[0] - ends[1]) / (2 * START_SIDE), (0, more))
+    return np.asarray(batch.lanes.with_integral((ends[0] - ends[1])[None] / (2 * START_SIDE))[0])

@@ -26,8 +26,7 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.passage import KEPT_STATES, ResponsePoints
-from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, loop_pieces
-from pneuopt.tuning.responses import is_sound
+from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, is_sound, loop_pieces
 from pneuopt.tuning.rows import Lanes, reading_times
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.sqp import LinearisedPoint, RowGroups

@@ -1,4 +1,4 @@
-"""`ResponsePoints`: where simulated lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
+"""`ResponsePoints`: where lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
 
 The points are those of `operating_points` in evaluation/operating_points.py. A search keeps few states
 along a response: the fastest sample is read off the outputs, and the states there come from a second run, from the last

@@ -23,8 +23,8 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.tuning.merit import VIOLATION_PENALTY, compute_merits
 from pneuopt.tuning.passage import KEPT_STATES
-from pneuopt.tuning.readings import WORST_MERIT
-from pneuopt.tuning.responses import RUNAWAY_LEVEL, Responses
+from pneuopt.tuning.readings import RUNAWAY_LEVEL, WORST_MERIT
+from pneuopt.tuning.responses import Responses
 from pneuopt.tuning.simulator import Simulator
 
 # Share of its weight that a case's victory keeps from race to race. Below, the order of the cases follows chance; near

@@ -9,10 +9,6 @@ from pneuopt.evaluation.requirements import larger_is_better, requirement_values
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.passage import ResponsePoints
 
-# Size of an output [its unit] from which a response counts as running away. A lower level may be reached by sound
-# signals in small units (pressures in Pa); beyond a higher one the metrics of a diverging response lose their digits.
-RUNAWAY_LEVEL = 1e12
-
 
 class Responses:
     """The metrics of simulated candidates; margins, a frequency response each, are computed only on request.
@@ -104,13 +100,6 @@ def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:
 def worst_values(found: Sequence[dict[str, float]]) -> dict[str, float]:
     """The largest of each value over the cases; NaN where one of them is NaN."""
     return {n: float(np.max([values[n] for values in found])) for n in found[0]}
-
-
-def is_sound(y: Array, x_end: Array) -> Mask:
-    """Which lanes did not run away, shape (m,)."""
-    with np.errstate(all="ignore"):
-        tame = (y.max(axis=(1, 2)) < RUNAWAY_LEVEL) & (y.min(axis=(1, 2)) > -RUNAWAY_LEVEL)  # NaN is neither
-    return np.asarray(tame & np.isfinite(x_end).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,30 +8,21 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
-from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.batch_margins import MarginFunction, batch_margin_function
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.margins import lowest_noise_frequency
-from pneuopt.evaluation.meter import check_channels, needed_channels
+from pneuopt.evaluation.meter import check_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.grids import reference_grids, refine_grids
-from pneuopt.tuning.passage import KEPT_STATES, ResponsePoints, PointFinder, fastest_samples
-from pneuopt.tuning.readings import (
-    CONTROL_OUTPUT,
-    SIGNAL_OUTPUT,
-    ReferenceGrid,
-    has_integral,
-    loop_pieces,
-    read_metrics,
-    speed_output,
-)
-from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, is_sound, to_records
+from pneuopt.tuning.passage import KEPT_STATES, PointFinder, ResponsePoints, fastest_samples
+from pneuopt.tuning.readings import CONTROL_OUTPUT, SIGNAL_OUTPUT, LoopLanes, ReferenceGrid, is_sound, speed_output
+from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, to_records
 from pneuopt.tuning.rests import starts_before_step
 from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
@@ -99,8 +90,8 @@ class Simulator:
         self.loop, self.space = loop, space
         self._rest = starts_before_step(self.cases, loop, space)
         check_channels(loop.plant, self.response_metrics)
-        self.meter_channels = needed_channels(self.response_metrics)
-        self.rollout = Rollout(loop_pieces(loop, self.meter_channels))
+        self._lanes = LoopLanes(loop, self.response_metrics)
+        self.meter_channels, self.rollout = self._lanes.channels, self._lanes.rollout
         self.grids = reference_grids(loop, references, space.parameters)
         self._grid_index = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
@@ -161,10 +152,8 @@ class Simulator:
     def _signal(self, point: Array, case: int, grid: ReferenceGrid) -> Array | None:
         """The measured signal of a case at the samples of a grid; None where it runs away."""
         p, start = self.lanes(point[None], np.zeros(1, dtype=np.intp), np.full(1, case))
-        u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-        with np.errstate(all="ignore"):
-            found = self.rollout.run(start, u, p, t, h, substeps=rk4_substeps(self._rate, grid.spacing))
-        return found.y[0, :, SIGNAL_OUTPUT] if is_sound(found.y, found.x_end)[0] else None
+        found, sound = self._lanes.run(grid, start, p, rk4_substeps(self._rate, grid.spacing))
+        return found.y[0, :, SIGNAL_OUTPUT] if sound[0] else None
 
     def cases_by_grid(self) -> list[Mask]:
         """Which cases run on each grid, that is on each reference: a mask of shape (n_cases,) a grid."""
@@ -251,7 +240,7 @@ class Simulator:
             found = np.tile(rest, (len(points), 1))
         else:
             found = np.array([self.cases[case].initial(self.loop, self.space.parameters_at(point)) for point in points])
-        return np.column_stack([found, np.zeros((len(found), int(has_integral(self.loop))))])
+        return self._lanes.with_integral(found)
 
     def starts_vary(self, case: int) -> bool:
         """Whether the state before the step depends on the gains in a case."""
@@ -270,21 +259,18 @@ class Simulator:
 
     def lanes_by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
         """Each averaging time [s], None without dither, and a mask of the sound lanes that it is for."""
-        rates = self._dither_rates(p)
-        for rate in np.unique(rates[sound]).tolist():
-            period = self.loop.dither.period(rate, self.loop.pid.sample_time) if rate and self.loop.dither else None
-            yield period, sound & (rates == rate)
+        return self._lanes.by_dither_period(p, sound)
 
     def pad(self, case: Indices) -> tuple[Array, Array, Array, int]:
         """Inputs, instants and steps of lanes, padded to one length, and their RK4 steps a sample.
 
-        Their shapes are (m, n, n_inputs), (m, n) and (m, n).
+        Their shapes are (m, n, n_inputs), (m, n) and (m, n); (n, n_inputs), (n,) and (n,) where all are on one grid.
         """
-        own = self._grid_index[case]
-        n = max(len(self.grids[g].t) for g in np.unique(own))
-        full = {g: self.grids[g].pad(n) for g in np.unique(own).tolist()}
-        u, t, h = (np.array([full[g][k] for g in own.tolist()]) for k in range(3))
-        return u, t, h, max(self.substeps[g] for g in np.unique(own))
+        used, place = np.unique(self._grid_index[case], return_inverse=True)
+        n = max(len(self.grids[g].t) for g in used)
+        padded = zip(*(self.grids[g].pad(n) for g in used), strict=True)
+        u, t, h = (np.array(arrays)[place] if len(used) > 1 else arrays[0] for arrays in padded)
+        return u, t, h, max(self.substeps[g] for g in used)
 
     @property
     def _longest(self) -> int:
@@ -332,22 +318,13 @@ class Simulator:
         """Fill the rows `chunk` of `out` from states, outputs and end states."""
         states, outputs, ends = run
         out.passage.states[chunk, : states.shape[1]], out.passage.ends[chunk] = states, ends
-        planes = np.ascontiguousarray(np.moveaxis(outputs, 2, 0))  # reading is over time, several times faster so
         for g in np.unique(self._grid_index[case]).tolist():
-            own, grid = self._grid_index[case] == g, self.grids[g]
-            y = np.moveaxis(planes[:, own, : len(grid.t)], 0, 2)
+            own, grid, asked = self._grid_index[case] == g, self.grids[g], self.response_metrics
+            y = outputs[own, : len(grid.t)]
             sound = is_sound(y, ends[own])
             out.sound[chunk[own]], out.passage.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
-            for period, rows in self.lanes_by_dither_period(p[own], sound):
-                metrics = read_metrics(
-                    grid,
-                    _select_rows(y, rows),
-                    self.bands(band),
-                    period,
-                    self.response_metrics,
-                    self._envelope,
-                    self.meter_channels,
-                )
+            found = self._lanes.read(grid, y, p[own], sound, self.bands(band), asked, self._envelope)
+            for period, rows, metrics in found:
                 for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value
                 out.passage.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
@@ -365,37 +342,18 @@ class Simulator:
         slow, fast = np.geomspace(3e-5 * slowest, 0.97 * lowest, 60), np.geomspace(lowest, fastest, 150)
         return batch_margin_function(self.loop, np.concatenate([slow, fast]), lowest)
 
-    def _dither_rates(self, p: Array) -> Array:
-        if self.loop.dither is None:
-            return np.zeros(len(p))
-        order = list(self.loop.parameters)
-        amplitude, frequency = (p[:, order.index(f"dither.{n}")] for n in ("amplitude", "frequency"))
-        return np.where(amplitude == 0, 0.0, frequency)
-
     def _fastest_eigenvalue(self, references: Sequence[Reference]) -> float:
         """The rate of the fastest mode over the gains' box and all plants [1/s].
 
         On the scenarios' plants only the corners that are fastest on the nominal one are examined.
         """
-        states = [x for k in range(len(references)) for x in self._sample_states(k)]
+        given = self.space.start[None]
+        p, starts = self.space.vectors(given)[0], [self.starts(k, given)[0] for k in range(len(references))]
+        along = [self._lanes.states_along(g, x, p, MAX_LOOP_SUBSTEPS) for g, x in zip(self.grids, starts, strict=True)]
+        states = [x for rows in along for x in rows]
         corners, order = self.space.vectors(self.space.corners()), list(self.space.parameters)
         rates = fastest_eigenvalue(self.loop, corners, states)
         worst = corners[np.argsort(rates)[-STIFFEST_CORNERS:]]
         others = [case.case_vectors(worst, order) for case in self.cases[len(references) :: len(references)]]
         fastest = fastest_eigenvalue(self.loop, np.vstack(others), states).max() if others else 0.0
         return float(max(rates.max(), fastest))
-
-    def _sample_states(self, k: int) -> list[Array]:
-        """States along the response of the given gains, from the start on."""
-        grid, given = self.grids[k], self.space.start[None]
-        start, p = self.starts(k, given), self.space.vectors(given)
-        u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-        found = self.rollout.run(start, u, p, t, h, substeps=MAX_LOOP_SUBSTEPS, states=True).x
-        assert found is not None
-        along = np.vstack([start, found[0][:: max(1, len(grid.t) // 10)]])[:, : len(self.loop.states)]
-        return list(along[np.isfinite(along).all(axis=1)])
-
-
-def _select_rows(y: Array, rows: Mask) -> Array:
-    """Select rows of responses without changing the memory order, in which time is contiguous."""
-    return y if rows.all() else np.moveaxis(np.moveaxis(y, 2, 0)[:, rows], 0, 2)

@@ -31,8 +31,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.report.live import live_script, to_script
 from pneuopt.tuning.linearised import _band_entry_times
-from pneuopt.tuning.readings import ReferenceGrid, read_metrics
-from pneuopt.tuning.responses import is_sound
+from pneuopt.tuning.readings import ReferenceGrid, is_sound, read_metrics
 
 SIZE, BAND, PERIOD = 0.2, 0.02, 0.02  # .2 + .02 * .2 - .2 > .02 * .2 in floating point: the edge itself
 T = np.linspace(0.0, 2.0, 2001)

@@ -317,6 +317,22 @@ def test_one_parameter_vector_serves_all_segments(
     assert_array_equal(shared.y, repeated.y)
 
 
+@pytest.mark.parametrize("lanes", [None, 0])
+@pytest.mark.parametrize("name", ["stribeck", "pressure", "sampled loop"])
+def test_segments_may_share_their_inputs_and_their_instants(name: str, lanes: int | None) -> None:
+    case = Case(name)
+    rollout = Rollout(case.system.pieces, lanes=lanes)
+    repeated = case.run(
+        rollout, **{n: np.tile(a[:1], (5, *[1] * (a.ndim - 1))) for n, a in vars(case).items() if n in "uth"}
+    )
+    shared = case.run(rollout, u=case.u[0], t=case.t[0], h=case.h[0])
+    own_inputs = case.run(rollout, t=case.t[0], h=case.h[0])
+    assert_array_equal(shared.y, repeated.y)
+    assert_array_equal(shared.x_end, repeated.x_end)
+    assert_array_equal(own_inputs.y[0], shared.y[0])
+    assert not np.array_equal(own_inputs.y, shared.y)
+
+
 def test_padding_freezes_the_state() -> None:
     case = Case("stribeck")
     full, short = case.run(case.rollout()), Case("stribeck")
