@@ -49,12 +49,7 @@ class SettlingBand:
         """Instants from which responses stay in the band, linear between samples, shape (m,) [s].
 
         NaN where one ends outside, or comes in for good only in the record's last share, where it may just pass.
-
-        Parameters
-        ----------
-        t : ndarray, shape (n,)
-            From the step on [s].
-        y : ndarray, shape (m, n)
+        The instants t, shape (n,), begin at the step; y has the shape (m, n).
         """
         outside = ~self.contains(y)
         k = len(t) - 1 - np.argmax(outside[:, ::-1], axis=1)
@@ -71,12 +66,6 @@ def entry_for_good(t: Array, inside: Mask) -> float:
     """Last instant outside the band of a response that was continued [s]; inf where it may leave the band again.
 
     It may where it came in at the record's very end, or has been inside for hardly longer than ever before.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        [s]
-    inside : ndarray of bool, shape (n,)
     """
     outside, end = np.flatnonzero(~inside), float(t[-1])
     last = float(t[outside[-1]]) if len(outside) else 0.0

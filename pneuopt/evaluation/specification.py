@@ -125,15 +125,8 @@ class Specification:
     def excess(self, values: Mapping[str, Any]) -> dict[Requirement, Any]:
         """The one answer to which limit is broken, by how much: the share by which values exceed each limit.
 
-        Parameters
-        ----------
-        values : mapping of str to float or ndarray
-            By metric, as `requirement_values` gives them.
-
-        Returns
-        -------
-        dict of Requirement to float or ndarray
-            Negative where a limit leaves room; NaN without a figure, which breaks it too.
+        The values are those of `requirement_values`, numbers or arrays. A share is negative where a limit leaves room,
+        and NaN without a figure, which breaks the limit too.
 
         Examples
         --------

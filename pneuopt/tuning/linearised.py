@@ -245,7 +245,7 @@ class LinearisedProblem:
             [self._periods[k] for k in case.tolist()],
             self._strides[g],
             self._spec.envelope,
-            self._simulator.meter_channels,
+            self._simulator.sampled.channels,
         )
         error, by_gain = (self._error_units[g] * a for a in lanes.record.error)
         rows_of: dict[type, tuple[Array, Array]] = {
@@ -264,8 +264,9 @@ class LinearisedProblem:
 
     def _points(self, grid: ReferenceGrid, p: Array, case: Indices, found: RolloutResult) -> tuple[Array, Array]:
         """The operating points of lanes on one grid, states and inputs."""
-        fastest = np.zeros(len(p), dtype=np.intp)
-        for period, rows in self._simulator.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
+        fastest, periods = np.zeros(len(p), dtype=np.intp), self._simulator.sampled.periods(p)
+        for period in np.unique(periods).tolist():
+            rows = periods == period
             fastest[rows] = self._simulator.fastest_samples(grid, found.y[rows], period)
         assert found.x is not None
         passage = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
@@ -344,7 +345,7 @@ def sensitivity_rollout(simulator: Simulator) -> Rollout:
     order, names = list(simulator.loop.parameters), simulator.space.names
     through_start = any(simulator.starts_vary(k) for k in range(len(simulator.cases)))
     return Rollout(
-        loop_pieces(simulator.loop, simulator.meter_channels),
+        loop_pieces(simulator.loop, simulator.sampled.channels),
         [order.index(n) for n in names],
         start=through_start,
     )

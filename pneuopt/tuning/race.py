@@ -116,7 +116,7 @@ class Race:
         if self._records.size < m * C * n * outputs:
             self._records = np.empty(m * C * n * outputs)
         y = self._records[: m * C * n * outputs].reshape(m, C, n, outputs)
-        field = RaceField(p, starts, simulator.lane_periods(p), self._order(first), rivals)
+        field = RaceField(p, starts, simulator.sampled.periods(p), self._order(first), rivals)
         merit = _merit_bounds(self._plain, simulator.bands(self._spec.band))
         outcome = race(simulator.rollout, self._course, merit, field, y)
         merits, worst, through = np.full(m, np.inf), outcome.loser.copy(), outcome.loser < 0

@@ -85,18 +85,7 @@ class ReferenceGrid:
 class LoopLanes:
     """The one simulator of a loop in SIMD lanes: searches, batches of plants and sensitivities run and read it.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-    metrics : collection of str
-        What will be read; the meter's channels for it are run.
-    compile_pieces : callable
-        Makes the `Rollout` of `loop_pieces`, with sensitivities for example.
-
-    Attributes
-    ----------
-    channels : tuple of str
-    rollout : Rollout
+    `compile_pieces` makes the `Rollout` of `loop_pieces`, with the meter's `channels` that the metrics need.
     """
 
     def __init__(
@@ -126,14 +115,14 @@ class LoopLanes:
         rows = np.vstack([x0, found[0]])[:, : len(self.loop.states)]
         return list(rows[np.isfinite(rows).all(axis=1)])
 
-    def by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
-        """Each averaging time [s], None without dither, and a mask of the sound lanes that it is for."""
-        dither, rates = self.loop.dither, np.zeros(len(p))
+    def periods(self, p: Array) -> Array:
+        """The time over which each lane is averaged, shape (m,) [s]; 0: it is not."""
+        dither, found = self.loop.dither, np.zeros(len(p))
         if dither is not None:
             amplitude, frequency = (p[:, self._order.index(f"dither.{n}")] for n in ("amplitude", "frequency"))
-            rates = np.where(amplitude == 0, 0.0, frequency)
-        for rate in np.unique(rates[sound]).tolist():
-            yield dither.period(rate, self.loop.pid.sample_time) if dither and rate else None, sound & (rates == rate)
+            for rate in np.unique(frequency[amplitude != 0]).tolist():
+                found[(amplitude != 0) & (frequency == rate)] = dither.period(rate, self.loop.pid.sample_time)
+        return found
 
     def read(
         self,
@@ -144,12 +133,14 @@ class LoopLanes:
         bands: Sequence[Band],
         only: Collection[str],
         envelope: Envelope = (),
-    ) -> Iterator[tuple[float | None, Mask, dict[str, Array]]]:
+    ) -> Iterator[tuple[float, Mask, dict[str, Array]]]:
         """The metrics of the sound lanes, by their averaging time: that, a mask of its lanes, and `read_metrics`."""
         planes = np.ascontiguousarray(np.moveaxis(y, 2, 0))  # reading is over time, several times faster so
-        for period, rows in self.by_dither_period(p, sound):
+        periods = self.periods(p)
+        for period in np.unique(periods[sound]).tolist():
+            rows = sound & (periods == period)
             seen = np.moveaxis(planes if rows.all() else planes[:, rows], 0, 2)
-            yield period, rows, read_metrics(grid, seen, bands, period, only, envelope, self.channels)
+            yield period, rows, read_metrics(grid, seen, bands, period or None, only, envelope, self.channels)
 
 
 def is_sound(y: Array, x_end: Array) -> Mask:

@@ -66,10 +66,7 @@ class Simulator:
     cases : tuple of TuningCase
     response_metrics, margin_metrics : tuple of str
         The metrics read off the responses, and off the loop linearised at their operating points.
-    meter_channels : tuple of str
-        Channels of the plant's meter that are run for them.
-    rollout : Rollout
-        Its outputs are those of `loop_pieces`.
+    sampled : LoopLanes
     """
 
     def __init__(
@@ -90,8 +87,8 @@ class Simulator:
         self.loop, self.space = loop, space
         self._rest = starts_before_step(self.cases, loop, space)
         check_channels(loop.plant, self.response_metrics)
-        self._lanes = LoopLanes(loop, self.response_metrics)
-        self.meter_channels, self.rollout = self._lanes.channels, self._lanes.rollout
+        self.sampled = LoopLanes(loop, self.response_metrics)
+        self.rollout = self.sampled.rollout
         self.grids = reference_grids(loop, references, space.parameters)
         self._grid_index = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
@@ -152,7 +149,7 @@ class Simulator:
     def _signal(self, point: Array, case: int, grid: ReferenceGrid) -> Array | None:
         """The measured signal of a case at the samples of a grid; None where it runs away."""
         p, start = self.lanes(point[None], np.zeros(1, dtype=np.intp), np.full(1, case))
-        found, sound = self._lanes.run(grid, start, p, rk4_substeps(self._rate, grid.spacing))
+        found, sound = self.sampled.run(grid, start, p, rk4_substeps(self._rate, grid.spacing))
         return found.y[0, :, SIGNAL_OUTPUT] if sound[0] else None
 
     def cases_by_grid(self) -> list[Mask]:
@@ -170,31 +167,21 @@ class Simulator:
         return [dither.period(rate, self.loop.pid.sample_time) for rate in rates]
 
     def respond(self, points: Array, band: Band, lanes: Mask | None = None) -> Responses:
-        """Simulate candidates.
-
-        Parameters
-        ----------
-        points : ndarray, shape (m, n)
-        band : float or Tolerance
-        lanes : ndarray of bool, shape (m, n_cases), optional
-            Which cases of which candidate; by default all.
-        """
+        """Simulate candidates, shape (m, n), on all cases, or on those that `lanes`, shape (m, n_cases), says."""
         wanted = np.ones((len(points), len(self.cases)), dtype=bool) if lanes is None else lanes
         rows, case = np.nonzero(wanted)
         p, starts = self.lanes(points, rows, case)
-        measured = LaneMetrics.empty(len(rows), self._longest, starts.shape[1], self.response_metrics)
+        measured = LaneMetrics.empty(
+            len(rows), max(len(grid.t) for grid in self.grids), starts.shape[1], self.response_metrics
+        )
         for chunk in self._chunks(case):
             self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
         return Responses(wanted, p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
     def values(self, points: Array, spec: Specification) -> dict[str, Array]:
-        """The values of the requirements for each candidate, the worst over the cases, shape (m,) each.
+        """The values of the requirements for each candidate, shape (m, n), the worst over the cases, shape (m,) each.
 
-        Parameters
-        ----------
-        points : ndarray, shape (m, n)
-        spec : Specification
-            It gives the band, and says whether margins are needed.
+        The specification gives the band, and says whether margins are needed.
         """
         responses = self.respond(points, spec.band)
         every = np.ones(len(points), dtype=bool)
@@ -214,16 +201,12 @@ class Simulator:
         """The plant's states and inputs at the lanes' operating points; see `PointFinder`."""
         own = self._grid_index[case]
         lanes = [(self.grids[g], np.flatnonzero(own == g)) for g in np.unique(own)]
-        return self._find_points(lanes, p, self.lane_periods(p), passage)
+        return self._find_points(lanes, p, self.sampled.periods(p), passage)
 
     def lanes(self, points: Array, rows: Indices, case: Indices) -> tuple[Array, Array]:
         """Parameters, shape (m, n_parameters), and start states, shape (m, n_states), of lanes.
 
-        Parameters
-        ----------
-        points : ndarray, shape (n_points, n)
-        rows, case : ndarray of int, shape (m,)
-            Each lane's candidate, a row of `points`, and its case.
+        Each lane has its candidate, a row of `points`, and its case; shape (m,).
         """
         base, order = self.space.vectors(points)[rows], list(self.space.parameters)
         p, starts = np.empty_like(base), np.empty((len(rows), self.rollout.n_states))
@@ -240,26 +223,15 @@ class Simulator:
             found = np.tile(rest, (len(points), 1))
         else:
             found = np.array([self.cases[case].initial(self.loop, self.space.parameters_at(point)) for point in points])
-        return self._lanes.with_integral(found)
+        return self.sampled.with_integral(found)
 
     def starts_vary(self, case: int) -> bool:
         """Whether the state before the step depends on the gains in a case."""
         return self._rest[case] is None
 
-    def lane_periods(self, p: Array) -> Array:
-        """The time over which each lane is averaged, shape (m,) [s]; 0: it is not."""
-        periods = np.zeros(len(p))
-        for period, rows in self.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
-            periods[rows] = period or 0.0
-        return periods
-
     def grid_index(self, case: int) -> int:
         """The number of the grid on which a case runs."""
         return int(self._grid_index[case])
-
-    def lanes_by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
-        """Each averaging time [s], None without dither, and a mask of the sound lanes that it is for."""
-        return self._lanes.by_dither_period(p, sound)
 
     def pad(self, case: Indices) -> tuple[Array, Array, Array, int]:
         """Inputs, instants and steps of lanes, padded to one length, and their RK4 steps a sample.
@@ -271,11 +243,6 @@ class Simulator:
         padded = zip(*(self.grids[g].pad(n) for g in used), strict=True)
         u, t, h = (np.array(arrays)[place] if len(used) > 1 else arrays[0] for arrays in padded)
         return u, t, h, max(self.substeps[g] for g in used)
-
-    @property
-    def _longest(self) -> int:
-        """The samples of the longest reference."""
-        return max(len(grid.t) for grid in self.grids)
 
     def _chunks(self, case: Indices) -> Iterator[Indices]:
         """Indices of lanes that run together: all at once if they are few, otherwise those on the same grid."""
@@ -297,19 +264,13 @@ class Simulator:
         self._read(out, chunk, case, p, (found.x, found.y, found.x_end), band)
 
     def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: Band) -> Responses:
-        """The responses of candidates on every case, of which the outputs and end states are known.
+        """The responses of candidates on every case that ran elsewhere; `shape` is (m, n_cases).
 
-        Parameters
-        ----------
-        p : ndarray, shape (m n_cases, n_parameters)
-        case : ndarray of int, shape (m n_cases,)
-        run : tuple of ndarray, shapes (m n_cases, k, n_states), (m n_cases, n, n_outputs) and (m n_cases, n_states)
-            States at every `KEPT_STATES`-th sample, outputs and end states.
-        shape : tuple of int
-            m and n_cases.
-        band : float or Tolerance
+        Parameters and cases of the lanes have the shapes (m n_cases, n_parameters) and (m n_cases,).
         """
-        measured = LaneMetrics.empty(len(p), self._longest, run[0].shape[2], self.response_metrics)
+        measured = LaneMetrics.empty(
+            len(p), max(len(grid.t) for grid in self.grids), run[0].shape[2], self.response_metrics
+        )
         for chunk in self._chunks(case):
             self._read(measured, chunk, case[chunk], p[chunk], (run[0][chunk], run[1][chunk], run[2][chunk]), band)
         return Responses(np.ones(shape, dtype=bool), p, measured, MarginReader(self.margin_metrics, self._read_margins))
@@ -323,16 +284,16 @@ class Simulator:
             y = outputs[own, : len(grid.t)]
             sound = is_sound(y, ends[own])
             out.sound[chunk[own]], out.passage.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
-            found = self._lanes.read(grid, y, p[own], sound, self.bands(band), asked, self._envelope)
+            found = self.sampled.read(grid, y, p[own], sound, self.bands(band), asked, self._envelope)
             for period, rows, metrics in found:
                 for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value
                 out.passage.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
 
-    def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float | None) -> Indices:
+    def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float) -> Indices:
         """Samples of the largest speed, as `ResponsePoints` has them; zeros for a plant without an axis."""
-        k = speed_output(self.loop, self.meter_channels)
-        return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period or 0.0)
+        k = speed_output(self.loop, self.sampled.channels)
+        return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period)
 
     def _margin_function(self, references: Sequence[Reference]) -> MarginFunction:
         """Margins of many loops, read from the frequency on at which a slow integral swings against a resting drive."""
@@ -349,7 +310,7 @@ class Simulator:
         """
         given = self.space.start[None]
         p, starts = self.space.vectors(given)[0], [self.starts(k, given)[0] for k in range(len(references))]
-        along = [self._lanes.states_along(g, x, p, MAX_LOOP_SUBSTEPS) for g, x in zip(self.grids, starts, strict=True)]
+        along = [self.sampled.states_along(g, x, p, MAX_LOOP_SUBSTEPS) for g, x in zip(self.grids, starts, strict=True)]
         states = [x for rows in along for x in rows]
         corners, order = self.space.vectors(self.space.corners()), list(self.space.parameters)
         rates = fastest_eigenvalue(self.loop, corners, states)

@@ -260,13 +260,8 @@ def _worst_by_plant(by_case: "pd.DataFrame", plants: Sequence[str], steps: Seque
     columns = {str(label): number for number, label in enumerate(by_case)}
     own = np.array([[columns[TuningCase(step, plant).label] for step in steps] for plant in plants])
     table = by_case.to_numpy(dtype=float)[:, own]
-    worst = [[_worst_value(row, str(n)) for row in rows] for n, rows in zip(by_case.index, table, strict=True)]
+    worst = [[row[_rank_order(row, str(n))[-1]] for row in rows] for n, rows in zip(by_case.index, table, strict=True)]
     return pd.DataFrame(worst, index=by_case.index, columns=list(plants))
-
-
-def _worst_value(values: Array, metric: str) -> float:
-    """The worst value of a metric."""
-    return float(values[_rank_order(values, metric)[-1]])
 
 
 def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
@@ -281,7 +276,7 @@ def _figures(
     """The table `DesignValidation.figures`."""
     import pandas as pd
 
-    limits = {metric_name(q): _metric_limit(q) for q in spec.limits}
+    limits = {metric_name(q): q.metric.factor * (user_limit(q) or math.nan) for q in spec.limits}
     given_rows = {str(n): row.to_numpy(dtype=float) for n, row in values.iterrows()}
     breaks = {metric_name(q): ~(share <= 0) for q, share in spec.excess(requirement_values(given_rows)).items()}
     rows = {}
@@ -291,7 +286,7 @@ def _figures(
         rows[metric] = {
             "median": _quantile(given, metric, 50.0),
             "p95": _quantile(given, metric, SUMMARY_PERCENTILE),
-            "worst": _worst_value(given, metric),
+            "worst": float(given[order[-1]]),
             "worst_plant": str(values.columns[order[-1]]),
             "certified": float(certified[case].to_dict()[metric]),
             "limit": limits.get(metric, math.nan),
@@ -303,9 +298,3 @@ def _figures(
 def _quantile(values: Array, metric: str, percent: float) -> float:
     """The value of a metric that so many percent of the plants are as good as or better than."""
     return float(values[_rank_order(values, metric)[math.ceil(len(values) * percent / 100) - 1]])
-
-
-def _metric_limit(requirement: Requirement) -> float:
-    """The limit in the metric's unit, percent where it has percent; NaN without a limit."""
-    limit = user_limit(requirement)
-    return math.nan if limit is None else requirement.metric.factor * limit
