@@ -89,7 +89,7 @@ class Ending:
     @property
     def defect(self) -> Defect | None:
         """How it ends where it neither settles nor rests where it may."""
-        return self.described[0] if self.described else None
+        return self.description[0] if self.description else None
 
     @property
     def hunts(self) -> bool:
@@ -97,7 +97,7 @@ class Ending:
         return self.defect is Defect.HUNTS
 
     @cached_property
-    def described(self) -> tuple[Defect, str] | None:
+    def description(self) -> tuple[Defect, str] | None:
         """The defect and its predicate, "hunts: ..."."""
         return _describe_defect(self)
 
@@ -165,8 +165,8 @@ class Ending:
 
 def find_defects(ending: Ending) -> Iterator[Finding]:
     """The defect with which a response ends, if any."""
-    if ending.described is not None:
-        defect, words = ending.described
+    if ending.description is not None:
+        defect, words = ending.description
         yield Finding(defect, ending.case, f"at {ending.case} the loop {words}")
 
 

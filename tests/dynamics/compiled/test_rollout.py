@@ -305,32 +305,17 @@ def test_threads_of_the_vm_change_nothing(name: str, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("cc", [None, ""])
-def test_one_parameter_vector_serves_all_segments(
+def test_one_vector_or_grid_serves_all_segments(
     cc: str | None, monkeypatch: pytest.MonkeyPatch, forget: Forget
 ) -> None:
     if cc is not None:
         monkeypatch.setenv("PNEUOPT_CC", cc)
     case = Case("stribeck")
     rollout = case.rollout((0,))
-    shared = case.run(rollout, p=case.p[0])
-    repeated = case.run(rollout, p=np.tile(case.p[0], (5, 1)))
-    assert_array_equal(shared.y, repeated.y)
-
-
-@pytest.mark.parametrize("lanes", [None, 0])
-@pytest.mark.parametrize("name", ["stribeck", "pressure", "sampled loop"])
-def test_segments_may_share_their_inputs_and_their_instants(name: str, lanes: int | None) -> None:
-    case = Case(name)
-    rollout = Rollout(case.system.pieces, lanes=lanes)
-    repeated = case.run(
-        rollout, **{n: np.tile(a[:1], (5, *[1] * (a.ndim - 1))) for n, a in vars(case).items() if n in "uth"}
-    )
-    shared = case.run(rollout, u=case.u[0], t=case.t[0], h=case.h[0])
-    own_inputs = case.run(rollout, t=case.t[0], h=case.h[0])
-    assert_array_equal(shared.y, repeated.y)
-    assert_array_equal(shared.x_end, repeated.x_end)
-    assert_array_equal(own_inputs.y[0], shared.y[0])
-    assert not np.array_equal(own_inputs.y, shared.y)
+    for shared in ("p", "u", "th", "uth", "puth"):
+        one = {n: np.array(getattr(case, n)[0]) for n in shared}
+        each = {n: np.tile(a, (5, *[1] * a.ndim)) for n, a in one.items()}
+        assert_array_equal(case.run(rollout, **one).y, case.run(rollout, **each).y)
 
 
 def test_padding_freezes_the_state() -> None:
