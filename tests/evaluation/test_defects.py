@@ -56,3 +56,20 @@ def test_a_response_that_never_was_in_the_band_has_no_stay() -> None:
     found = ending(t, error)
     assert longest_stay(t, found.is_inside(error)) == 0.0
     assert [f.defect for f in find_defects(found)] == [Defect.CREEPS]
+
+
+@pytest.mark.parametrize(("settled", "defects"), [(3.9, []), (4.1, [Defect.CREEPS])])
+def test_who_needs_more_than_four_horizons_creeps(settled: float, defects: list[Defect]) -> None:
+    """The step's horizon is 1 s; what comes in within four is settled, later than its user thought."""
+    t = np.linspace(0.0, 16.0, 8001)
+    found = ending(t, np.where(t < settled, -0.05, 0.0))
+    assert found.settling_time == pytest.approx(settled, abs=5e-3)
+    assert [f.defect for f in find_defects(found)] == defects
+
+
+@pytest.mark.parametrize(("ratio", "settles"), [(1.8, False), (2.2, True)])
+def test_who_came_in_late_must_stay_twice_as_long_as_before(ratio: float, settles: bool) -> None:
+    """Of the 1 s that is judged: .15 s inside, then outside until the last stay, which lasts a multiple of that."""
+    t = np.linspace(0.0, 1 / 0.9, 4001)
+    inside = ((t > 0.3) & (t < 0.45)) | (t > 1 - ratio * 0.15)
+    assert ending(t, np.where(inside, 0.01, 0.05)).is_settled == settles
