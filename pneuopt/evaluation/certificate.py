@@ -146,8 +146,8 @@ def judge_evaluations(
     metrics = tabulate_metrics(evaluations)
     for found in evaluations if continues else ():
         share = band_share(band, found.case.reference)
-        ending = Ending(continue_response(found, share), share, found.case.label)
-        findings += find_defects(ending, rest_error)
+        ending = Ending(continue_response(found, share), share, found.case.label, rest_error)
+        findings += find_defects(ending)
         notes += describe_ending(ending, found.metrics)
         counts = describe_counts(found.loop, found.parameters, found.case.reference, band)
         notes += [f"at {ending.case} {counts}"] if counts else []

@@ -95,7 +95,7 @@ def judge_compensators(
     steps, full, bare = as_references(references), loop.complete(parameters), replace(loop, compensators=())
     plain = (full if without is None else full | without).select(bare.parameters)
     before, after = (read_endings(one, steps, p, band) for one, p in ((bare, plain), (loop, full)))
-    table, hunts = worst_metrics(before, after), any(e.hunts for e in after)
+    table, hunts = worst_metrics(before, after), any(e.ending.hunts for e in after)
     narrowest = min(band_share(band, r) for r in steps)
     usefulness, changes = weigh_changes(table, narrowest, loop, [], hunts=hunts)
     notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]

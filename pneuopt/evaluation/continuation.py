@@ -40,7 +40,7 @@ RUNAWAY_ERROR = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class ContinuedResponse:
     """What a response does from the step on, as far as it was simulated.
 
     Attributes
@@ -133,7 +133,7 @@ class Course:
         return np.asarray(period_mean(self.t, values[None], initial, self.period, self.at)[0])
 
 
-def continue_response(found: CaseEvaluation, band: float) -> Course:
+def continue_response(found: CaseEvaluation, band: float) -> ContinuedResponse:
     """Continue a response by its own length again and again until it is decided.
 
     Parameters
@@ -145,7 +145,7 @@ def continue_response(found: CaseEvaluation, band: float) -> Course:
 
     Returns
     -------
-    Course
+    ContinuedResponse
         It ends where signal and command stand, at `MAX_HORIZONS` horizons, at a contact with a validity limit, or
         where the budget of simulated instants ends.
     """
@@ -154,7 +154,7 @@ def continue_response(found: CaseEvaluation, band: float) -> Course:
     period = loop.dither_period(found.parameters)
     t, y, u = (run.t[since] - reference.at, run[loop.feedback.name][since], run["control"][since])
     stable = bool(np.isfinite(found.metrics["MaxSensitivity"]))
-    course = Course(loop, reference, period, t, y, u, contact=_limit_in_horizon(found), is_stable=stable)
+    course = ContinuedResponse(loop, reference, period, t, y, u, contact=_limit_in_horizon(found), is_stable=stable)
     left = MAX_CONTINUATION_INSTANTS
     while not course.is_decided(band):
         inputs, instants = _next_inputs(found, run.t[-1], course)
@@ -187,7 +187,7 @@ def _limit_in_horizon(found: CaseEvaluation) -> str:
     return ""
 
 
-def _append(course: Course, run: Trajectory, contact: str) -> Course:
+def _append(course: ContinuedResponse, run: Trajectory, contact: str) -> ContinuedResponse:
     t, y, u = (run.t[1:] - course.reference.at, run[course.loop.feedback.name][1:], run["control"][1:])
     return replace(
         course,
@@ -198,7 +198,7 @@ def _append(course: Course, run: Trajectory, contact: str) -> Course:
     )
 
 
-def _next_inputs(found: CaseEvaluation, begin: float, course: Course) -> tuple[Trajectory, Array]:
+def _next_inputs(found: CaseEvaluation, begin: float, course: ContinuedResponse) -> tuple[Trajectory, Array]:
     """Inputs that stay as they were after the step for once more the record's length, and instants to report."""
     loop, reference, h = found.loop, found.case.reference, found.loop.pid.sample_time
     length = min(course.t[-1], MAX_HORIZONS * course.horizon - course.t[-1])

@@ -4,22 +4,23 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from math import nan
+from math import isfinite, nan
 
 import numpy as np
 
-from pneuopt.evaluation.continuation import Course
+from pneuopt.evaluation.band import SettlingBand, entry_for_good
+from pneuopt.evaluation.continuation import ContinuedResponse
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.dither_ripple import describe_ripple
 from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
-from pneuopt.quantities.arrays import Mask
+from pneuopt.quantities.arrays import Array, Mask
 
 # Share of the step below which a response has not moved: below it, a stuck drive whose friction gives way a little
 # counts as a motion; above it, a response counts as none that creeps towards the reference.
 MIN_MOTION = 0.1
-# Excess over the settling band, relative to it, that counts as inside. Below, the tolerance of the continuation decides
-# at the band's edge; above, a design that leaves the band counts as settled.
-BAND_TOLERANCE = 1e-3
+# Overshoot of the continuation beyond the horizon's, as a share of the settling band, from which it takes its place.
+# Below, the ripple's mean at the horizon's end decides; above, a larger overshoot goes unsaid.
+MIN_LATER_OVERSHOOT = 1e-3
 # Ratio of an oscillation's size in the last quarter of the record to that in the quarter before from which it grows.
 # A lower one takes irregular hunting for growth; a higher one misses growth that takes many periods.
 MIN_GROWTH = 1.1
@@ -29,10 +30,6 @@ GROWTH_SHARE, EDGE_SHARE = 0.5, 0.9
 # Share of the range over half the record that a drift in one direction must cover to be creep: with less, slow hunting
 # is creep too; with all of it, the least ringing on the drift hides it.
 MIN_DRIFT_SHARE = 0.9
-# Ratio of the time in the band at the record's end to any stay in it before, from which a response that came in late
-# counts as settled. With a lower one slow hunting settles whenever it is inside; with a higher one a stroke that ends
-# early makes creep of every response that once touched the band's edge.
-MIN_STAY_RATIO = 2.0
 # Horizons within which a response must be in its band for good. With fewer, a design is refused whose user only
 # underrated its settling; with more, one counts as settled that for its user's purposes never does.
 LATEST_SETTLING = 4.0
@@ -71,49 +68,56 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Ending:
-    """How a response ends, read against a settling band.
+    """The one answer to "how does a response end", read against a settling band; certificate and verdicts read it.
 
     Parameters
     ----------
-    course : Course
+    course : ContinuedResponse
     band : float
         Half width, a fraction of the step.
     case : str
         Its label.
+    rest_error : float
+        Distance from the reference at which it may rest outside the band, a fraction of the step.
     """
 
-    course: Course
+    course: ContinuedResponse
     band: float
     case: str
+    rest_error: float = 0.0
 
     @property
+    def defect(self) -> Defect | None:
+        """How it ends where it neither settles nor rests where it may."""
+        return self.description[0] if self.description else None
+
+    @property
+    def hunts(self) -> bool:
+        """Whether it goes on to and fro, out of the band."""
+        return self.defect is Defect.HUNTS
+
+    @cached_property
+    def description(self) -> tuple[Defect, str] | None:
+        """The defect and its predicate, "hunts: ..."."""
+        return _describe_defect(self)
+
+    @cached_property
     def settling_time(self) -> float:
-        """Instant after the step from which the mean stays in the band, to the grid [s]."""
-        outside = np.flatnonzero(~self._inside)
-        return float(self.course.at[outside[-1]]) if len(outside) else 0.0
+        """Instant after the step from which the mean stays in the band, to the grid [s]; inf where it does not."""
+        return entry_for_good(self.course.at, self.is_inside(self.course.error))
 
     @property
     def is_settled(self) -> bool:
-        """Whether the mean enters the band for good: not at the very end, and not again and again."""
-        last, end = self.settling_time, float(self.course.at[-1])
-        return last <= (1 - TAIL_SHARE) * end and (last <= end / 2 or end - last >= MIN_STAY_RATIO * self.longest_stay)
+        """Whether the mean enters the band for good."""
+        return isfinite(self.settling_time)
 
-    @property
-    def longest_stay(self) -> float:
-        """The longest time in the band before the mean leaves it for the last time [s]; 0 where it never does."""
-        at = self.course.at
-        inside = np.concatenate([[False], self._inside, [False]])
-        enters, leaves = np.flatnonzero(~inside[:-1] & inside[1:]), np.flatnonzero(inside[:-1] & ~inside[1:])
-        ended = leaves < len(at)
-        return float(np.max(at[leaves[ended]] - at[enters[ended]], initial=0.0))
-
-    @cached_property
-    def _inside(self) -> Mask:
-        return np.abs(self.course.error) <= self.band * (1 + BAND_TOLERANCE)
+    def is_inside(self, error: Array) -> Mask:
+        """Which errors, in steps, lie in the band."""
+        return SettlingBand(0.0, self.band).contains(error)
 
     def returns(self, share: float) -> int:
         """How often the mean leaves the band from this share of the record on, having been inside."""
-        inside = self._inside[self.course.since(share)]
+        inside = self.is_inside(self.course.error[self.course.since(share)])
         return int(np.sum(inside[:-1] & ~inside[1:]))
 
     @property
@@ -125,8 +129,7 @@ class Ending:
     def refutes(self, settling_time: float) -> bool:
         """Whether the mean leaves the band after this instant, beyond the horizon [s]."""
         course = self.course
-        beyond = course.error[course.at > course.horizon]
-        return bool(np.any(np.abs(beyond) > self.band * (1 + BAND_TOLERANCE))) and settling_time <= course.horizon
+        return not self.is_inside(course.error[course.at > course.horizon]).all() and settling_time <= course.horizon
 
     @property
     def stands(self) -> bool:
@@ -160,22 +163,14 @@ class Ending:
         return bool(abs(late[-1] - late[0]) >= MIN_DRIFT_SHARE * np.ptp(late))
 
 
-def find_defects(ending: Ending, rest_error: float) -> Iterator[Finding]:
-    """The defect with which a response ends, if any.
-
-    Parameters
-    ----------
-    ending : Ending
-    rest_error : float
-        Distance from the reference that a rest may have, a fraction of the step.
-    """
-    found = _describe_defect(ending, max(rest_error, ending.band))
-    if found is not None:
-        defect, words = found
+def find_defects(ending: Ending) -> Iterator[Finding]:
+    """The defect with which a response ends, if any."""
+    if ending.description is not None:
+        defect, words = ending.description
         yield Finding(defect, ending.case, f"at {ending.case} the loop {words}")
 
 
-def _describe_defect(ending: Ending, rest_error: float) -> tuple[Defect, str] | None:
+def _describe_defect(ending: Ending) -> tuple[Defect, str] | None:
     """The defect and its predicate, "hunts: ..."."""
     course, cycle = ending.course, ending.cycle
     moved, until = 1 + float(course.error.max()), f"{course.t[-1]:.3g} s after the step"
@@ -193,7 +188,7 @@ def _describe_defect(ending: Ending, rest_error: float) -> tuple[Defect, str] | 
             Defect.CREEPS,
             f"creeps: it is in the band for good only {ending.settling_time:.3g} s after the step, {times}",
         )
-    rests = ending.stands and abs(ending.final_error) <= rest_error
+    rests = ending.stands and abs(ending.final_error) <= max(ending.rest_error, ending.band)
     return None if ending.is_settled or rests else _describe_unrest(ending, cycle, until)
 
 
@@ -223,7 +218,7 @@ def correct_metrics(ending: Ending, metrics: Mapping[str, float]) -> dict[str, f
     times = [n for n in ("SettlingTime", "SettlingTimeRaw") if n in metrics]
     refuted = dict.fromkeys(times, nan) if ending.refutes(metrics["SettlingTime"]) else {}
     higher = {"Overshoot": 100 * largest, "OvershootDistance": largest * abs(ending.course.reference.nominal_size)}
-    if largest <= metrics["Overshoot"] / 100 + BAND_TOLERANCE * ending.band:
+    if largest <= metrics["Overshoot"] / 100 + MIN_LATER_OVERSHOOT * ending.band:
         higher = {}
     return {**metrics, **refuted, **higher}
 

@@ -168,7 +168,7 @@ def judge_dither(
     objections = [
         text for step, found in zip(steps, after, strict=True) for text in _object_to_swing(step, found, effect)
     ]
-    hunts, narrowest = any(e.hunts for e in after), min(band_share(band, r) for r in steps)
+    hunts, narrowest = any(e.ending.hunts for e in after), min(band_share(band, r) for r in steps)
     usefulness, changes = weigh_changes(table, narrowest, loop, objections, hunts=hunts)
     notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
     rival = "gains tuned without it"
@@ -196,7 +196,8 @@ def worst_metrics(before: Sequence[DitheredEnding], after: Sequence[DitheredEndi
 
 def _object_to_swing(reference: Reference, found: DitheredEnding, effect: DitherEffect) -> Iterator[str]:
     """Objection to a dither that swings the signal by a large part of the step, in the end or while the body moves."""
-    signal, axis = found.course.loop.feedback, found.course.loop.plant.axis or Axis()
+    loop = found.ending.course.loop
+    signal, axis = loop.feedback, loop.plant.axis or Axis()
     moving = {axis.speed: effect.speed, axis.position: effect.travel}.get(signal.name, nan)
     swing, size = max(found.ripple, 0.0 if isnan(moving) else 2 * moving), abs(reference.nominal_size)
     if swing >= MAX_RIPPLE_SHARE * size:

@@ -6,13 +6,12 @@ from math import isfinite
 
 import numpy as np
 
-from pneuopt.evaluation.band import Band, band_share
-from pneuopt.evaluation.continuation import Course, continue_response
-from pneuopt.evaluation.defects import BAND_TOLERANCE, Ending
+from pneuopt.evaluation.band import Band, band_share, entry_for_good
+from pneuopt.evaluation.continuation import ContinuedResponse, continue_response
+from pneuopt.evaluation.defects import Ending
 from pneuopt.evaluation.dither_mean import FINAL_PERIODS, TAIL_SHARE, period_mean
 from pneuopt.evaluation.dither_ripple import describe_ripple, measure_ripple
 from pneuopt.evaluation.evaluate import CaseEvaluation
-from pneuopt.evaluation.limit_cycle import LimitCycle
 from pneuopt.quantities.arrays import Array
 
 # Cycles of a hunting loop, at its end, over which its error is the largest one: fewer miss the worst of irregular
@@ -29,12 +28,8 @@ class DitheredEnding:
     metrics : dict of str to float
         Those of `evaluate`, with the settling times and the error of the continued response, infinite where it never
         settles, and RemainingError, the largest error of the signal itself over the last cycles [% of the step].
-    course : Course
-        The response, continued until it is decided.
-    hunts : bool
-        Whether it neither stands in the end nor drifts in one direction.
-    cycle : LimitCycle or None
-        Its hunting, where that is regular.
+    ending : Ending
+        Of the response, continued until it is decided.
     ripple : float
         Peak to peak of its dither's ripple in the end [measured unit].
     speed : float or None
@@ -44,22 +39,21 @@ class DitheredEnding:
     """
 
     metrics: dict[str, float]
-    course: Course
-    hunts: bool
-    cycle: LimitCycle | None
+    ending: Ending
     ripple: float
     speed: float | None
     ripple_note: str | None
 
     def describe(self, which: str) -> Iterator[str]:
         """What a table of metrics does not show, a sentence each; `which` is "with" or "without" the dither."""
-        if self.cycle is not None:
-            yield f"{which} it the loop ends in {self.cycle.describe(self.course.loop.feedback.unit)}"
+        course, cycle = self.ending.course, self.ending.cycle
+        if cycle is not None:
+            yield f"{which} it the loop ends in {cycle.describe(course.loop.feedback.unit)}"
         if self.ripple_note is not None:
             yield self.ripple_note
-        if self.course.contact and self.hunts:
-            until = f"{self.course.t[-1]:.3g} s after the step"
-            yield f"{which} it the response is judged until {until}: {self.course.contact}"
+        if course.contact and self.ending.hunts:
+            until = f"{course.t[-1]:.3g} s after the step"
+            yield f"{which} it the response is judged until {until}: {course.contact}"
 
 
 def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
@@ -94,9 +88,7 @@ def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
     }
     return DitheredEnding(
         {**found.metrics, **errors, **settled},
-        course,
-        not (ending.stands or ending.drifts),
-        ending.cycle,
+        ending,
         _ripple(course),
         _largest_speed(found),
         describe_ripple(found.metrics, size, share),
@@ -118,15 +110,13 @@ def begin_of_end(ending: Ending) -> float:
 
 def _settling_time(ending: Ending, within_horizon: float, t: Array, error: Array) -> float:
     """That within the horizon, if the continuation does not refute it; else its own; infinite for never [s]."""
-    outside, end = np.flatnonzero(error > ending.band * (1 + BAND_TOLERANCE)), float(t[-1])
-    last = float(t[outside[-1]]) if len(outside) else 0.0
-    if isfinite(within_horizon) and last <= ending.course.horizon:
+    inside = ending.is_inside(error)
+    if isfinite(within_horizon) and inside[t > ending.course.horizon].all():
         return within_horizon
-    stays = last <= end / 2 or (ending.cycle is None and last <= (1 - TAIL_SHARE) * end)
-    return last if stays else np.inf
+    return entry_for_good(t, inside)
 
 
-def _ripple(course: Course) -> float:
+def _ripple(course: ContinuedResponse) -> float:
     """Peak to peak of what repeats with the dither in the end [measured unit]."""
     if course.period is None:
         return 0.0

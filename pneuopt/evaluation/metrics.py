@@ -7,7 +7,8 @@ from math import nan
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.evaluation.crossings import Samples, first_crossing_times, pick_samples, settling_times, times_in_bands
+from pneuopt.evaluation.band import SettlingBand
+from pneuopt.evaluation.crossings import Samples, first_crossing_times, pick_samples
 from pneuopt.evaluation.dither_mean import period_mean, tail
 from pneuopt.evaluation.dither_ripple import remove_ripple
 from pneuopt.evaluation.metric import Source
@@ -218,7 +219,8 @@ def batch_metrics(
     centre, width = steady, band * np.abs(steady - initial)
     if band_centre is BandCentre.REFERENCE:
         centre, width = np.full_like(steady, reference_final), np.full_like(steady, band * abs(size))
-    settled, settled_raw = (settling_times(samples, centre, width) for samples in (smooth, raw))
+    settled, settled_raw = (SettlingBand(centre, width).settling_times(part.t, part.y) for part in (smooth, raw))
+    times = [SettlingBand(centre, other / band * width).settling_times(smooth.t, smooth.y) for other in wider]
     only_mean = np.isnan(settled_raw) & (settled > raw.t[-1] - MIN_SETTLED_PERIODS * (dither_period or 0.0))
     record = _to_step_record(
         raw,
@@ -241,7 +243,7 @@ def batch_metrics(
         **({} if scale is None else _deviation_metrics(smooth, reference_final, scale)),
         "SteadyStateValue": steady,
         **({"Ripple": np.maximum(ripple, np.ptp(tail(raw.t, raw.y), axis=1))} if _wants(only, "Ripple") else {}),
-        **({"SettlingTimes": times_in_bands(smooth, centre, width, np.divide(wider, band))} if wider else {}),
+        **({"SettlingTimes": np.transpose(times)} if wider else {}),
         **{name: _largest(name, record) for name in ROW_METRICS if _wants(only, name) and _is_shown(name, record)},
     }
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from types import MappingProxyType
+from typing import Any
 
 from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
@@ -61,7 +62,7 @@ class Specification:
         return next((q.bounds for q in (*self.weights, *self.limits) if isinstance(q, StepEnvelope)), ())
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def metric_names(self) -> tuple[str, ...]:
         """Names of the metrics that it limits or minimises."""
         return tuple(dict.fromkeys(metric_name(q) for q in (*self.weights, *self.limits)))
 
@@ -121,9 +122,23 @@ class Specification:
         """Difference of the objective below which two simulations agree: its terms' resolutions, weighted."""
         return sum(weight * q.metric.resolution for q, weight in self.weights.items())
 
+    def excess(self, values: Mapping[str, Any]) -> dict[Requirement, Any]:
+        """The one answer to which limit is broken, by how much: the share by which values exceed each limit.
+
+        The values are those of `requirement_values`, numbers or arrays. A share is negative where a limit leaves room,
+        and NaN without a figure, which breaks the limit too.
+
+        Examples
+        --------
+        >>> spec = specify(SettlingTime(), [MaxSensitivity(1.6)])
+        >>> round(spec.excess({"MaxSensitivity": 2.0})[MaxSensitivity(1.6)], 6)
+        0.25
+        """
+        return {q: values[metric_name(q)] / upper_limit(q) - 1 for q in self.limits}
+
     def violations(self, values: Mapping[str, float], slack: float = 0.0) -> tuple[Requirement, ...]:
-        """Limits that `values` violate, which a NaN does too; `slack` is relative to the limit."""
-        return tuple(q for q in self.limits if not values[metric_name(q)] <= upper_limit(q) * (1 + slack))
+        """Limits that `values` violate; `slack` is relative to the limit."""
+        return tuple(q for q, share in self.excess(values).items() if not share <= slack)
 
 
 Objective = Requirement | Mapping[Requirement, float] | Specification

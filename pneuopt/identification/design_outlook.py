@@ -133,7 +133,7 @@ def _certify(
         )
         failures += [n for n in map(metric_name, violated) if n not in failures]
     row: dict[str, float | str] = {}
-    for name in (n for n in spec.kinds if n in found.metrics.index):
+    for name in (n for n in spec.metric_names if n in found.metrics.index):
         worst = np.min if larger_is_better(name) else np.max
         row[name] = float(worst(found.metrics.loc[name].to_numpy(dtype=float)))
     return {**row, "fails": ", ".join(failures)}

@@ -111,17 +111,12 @@ class PlannedRun:
     def simulate(self, signals: Array, parameters: ParameterSet, substeps: int) -> Array:
         """Run excitations of shape (m, n), counted from the start; returns all `channels`, shape (m, n, n_channels)."""
         m, n = signals.shape
-        model = self.loop or self.plant
-        size = max(1, BATCH_SAMPLES // n)
-        p, x0 = parameter_vector(model.parameters, parameters), self.rest(parameters)
-        given = signals + self.origin
-        grid = np.arange(n) * self.sample_time
+        size, given = max(1, BATCH_SAMPLES // n), signals[:, :, None] + self.origin
+        p, x0 = parameter_vector((self.loop or self.plant).parameters, parameters), self.rest(parameters)
+        t, h = np.arange(n) * self.sample_time, np.full(n, self.sample_time)
         parts = []
-        for i in range(0, m, size):
-            u = given[i : i + size, :, None]
-            wide = (len(u), n)
-            arrays = np.tile(x0, (len(u), 1)), u, p, np.broadcast_to(grid, wide), np.full(wide, self.sample_time)
-            run = self._run.run(*arrays, substeps=substeps, states=1)
+        for u in np.split(given, range(size, m, size)):
+            run = self._run.run(np.tile(x0, (len(u), 1)), u, p, t, h, substeps=substeps, states=1)
             assert run.x is not None
             parts.append(self._gather(u, run.y, run.x))
         return np.concatenate(parts)

@@ -19,8 +19,8 @@ function sliderShare(slider, value) {
   return slider.isLog ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low);
 }
 
-// The mean over a dither period around each instant, as long as one fits; of a loop without dither the signal itself.
-// Before its first instant the signal rests.
+// The mean over a dither period around each instant; of a loop without dither the signal itself. Before its first instant
+// the signal rests; in its last half period the mean goes on as fast as it went.
 function ditherMean(t, y, period) {
   const step = t[1] - t[0];
   if (!(period > 2 * step)) return Array.from(y);
@@ -35,6 +35,11 @@ function ditherMean(t, y, period) {
   };
   const found = [];
   for (let i = 0; i + reach <= y.length - 1; i++) found.push((upTo(i + reach) - upTo(i - reach)) / (2 * reach));
+  const last = y.length - 1;
+  const begin = Math.max(0, last - 2 * reach);
+  const i = Math.min(Math.floor(begin), last - 1);
+  const slope = (y[last] - y[i] - (begin - i) * (y[i + 1] - y[i])) / (2 * reach);
+  while (found.length && found.length < y.length) found.push(found[found.length - 1] + slope);
   return found;
 }
 
@@ -43,22 +48,38 @@ function ditherPeriod(p) {
   return value("dither.amplitude") ? 1 / value("dither.frequency") : 0;
 }
 
+// Since when a signal stays in the band, by the rule of SettlingBand: NaN is outside, and never is Infinity.
+function settlingTime(t, y, reference) {
+  const reach = reference.band * Math.abs(reference.size);
+  const end = y.length - 1;
+  let k = end;
+  while (k >= 0 && t[k] >= reference.at && Math.abs(y[k] - reference.final) <= DATA.rule.edge * reach) k--;
+  if (k < 0 || t[k] < reference.at) return 0;
+  if (k === end) return Infinity;
+  const edge = reference.final + reach * Math.sign(y[k] - reference.final);
+  const settled = t[k] + ((t[k + 1] - t[k]) * (edge - y[k])) / (y[k + 1] - y[k]) - reference.at;
+  return settled <= (1 - DATA.rule.tail) * (t[end] - reference.at) ? settled : Infinity;
+}
+
 // Of a disturbance alone, as the certificate: either side of the reference, as a share of the reference's own scale.
 function readMetrics(run, p, reference) {
   const t = run.t;
-  const y = ditherMean(t, run.outputs[DATA.measured], ditherPeriod(p));
+  const raw = run.outputs[DATA.measured];
+  const period = ditherPeriod(p);
+  const y = ditherMean(t, raw, period);
   const { size } = reference;
   const control = run.outputs[run.outputs.length - 1];
   let over = 0;
-  let settled = reference.at;
   for (let i = 0; i < y.length; i++) {
     if (t[i] < reference.at) continue;
     const off = (y[i] - reference.final) / size;
     over = Math.max(over, reference.isStep ? off : Math.abs(off));
-    if (Math.abs(off) > reference.band) settled = i + 1 < y.length ? t[i + 1] : Infinity;
   }
   const peak = control.reduce((most, v) => Math.max(most, Math.abs(v)), 0);
-  return { SettlingTime: settled - reference.at, Overshoot: 100 * over, PeakControl: peak };
+  const settled = settlingTime(t, y, reference);
+  const late = t[t.length - 1] - reference.at - DATA.rule.periods * period; // from there on a mean may just pass
+  const passes = settled > late && settlingTime(t, raw, reference) === Infinity;
+  return { SettlingTime: passes ? Infinity : settled, Overshoot: 100 * over, PeakControl: peak };
 }
 
 function quantity(slider, value) {

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, Step, disturbance_input
-from pneuopt.evaluation.band import Band, band_share
+from pneuopt.evaluation.band import EDGE_ROUNDING, Band, band_share
+from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.evaluate import relevant_units
+from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
 from pneuopt.export.languages import write_loop_javascript
 from pneuopt.models.load import GRAVITY
 from pneuopt.plotting.canvas import PLOT_UNITS
@@ -89,6 +91,7 @@ def live_script(
         ],
         "limits": {n: limit for n, limit in (limits or {}).items() if n in LIVE_METRICS},
         "units": {n: units.get(n, "") for n in LIVE_METRICS},
+        "rule": {"edge": 1 + EDGE_ROUNDING, "tail": TAIL_SHARE, "periods": MIN_SETTLED_PERIODS},
         "measured": [q.name for q in loop.outputs].index(loop.feedback.name),
         "labels": [f"{q.name} [{q.unit}]" for q in (loop.feedback, loop.outputs[-1])],
         "controller": list(loop.tunable_sections),

@@ -33,7 +33,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.shown import Shown
-from pneuopt.studies.fleet import Fleet
+from pneuopt.studies.fleet import PlantBatch
 from pneuopt.studies.journal import CaseMarks, Journal
 from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
 from pneuopt.studies.processes import Processes
@@ -176,19 +176,19 @@ def evaluate_batch(
     chunk = CHUNK_A_CORE * processor_count() if chunk is None else chunk
     _check_batch(loop, chosen, cases, recertify, chunk)
     cases = {str(name): values for name, values in cases.items()}
-    fleet = Fleet(add_disturbances(loop, steps), steps, parameters, cases, chosen, band)
-    columns, report = fleet.empty_columns(), ProgressReporter(progress, "batch")
+    batch = PlantBatch(add_disturbances(loop, steps), steps, parameters, cases, chosen, band)
+    columns, report = batch.empty_columns(), ProgressReporter(progress, "batch")
     memory = _Memory(journal, parameters, cases, columns)
     with suppress(KeyboardInterrupt):
         for begin in range(0, len(memory.missing), chunk):
             rows = memory.missing[begin : begin + chunk]
-            fleet.measure(rows, columns)
-            memory.keep(rows, fleet.errors)
+            batch.measure(rows, columns)
+            memory.keep(rows, batch.errors)
             done = memory.done
             report(f"{done} of {len(cases)} plants", done, len(cases))
     for row in memory.missing[memory.kept :].tolist():
-        fleet.errors[row] = fleet.errors[row] or INTERRUPTED_CASE
-    table = WideFrame({"case": list(cases), **fleet.varied_columns(), **columns, "error": fleet.errors})
+        batch.errors[row] = batch.errors[row] or INTERRUPTED_CASE
+    table = WideFrame({"case": list(cases), **batch.varied_columns(), **columns, "error": batch.errors})
     picked = _pick_cases(table, list(columns), recertify, seed) if memory.done == len(cases) else []
     compute = partial(sweep, executor=executor, journal=journal)
     checks = _certify(loop, steps, parameters, {n: cases[n] for n in picked}, table, (band, tolerance), compute)

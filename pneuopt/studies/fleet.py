@@ -1,8 +1,7 @@
-"""`Fleet`: the plants of a batch as rows of numbers, run in SIMD lanes, and the metrics read off their responses."""
+"""`PlantBatch`: the plants of a batch as rows of numbers, run in SIMD lanes, and their metrics."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import nan
-from typing import Any
 
 import numpy as np
 
@@ -11,13 +10,11 @@ from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.cases import TuningCase
-from pneuopt.evaluation.meter import needed_channels
-from pneuopt.quantities.arrays import Array, Indices, Mask
+from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import PneuoptError, check_names
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.grids import reference_grids
-from pneuopt.tuning.readings import ReferenceGrid, has_integral, loop_pieces, read_metrics
-from pneuopt.tuning.responses import is_sound
+from pneuopt.tuning.readings import LoopLanes, ReferenceGrid
 from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
 MAX_PROBED = 64
@@ -30,7 +27,7 @@ SAME_START = 1e-9
 RAN_AWAY = "the response runs away"
 
 
-class Fleet:
+class PlantBatch:
     """The plants of a batch as rows of numbers, and the grids on which they run."""
 
     def __init__(
@@ -54,9 +51,7 @@ class Fleet:
             [[v.get(n, self._full.value(n)) for n in self.varied] for v in self._cases], dtype=float
         )
         self._check_values()
-        self._channels = needed_channels(metrics)
-        self._held: tuple[Any, ...] = ()
-        self._rollout = _make_rollout(loop_pieces(loop, self._channels))
+        self.lanes = LoopLanes(loop, metrics, _make_rollout)
         fastest = {"dither.frequency": self._most("dither.frequency")} if "dither.frequency" in self.varied else {}
         self.grids = reference_grids(loop, steps, self._full.with_values(fastest))
         self._starts = [self._shared_start(grid.reference) for grid in self.grids]
@@ -85,43 +80,18 @@ class Fleet:
             own, x0 = self._start_states(rows, grid.reference, start)
             if not len(own):
                 continue
-            p, y, sound = self._run(own, x0, grid, substeps)
+            p = np.tile(self.nominal, (len(own), 1))
+            p[:, self._places] = self._values[own]
+            run, sound = self.lanes.run(grid, x0, p, substeps)
             if not sound.all() and 2 * substeps <= MAX_LOOP_SUBSTEPS:  # RK4 may be what runs away
                 again = ~sound
-                _, y[again], sound[again] = self._run(own[again], x0[again], grid, 2 * substeps)
+                finer, sound[again] = self.lanes.run(grid, x0[again], p[again], 2 * substeps)
+                run.y[again] = finer.y
             for k in own[~sound].tolist():
                 self.errors[k] = self.errors[k] or f"{RAN_AWAY} in the lanes"
-            for period, some in self._by_dither_period(p, sound):
-                whole = y if len(some) == len(y) else y[some]  # a copy would take a tenth of the time
-                seen = np.moveaxis(np.ascontiguousarray(np.moveaxis(whole, 2, 0)), 0, 2)
-                read = read_metrics(grid, seen, (self.band,), period, self.metrics, (), self._channels)
-                for n, value in read.items():
+            for _, some, metrics in self.lanes.read(grid, run.y, p, sound, (self.band,), self.metrics):
+                for n, value in metrics.items():
                     columns[self.column(n, grid)][own[some]] = value
-
-    def _run(self, own: Indices, x0: Array, grid: ReferenceGrid, substeps: int) -> tuple[Array, Array, Mask]:
-        """Parameters and outputs of plants, and which of them do not run away."""
-        p = np.tile(self.nominal, (len(own), 1))
-        p[:, self._places] = self._values[own]
-        if self._held[:2] != (
-            grid,
-            len(own),
-        ):  # most chunks are alike; a copy for each would take a quarter of its time
-            shown = (np.tile(a, (len(own), *[1] * a.ndim)) for a in grid.pad(len(grid.t)))
-            self._held = (grid, len(own), *shown)
-        u, t, h = self._held[2:]
-        with np.errstate(all="ignore"):
-            found = self._rollout.run(x0, u, p, t, h, substeps=substeps)
-        return p, found.y, is_sound(found.y, found.x_end)
-
-    def _by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Indices]]:
-        """The time over which a plant's signal is averaged [s], None without dither, and the rows that it is for."""
-        rates, dither = np.zeros(len(p)), self.loop.dither
-        if dither is not None:
-            amplitude, frequency = (p[:, self._order[f"dither.{n}"]] for n in ("amplitude", "frequency"))
-            rates = np.where(amplitude == 0, 0.0, frequency)
-        for rate in np.unique(rates[sound]).tolist():
-            period = dither.period(rate, self.loop.pid.sample_time) if dither is not None and rate else None
-            yield period, np.flatnonzero(sound & (rates == rate))
 
     def _start_states(self, rows: Indices, step: Reference, shared: Array | None) -> tuple[Indices, Array]:
         """The plants that can begin, and their states before the step; the others get their reason."""
@@ -135,7 +105,7 @@ class Fleet:
             except PneuoptError as error:
                 self.errors[k] = str(error)
         found = np.reshape(states, (len(good), len(self.loop.states)))
-        return np.array(good, dtype=np.intp), np.pad(found, ((0, 0), (0, int(has_integral(self.loop)))))
+        return np.array(good, dtype=np.intp), self.lanes.with_integral(found)
 
     def start(self, values: Mapping[str, float], step: Reference) -> Array:
         """The state before a step of the plant with these values."""
@@ -168,18 +138,10 @@ class Fleet:
         probed = np.unique([*self._extremes(), *spread.tolist()]).astype(int)
         p = np.tile(self.nominal, (len(probed) + 1, 1))
         p[1:, self._places] = self._values[probed]
-        return float(fastest_eigenvalue(self.loop, p, [x for grid in self.grids for x in self._along(grid)]).max())
-
-    def _along(self, grid: ReferenceGrid) -> list[Array]:
-        """States along the nominal plant's response, its start first."""
-        start = self.start({}, grid.reference)
-        x0 = np.pad(start, (0, int(has_integral(self.loop))))[None]
-        u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-        every = max(1, len(grid.t) // 10)
-        found = self._rollout.run(x0, u, self.nominal, t, h, substeps=MAX_LOOP_SUBSTEPS // 4, states=every).x
-        assert found is not None
-        rows = np.vstack([start, found[0][:, : len(start)]])
-        return list(rows[np.isfinite(rows).all(axis=1)])
+        starts = [self.lanes.with_integral(self.start({}, grid.reference)[None])[0] for grid in self.grids]
+        few = MAX_LOOP_SUBSTEPS // 4
+        along = [self.lanes.states_along(g, x, self.nominal, few) for g, x in zip(self.grids, starts, strict=True)]
+        return float(fastest_eigenvalue(self.loop, p, [x for rows in along for x in rows]).max())
 
     def _check_values(self) -> None:
         """Give each plant with a value that is no number, or out of bounds, its reason."""

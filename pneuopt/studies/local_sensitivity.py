@@ -8,6 +8,7 @@ signal enters the band, ``dt = -(dy/dp) / (dy/dt)``; of an overshoot it is the s
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,6 @@ from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.band import Band
-from pneuopt.evaluation.meter import needed_channels
 from pneuopt.evaluation.scenarios import SampleSpreads, axis_labels, values_at
 from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.arrays import Array
@@ -26,9 +26,8 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.shown import Shown
 from pneuopt.studies.batch import check_lanes
-from pneuopt.studies.fleet import Fleet
-from pneuopt.tuning.readings import ReferenceGrid, has_integral, loop_pieces, read_metrics
-from pneuopt.tuning.responses import is_sound
+from pneuopt.studies.fleet import PlantBatch
+from pneuopt.tuning.readings import LoopLanes, ReferenceGrid, read_metrics
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -141,11 +140,11 @@ def local_sensitivity(
     check_lanes(loop, chosen)
     full_loop = add_disturbances(loop, steps)
     axes = _axis_steps(full_loop, parameters, spreads)
-    fleet = Fleet(full_loop, steps, parameters, {"design": {}}, chosen, band)
+    batch = PlantBatch(full_loop, steps, parameters, {"design": {}}, chosen, band)
     rows, about = dict[tuple[str, str], dict[str, float]](), dict[str, dict[str, float]]()
-    for grid, substeps in zip(fleet.grids, fleet.substeps, strict=True):
-        for metric, (value, changes) in _measure(full_loop, parameters, fleet, grid, substeps, axes).items():
-            figure, squares = fleet.column(metric, grid), changes**2
+    for grid, substeps in zip(batch.grids, batch.substeps, strict=True):
+        for metric, (value, changes) in _measure(full_loop, parameters, batch, grid, substeps, axes).items():
+            figure, squares = batch.column(metric, grid), changes**2
             about[figure] = {"value": value, "std": float(np.sqrt(squares.sum()))}
             with np.errstate(divide="ignore", invalid="ignore"):
                 relative, shares = changes / abs(value), squares / squares.sum() if squares.any() else squares
@@ -174,52 +173,46 @@ def _axis_steps(loop: ClosedLoop, parameters: ParameterSet, spreads: SampleSprea
 def _measure(
     loop: ClosedLoop,
     parameters: ParameterSet,
-    fleet: Fleet,
+    batch: PlantBatch,
     grid: ReferenceGrid,
     substeps: int,
     axes: Mapping[str, Mapping[str, float]],
 ) -> dict[str, tuple[float, Array]]:
     """By metric its value and its change for one standard deviation of each axis."""
-    channels = needed_channels(fleet.metrics)
-    y, along = _run_with_sensitivities(loop, fleet, grid, substeps, axes, channels)
+    y, along = _run_with_sensitivities(loop, batch, grid, substeps, axes)
     moved = np.concatenate([y[None], y + SIDE * along, y - SIDE * along])
     period = loop.dither_period(loop.complete(parameters))
-    found = read_metrics(grid, moved, (fleet.band,), period, fleet.metrics, (), channels)
+    found = read_metrics(grid, moved, (batch.band,), period, batch.metrics, (), batch.lanes.channels)
     m = len(along)
     return {n: (float(v[0]), (v[1 : 1 + m] - v[1 + m :]) / (2 * SIDE)) for n, v in found.items()}
 
 
 def _run_with_sensitivities(
     loop: ClosedLoop,
-    fleet: Fleet,
+    batch: PlantBatch,
     grid: ReferenceGrid,
     substeps: int,
     axes: Mapping[str, Mapping[str, float]],
-    channels: Sequence[str],
 ) -> tuple[Array, Array]:
     """The outputs, shape (n, n_outputs), and their change along each axis, shape (axes, n, n_outputs)."""
     order = list(loop.parameters)
     names = list(dict.fromkeys(n for steps in axes.values() for n in steps))
-    rollout = Rollout(loop_pieces(loop, channels), wrt=[order.index(n) for n in names], start=True)
-    more = int(has_integral(loop))
-    x0 = np.pad(fleet.start({}, grid.reference), (0, more))
-    u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-    run = rollout.run(x0[None], u, fleet.nominal, t, h, substeps=substeps)
-    require(
-        bool(is_sound(run.y, run.x_end)[0]), "the response runs away; no figure of it has a slope", ConvergenceError
-    )
+    lanes = LoopLanes(loop, batch.metrics, partial(Rollout, wrt=[order.index(n) for n in names], start=True))
+    x0 = lanes.with_integral(batch.start({}, grid.reference)[None])
+    run, sound = lanes.run(grid, x0, batch.nominal, substeps)
+    require(bool(sound[0]), "the response runs away; no figure of it has a slope", ConvergenceError)
     assert run.dy is not None
     along = [
-        run.dy[0] @ np.concatenate([_start_change(fleet, grid.reference, s, more), [s.get(n, 0.0) for n in names]])
+        run.dy[0] @ np.concatenate([_start_change(batch, grid.reference, s), [s.get(n, 0.0) for n in names]])
         for s in axes.values()
     ]
     return run.y[0], np.array(along)
 
 
-def _start_change(fleet: Fleet, reference: Reference, steps: Mapping[str, float], more: int) -> Array:
+def _start_change(batch: PlantBatch, reference: Reference, steps: Mapping[str, float]) -> Array:
     """How the state before the step changes with an axis."""
     ends = [
-        fleet.start({n: fleet.nominal_value(n) + side * START_SIDE * s for n, s in steps.items()}, reference)
+        batch.start({n: batch.nominal_value(n) + side * START_SIDE * s for n, s in steps.items()}, reference)
         for side in (1, -1)
     ]
-    return np.pad((ends[0] - ends[1]) / (2 * START_SIDE), (0, more))
+    return np.asarray(batch.lanes.with_integral((ends[0] - ends[1])[None] / (2 * START_SIDE))[0])

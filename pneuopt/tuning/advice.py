@@ -8,7 +8,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import PlantAxis
 from pneuopt.evaluation.metric import Requirement, Sense
-from pneuopt.evaluation.requirements import metric_name, user_limit
+from pneuopt.evaluation.requirements import metric_name, requirement_values, user_limit
 from pneuopt.evaluation.specification import Specification
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def find_breaks(row: Mapping[str, float], spec: Specification, accept: Collectio
         Defects that do not count.
     """
     defects = {n: defect.value for n, defect in LANE_DEFECTS.items() if not math.isfinite(row[n])}
-    limits = [metric_name(q) for q in spec.limits if not _excess(q, row) <= 0]
+    limits = [metric_name(q) for q in spec.violations(requirement_values(row))]
     named = [word for word in defects.values() if Defect(word) not in accept]
     return (*named, *(n for n in limits if n not in defects))
 
@@ -98,7 +98,7 @@ def _relaxation(
 def _relaxed_limit(requirement: Requirement, values: Sequence[float], loop: ClosedLoop) -> str:
     """The limit that the worst value keeps, rounded away from what is asked: "Overshoot <= 4.44 %"."""
     metric, least = requirement.metric, requirement.metric.sense is Sense.AT_LEAST
-    worst = min(values) if least else max(values)
+    worst = max(values, key=metric.requirement_value)
     digit = 10.0 ** (math.floor(math.log10(abs(worst))) + 1 - RELAXED_DIGITS)
     value = (math.floor if least else math.ceil)(worst / digit) * digit
     unit = metric.shown_unit(loop.command.unit, loop.feedback.unit)
@@ -121,10 +121,4 @@ def _worst_excess(row: Mapping[str, float], spec: Specification) -> float:
     """By what share the worst limit is exceeded; infinite where the loop never settles or is unstable."""
     if not all(math.isfinite(row[n]) for n in LANE_DEFECTS):
         return math.inf
-    return max((_excess(q, row) for q in spec.limits), default=-math.inf)
-
-
-def _excess(requirement: Requirement, row: Mapping[str, float]) -> float:
-    """By what share a limit is exceeded, negative where it holds; NaN where there is no figure."""
-    value, limit = row[metric_name(requirement)] / requirement.metric.factor, user_limit(requirement) or 0.0
-    return limit / value - 1 if requirement.metric.sense is Sense.AT_LEAST and value > 0 else value / limit - 1
+    return max(spec.excess(requirement_values(row)).values(), default=-math.inf)

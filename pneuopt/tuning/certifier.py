@@ -92,7 +92,7 @@ class Certifier:
         import pandas as pd
 
         ripple = ("SettlingTimeRaw", "Ripple") if self.task.loop.dither_period(parameters) else ()
-        shown = [n for n in METRICS if n in (*TABLE_METRICS, *ripple, *self.task.spec.kinds)]
+        shown = [n for n in METRICS if n in (*TABLE_METRICS, *ripple, *self.task.spec.metric_names)]
         claimed = claimed.loc[shown]
         try:
             evaluations, contacts = self._evaluate(parameters)

@@ -12,7 +12,7 @@ import numpy as np
 
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
-from pneuopt.evaluation.band import band_share
+from pneuopt.evaluation.band import SettlingBand, band_share
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
 from pneuopt.evaluation.requirements import (
@@ -24,9 +24,8 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
-from pneuopt.tuning.passage import KEPT_STATES, Passage
-from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, loop_pieces
-from pneuopt.tuning.responses import is_sound
+from pneuopt.tuning.passage import KEPT_STATES, ResponsePoints
+from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, is_sound, loop_pieces
 from pneuopt.tuning.rows import Lanes, reading_times
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.sqp import LinearisedPoint, RowGroups
@@ -143,8 +142,9 @@ class LinearisedProblem:
             k = np.searchsorted(t, times)
             late = np.maximum(late, np.append(after, 0.0)[k])
             crossings = np.maximum(crossings, np.append(_band_entry_times(t, size, self._band), np.inf)[k])
-        excess = np.maximum(late - self._band, 0.0)
-        times = np.where(excess == 0, np.minimum(crossings, times), times)
+        inside = SettlingBand(0.0, self._band).contains(late)
+        excess = np.where(inside, 0.0, late - self._band)
+        times = np.where(inside, np.minimum(crossings, times), times)
         costs = np.where(
             times <= self.bounds[-1, 1] * self.horizon, weight * times + self._band_weight * excess, np.inf
         )
@@ -244,7 +244,7 @@ class LinearisedProblem:
             [self._periods[k] for k in case.tolist()],
             self._strides[g],
             self._spec.envelope,
-            self._simulator.meter_channels,
+            self._simulator.sampled.channels,
         )
         error, by_gain = (self._error_units[g] * a for a in lanes.record.error)
         rows_of: dict[type, tuple[Array, Array]] = {
@@ -263,11 +263,12 @@ class LinearisedProblem:
 
     def _points(self, grid: ReferenceGrid, p: Array, case: Indices, found: RolloutResult) -> tuple[Array, Array]:
         """The operating points of lanes on one grid, states and inputs."""
-        fastest = np.zeros(len(p), dtype=np.intp)
-        for period, rows in self._simulator.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
+        fastest, periods = np.zeros(len(p), dtype=np.intp), self._simulator.sampled.periods(p)
+        for period in np.unique(periods).tolist():
+            rows = periods == period
             fastest[rows] = self._simulator.fastest_samples(grid, found.y[rows], period)
         assert found.x is not None
-        passage = Passage(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
+        passage = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
         return self._simulator.operating_points(p, case, passage)
 
     def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:
@@ -343,7 +344,7 @@ def sensitivity_rollout(simulator: Simulator) -> Rollout:
     order, names = list(simulator.loop.parameters), simulator.space.names
     through_start = any(simulator.starts_vary(k) for k in range(len(simulator.cases)))
     return Rollout(
-        loop_pieces(simulator.loop, simulator.meter_channels),
+        loop_pieces(simulator.loop, simulator.sampled.channels),
         [order.index(n) for n in names],
         start=through_start,
     )
@@ -354,10 +355,10 @@ def _band_entry_times(t: Array, size: Array, band: float) -> Array:
 
     Where that segment does not enter the band it is the time at which the segment begins.
     """
-    before, after = size[:, :-1], size[:, 1:]
+    before, after, inside = size[:, :-1], size[:, 1:], SettlingBand(0.0, band).contains(size)
     with np.errstate(all="ignore"):
-        share = np.where((before > band) & (after <= band), (before - band) / (before - after), 0.0)
-    entered = np.where(before > band, t[:-1] + share * np.diff(t), t[:-1])
+        share = np.where(~inside[:, :-1] & inside[:, 1:], (before - band) / (before - after), 0.0)
+    entered = np.where(inside[:, :-1], t[:-1], t[:-1] + share * np.diff(t))
     return np.asarray(np.append(t[0], entered.max(axis=0)))
 
 

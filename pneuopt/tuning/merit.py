@@ -45,8 +45,8 @@ def compute_merits(values: Mapping[str, Array], spec: Specification, scale: floa
     settles, late = np.isfinite(values["SettlingTime"]), penalty_settling_time(scale, filled["Excess"])
     filled["SettlingTime"] = np.where(settles, filled["SettlingTime"], late)
     missed = np.where(settles, 0.0, late / scale) if spec.weight(SettlingTime) else np.zeros_like(late)
-    for q in spec.limits:
-        missed += VIOLATION_PENALTY * np.maximum(0.0, filled[metric_name(q)] / upper_limit(q) - 1)
+    for share in spec.excess(filled).values():
+        missed += VIOLATION_PENALTY * np.maximum(0.0, share)
     total = np.zeros_like(late)
     for q, weight in spec.weights.items():
         total += weight * filled[metric_name(q)]

@@ -1,4 +1,4 @@
-"""`Passage`: where simulated lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
+"""`ResponsePoints`: where lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
 
 The points are those of `operating_points` in evaluation/operating_points.py. A search keeps few states
 along a response: the fastest sample is read off the outputs, and the states there come from a second run, from the last
@@ -29,7 +29,7 @@ from pneuopt.tuning.space import rk4_substeps
 KEPT_STATES = 64
 
 
-class Passage(NamedTuple):
+class ResponsePoints(NamedTuple):
     """Where m lanes begin, move fastest and end.
 
     Attributes
@@ -49,18 +49,18 @@ class Passage(NamedTuple):
     command: Array
 
     @staticmethod
-    def empty(m: int, n: int, n_states: int) -> "Passage":
+    def empty(m: int, n: int, n_states: int) -> "ResponsePoints":
         """Arrays for m lanes of n samples to be filled in."""
         states = np.zeros((m, -(-n // KEPT_STATES), n_states)), np.zeros((m, n_states))
-        return Passage(*states, np.zeros(m, dtype=np.intp), np.zeros(m))
+        return ResponsePoints(*states, np.zeros(m, dtype=np.intp), np.zeros(m))
 
-    def select(self, rows: Indices | Mask) -> "Passage":
+    def select(self, rows: Indices | Mask) -> "ResponsePoints":
         """The passage of some lanes."""
-        return Passage(self.states[rows], self.ends[rows], self.fastest[rows], self.command[rows])
+        return ResponsePoints(self.states[rows], self.ends[rows], self.fastest[rows], self.command[rows])
 
 
 def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices:
-    """Samples of the largest speed after the step, shape (m,), as `Passage` has them.
+    """Samples of the largest speed after the step, shape (m,), as `ResponsePoints` has them.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class PointFinder:
     rate: float
 
     def __call__(
-        self, grids: Sequence[tuple[ReferenceGrid, Indices]], p: Array, periods: Array, passage: Passage
+        self, grids: Sequence[tuple[ReferenceGrid, Indices]], p: Array, periods: Array, passage: ResponsePoints
     ) -> tuple[Array, Array]:
         """Find the points.
 
@@ -102,7 +102,7 @@ class PointFinder:
         p : ndarray, shape (m, n_parameters)
         periods : ndarray, shape (m,)
             Periods over which lanes are averaged [s]; 0: they are not.
-        passage : Passage
+        passage : ResponsePoints
 
         Returns
         -------
@@ -117,7 +117,7 @@ class PointFinder:
         return x, u
 
     def _points(
-        self, grid: ReferenceGrid, rows: Indices, p: Array, periods: Array, passage: Passage
+        self, grid: ReferenceGrid, rows: Indices, p: Array, periods: Array, passage: ResponsePoints
     ) -> tuple[Array, Array]:
         """Points of lanes on one grid, states and inputs, shapes (k, m, n)."""
         own, p = passage.select(rows), p[rows]
@@ -136,7 +136,7 @@ class PointFinder:
                 u[0, :, k] = 0.0  # the disturbance has not begun
         return along[:, :, :-1], u
 
-    def _at_start(self, grid: ReferenceGrid, p: Array, own: Passage) -> Array:
+    def _at_start(self, grid: ReferenceGrid, p: Array, own: ResponsePoints) -> Array:
         """The plant's state and the command before the step, shape (m, n_plant_states + 1), dither switched off."""
         order, quiet = list(self.loop.parameters), p.copy()
         quiet[:, [order.index(n) for n in (DITHER_AMPLITUDE, DITHER_OFFSET) if n in order]] = 0.0
@@ -146,7 +146,7 @@ class PointFinder:
         control = self.rollout.run(own.states[:, 0], u, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
         return np.column_stack([own.states[:, 0, : len(self.loop.plant.states)], control])
 
-    def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage, reach: Array) -> Array:
+    def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints, reach: Array) -> Array:
         """The plant's state and the command at the fastest sample, without ripple."""
         begin = np.maximum(own.fastest - np.round(periods / 2 / grid.spacing).astype(np.intp), 0)
         out, ends = self._run_up_to(grid, p, begin, own, periods > 0)
@@ -157,7 +157,7 @@ class PointFinder:
         return out
 
     def _run_up_to(
-        self, grid: ReferenceGrid, p: Array, last: Indices, own: Passage, goes_on: Mask
+        self, grid: ReferenceGrid, p: Array, last: Indices, own: ResponsePoints, goes_on: Mask
     ) -> tuple[Array, Array]:
         """The plant's state and the command at a sample of each lane, and the loop's state there.
 
@@ -177,7 +177,7 @@ class PointFinder:
         plant = run.x_end[:, : len(self.loop.plant.states)]
         return np.column_stack([plant, run.y[:, -1, CONTROL_OUTPUT]]), run.x_end
 
-    def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage) -> tuple[Array, Array]:
+    def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints) -> tuple[Array, Array]:
         """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.
 
         Under dither one more period is run after the end. Half the change from its start to its end is subtracted from

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pneuopt.dynamics.compiled.race import RACE_VALUES, RaceCourse, RaceField, RaceMerit, race
-from pneuopt.evaluation.band import Band, band_number, band_unit
+from pneuopt.evaluation.band import EDGE_ROUNDING, Band, band_number, band_unit
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     ROBUSTNESS_REQUIREMENTS,
@@ -23,8 +23,8 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.tuning.merit import VIOLATION_PENALTY, compute_merits
 from pneuopt.tuning.passage import KEPT_STATES
-from pneuopt.tuning.readings import WORST_MERIT
-from pneuopt.tuning.responses import RUNAWAY_LEVEL, Responses
+from pneuopt.tuning.readings import RUNAWAY_LEVEL, WORST_MERIT
+from pneuopt.tuning.responses import Responses
 from pneuopt.tuning.simulator import Simulator
 
 # Share of its weight that a case's victory keeps from race to race. Below, the order of the cases follows chance; near
@@ -116,7 +116,7 @@ class Race:
         if self._records.size < m * C * n * outputs:
             self._records = np.empty(m * C * n * outputs)
         y = self._records[: m * C * n * outputs].reshape(m, C, n, outputs)
-        field = RaceField(p, starts, simulator.lane_periods(p), self._order(first), rivals)
+        field = RaceField(p, starts, simulator.sampled.periods(p), self._order(first), rivals)
         merit = _merit_bounds(self._plain, simulator.bands(self._spec.band))
         outcome = race(simulator.rollout, self._course, merit, field, y)
         merits, worst, through = np.full(m, np.inf), outcome.loser.copy(), outcome.loser < 0
@@ -180,7 +180,7 @@ def may_be_cut(spec: Specification) -> bool:
 def _course(simulator: Simulator, band: Band) -> RaceCourse:
     """The cases of a simulator, as a race in machine code takes them."""
     grids = simulator.grids
-    n, grid = max(len(g.t) for g in grids), np.array([simulator.grid_of(k) for k in range(len(simulator.cases))])
+    n, grid = max(len(g.t) for g in grids), np.array([simulator.grid_index(k) for k in range(len(simulator.cases))])
     u, t, h = (np.array(arrays) for arrays in zip(*(g.pad(n) for g in grids), strict=True))
     settings = [
         (r.final, r.nominal_size, r.initial, g.spacing, g.t[g.step_index] - r.at, float(r.changes), band_unit(band, r))
@@ -195,6 +195,5 @@ def _course(simulator: Simulator, band: Band) -> RaceCourse:
 def _merit_bounds(spec: Specification, bands: Sequence[Band]) -> RaceMerit:
     kinds = [next(kind for kind in REQUIREMENT_KINDS if kind.metric.name == n) for n in RACE_VALUES]
     weights, limits = np.array([[spec.weight(kind), spec.limit(kind)] for kind in kinds]).T
-    return RaceMerit(
-        np.array([band_number(band) for band in bands]), weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL
-    )
+    edges = (1 + EDGE_ROUNDING) * np.array([band_number(band) for band in bands])
+    return RaceMerit(edges, weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL)

@@ -1,6 +1,6 @@
 """The outputs that a search runs, the grid on which it samples a reference, and the metrics that it reads there."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,20 +9,23 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
-from pneuopt.dynamics.compiled.rollout import Pieces
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, RolloutResult
 from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.dither_mean import DitherPeriodMean
-from pneuopt.evaluation.meter import meter_outputs
+from pneuopt.evaluation.meter import meter_outputs, needed_channels
 from pneuopt.evaluation.metrics import BandCentre, Envelope, batch_metrics
 from pneuopt.evaluation.motion_requirements import FOLLOWING_METRICS, PUSH
 from pneuopt.evaluation.response import MAX_READINGS_A_SAMPLE
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Mask
 
 # Indices of the outputs that are run: the measured signal, the command, then the meter's channels one after another.
 SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT = range(3)
 INTEGRAL_OUTPUT = -1  # index of the signal's integral, under dither the last output and the last state
+# Size of an output [its unit] from which a response counts as running away. A lower level may be reached by sound
+# signals in small units (pressures in Pa); beyond a higher one the metrics of a diverging response lose their digits.
+RUNAWAY_LEVEL = 1e12
 # The largest objective that a search tells apart, in place of infinity. Below what objectives reach (seconds, percent,
 # volts) good designs would tie; far above it the grading of broken limits, which is multiplied by it, loses digits.
 WORST_MERIT = 1e6
@@ -77,6 +80,74 @@ class ReferenceGrid:
     def at(self, t: Array) -> "ReferenceGrid":
         """The same inputs, held as before, at other instants between the first and the last."""
         return replace(self, t=t, u=self.u[np.searchsorted(self.t, t, side="right") - 1])
+
+
+class LoopLanes:
+    """The one simulator of a loop in SIMD lanes: searches, batches of plants and sensitivities run and read it.
+
+    `compile_pieces` makes the `Rollout` of `loop_pieces`, with the meter's `channels` that the metrics need.
+    """
+
+    def __init__(
+        self, loop: ClosedLoop, metrics: Collection[str], compile_pieces: Callable[[Pieces], Rollout] = Rollout
+    ) -> None:
+        self.loop, self.channels = loop, needed_channels(metrics)
+        self.rollout = compile_pieces(loop_pieces(loop, self.channels))
+        self._order = list(loop.parameters)
+
+    def with_integral(self, states: Array) -> Array:
+        """The loop's states, shape (m, n), with those that `loop_pieces` adds, zero before the step."""
+        return np.pad(states, ((0, 0), (0, int(has_integral(self.loop)))))
+
+    def run(
+        self, grid: ReferenceGrid, x0: Array, p: Array, substeps: int, states: int = 0
+    ) -> tuple[RolloutResult, Mask]:
+        """Run lanes of start states, shape (m, n_states), on one grid; and which of them do not run away."""
+        u, t, h = grid.pad(len(grid.t))
+        with np.errstate(all="ignore"):
+            found = self.rollout.run(x0, u, p, t, h, substeps=substeps, states=states)
+        return found, is_sound(found.y, found.x_end)
+
+    def states_along(self, grid: ReferenceGrid, x0: Array, p: Array, substeps: int) -> list[Array]:
+        """The loop's states along one response, its start first, as far as they are finite."""
+        found = self.run(grid, x0[None], p, substeps, max(1, len(grid.t) // 10))[0].x
+        assert found is not None
+        rows = np.vstack([x0, found[0]])[:, : len(self.loop.states)]
+        return list(rows[np.isfinite(rows).all(axis=1)])
+
+    def periods(self, p: Array) -> Array:
+        """The time over which each lane is averaged, shape (m,) [s]; 0: it is not."""
+        dither, found = self.loop.dither, np.zeros(len(p))
+        if dither is not None:
+            amplitude, frequency = (p[:, self._order.index(f"dither.{n}")] for n in ("amplitude", "frequency"))
+            for rate in np.unique(frequency[amplitude != 0]).tolist():
+                found[(amplitude != 0) & (frequency == rate)] = dither.period(rate, self.loop.pid.sample_time)
+        return found
+
+    def read(
+        self,
+        grid: ReferenceGrid,
+        y: Array,
+        p: Array,
+        sound: Mask,
+        bands: Sequence[Band],
+        only: Collection[str],
+        envelope: Envelope = (),
+    ) -> Iterator[tuple[float, Mask, dict[str, Array]]]:
+        """The metrics of the sound lanes, by their averaging time: that, a mask of its lanes, and `read_metrics`."""
+        planes = np.ascontiguousarray(np.moveaxis(y, 2, 0))  # reading is over time, several times faster so
+        periods = self.periods(p)
+        for period in np.unique(periods[sound]).tolist():
+            rows = sound & (periods == period)
+            seen = np.moveaxis(planes if rows.all() else planes[:, rows], 0, 2)
+            yield period, rows, read_metrics(grid, seen, bands, period or None, only, envelope, self.channels)
+
+
+def is_sound(y: Array, x_end: Array) -> Mask:
+    """Which lanes did not run away, shape (m,)."""
+    with np.errstate(all="ignore"):
+        tame = (y.max(axis=(1, 2)) < RUNAWAY_LEVEL) & (y.min(axis=(1, 2)) > -RUNAWAY_LEVEL)  # NaN is neither
+    return np.asarray(tame & np.isfinite(x_end).all(axis=1))
 
 
 def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:

@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 from pneuopt.control.reference import Reference
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metric import Requirement, Sense
-from pneuopt.evaluation.requirements import SettlingTime, metric_name, upper_limit, user_limit, with_user_limit
+from pneuopt.evaluation.requirements import SettlingTime, upper_limit, user_limit, with_user_limit
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
@@ -102,9 +102,8 @@ def limit_excess(values: Mapping[str, Array], spec: Specification) -> Array:
     worst = np.full_like(unsettled, -np.inf)
     if spec.concerns(SettlingTime):
         worst = np.where(np.isfinite(values["SettlingTime"]), worst, unsettled)
-    for q in spec.limits:
-        used = np.where(np.isfinite(values[metric_name(q)]), values[metric_name(q)] / upper_limit(q) - 1, unsettled)
-        worst = np.maximum(worst, used)
+    for share in spec.excess(values).values():
+        worst = np.maximum(worst, np.where(np.isfinite(share), share, unsettled))
     return worst
 
 

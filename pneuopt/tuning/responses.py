@@ -7,11 +7,7 @@ import numpy as np
 
 from pneuopt.evaluation.requirements import larger_is_better, requirement_values
 from pneuopt.quantities.arrays import Array, Indices, Mask
-from pneuopt.tuning.passage import Passage
-
-# Size of an output [its unit] from which a response counts as running away. A lower level may be reached by sound
-# signals in small units (pressures in Pa); beyond a higher one the metrics of a diverging response lose their digits.
-RUNAWAY_LEVEL = 1e12
+from pneuopt.tuning.passage import ResponsePoints
 
 
 class Responses:
@@ -81,17 +77,17 @@ class LaneMetrics:
         graded; infinite where the response runs away.
     sound : ndarray of bool, shape (m,)
         False where the response runs away.
-    passage : Passage
+    passage : ResponsePoints
     """
 
     metrics: dict[str, Array]
     sound: Mask
-    passage: Passage
+    passage: ResponsePoints
 
     @staticmethod
     def empty(m: int, n: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
         """Metrics of m lanes of n samples to be filled in; until then they read as running away."""
-        passage = Passage.empty(m, n, n_states)
+        passage = ResponsePoints.empty(m, n, n_states)
         return LaneMetrics({name: np.full(m, np.inf) for name in read}, np.zeros(m, dtype=bool), passage)
 
 
@@ -104,13 +100,6 @@ def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:
 def worst_values(found: Sequence[dict[str, float]]) -> dict[str, float]:
     """The largest of each value over the cases; NaN where one of them is NaN."""
     return {n: float(np.max([values[n] for values in found])) for n in found[0]}
-
-
-def is_sound(y: Array, x_end: Array) -> Mask:
-    """Which lanes did not run away, shape (m,)."""
-    with np.errstate(all="ignore"):
-        tame = (y.max(axis=(1, 2)) < RUNAWAY_LEVEL) & (y.min(axis=(1, 2)) > -RUNAWAY_LEVEL)  # NaN is neither
-    return np.asarray(tame & np.isfinite(x_end).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,4 +115,4 @@ class MarginReader:
     """
 
     names: tuple[str, ...]
-    read: Callable[[Array, Indices, Passage], Mapping[str, Array]]
+    read: Callable[[Array, Indices, ResponsePoints], Mapping[str, Array]]

@@ -8,30 +8,21 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
-from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.batch_margins import MarginFunction, batch_margin_function
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.margins import lowest_noise_frequency
-from pneuopt.evaluation.meter import check_channels, needed_channels
+from pneuopt.evaluation.meter import check_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.grids import reference_grids, refine_grids
-from pneuopt.tuning.passage import KEPT_STATES, Passage, PointFinder, fastest_samples
-from pneuopt.tuning.readings import (
-    CONTROL_OUTPUT,
-    SIGNAL_OUTPUT,
-    ReferenceGrid,
-    has_integral,
-    loop_pieces,
-    read_metrics,
-    speed_output,
-)
-from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, is_sound, to_records
+from pneuopt.tuning.passage import KEPT_STATES, PointFinder, ResponsePoints, fastest_samples
+from pneuopt.tuning.readings import CONTROL_OUTPUT, SIGNAL_OUTPUT, LoopLanes, ReferenceGrid, is_sound, speed_output
+from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, to_records
 from pneuopt.tuning.rests import starts_before_step
 from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
@@ -75,10 +66,7 @@ class Simulator:
     cases : tuple of TuningCase
     response_metrics, margin_metrics : tuple of str
         The metrics read off the responses, and off the loop linearised at their operating points.
-    meter_channels : tuple of str
-        Channels of the plant's meter that are run for them.
-    rollout : Rollout
-        Its outputs are those of `loop_pieces`.
+    sampled : LoopLanes
     """
 
     def __init__(
@@ -89,7 +77,7 @@ class Simulator:
         scenarios: Scenarios = NO_SCENARIOS,
         spec: Specification | None = None,
     ) -> None:
-        linearised, kinds = [k.metric.name for k in ROBUSTNESS_REQUIREMENTS], spec.kinds if spec else ()
+        linearised, kinds = [k.metric.name for k in ROBUSTNESS_REQUIREMENTS], spec.metric_names if spec else ()
         self.response_metrics = tuple(dict.fromkeys((*BASE_METRICS, *(k for k in kinds if k not in linearised))))
         self.margin_metrics = tuple(dict.fromkeys((*BASE_MARGINS, *(k for k in kinds if k in linearised))))
         self._envelope = spec.envelope if spec else ()
@@ -99,10 +87,10 @@ class Simulator:
         self.loop, self.space = loop, space
         self._rest = starts_before_step(self.cases, loop, space)
         check_channels(loop.plant, self.response_metrics)
-        self.meter_channels = needed_channels(self.response_metrics)
-        self.rollout = Rollout(loop_pieces(loop, self.meter_channels))
+        self.sampled = LoopLanes(loop, self.response_metrics)
+        self.rollout = self.sampled.rollout
         self.grids = reference_grids(loop, references, space.parameters)
-        self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
+        self._grid_index = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
         self.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in self.grids]
         self.robustness = self._margin_function(references)  # about `operating_points`
@@ -117,7 +105,7 @@ class Simulator:
         part = copy.copy(self)
         part._wider = tuple(bands)
         part.response_metrics = tuple(
-            dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.kinds if n in self.response_metrics)))
+            dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.metric_names if n in self.response_metrics)))
         )
         if not self._is_refined:
             part.grids = reference_grids(
@@ -161,14 +149,12 @@ class Simulator:
     def _signal(self, point: Array, case: int, grid: ReferenceGrid) -> Array | None:
         """The measured signal of a case at the samples of a grid; None where it runs away."""
         p, start = self.lanes(point[None], np.zeros(1, dtype=np.intp), np.full(1, case))
-        u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-        with np.errstate(all="ignore"):
-            found = self.rollout.run(start, u, p, t, h, substeps=rk4_substeps(self._rate, grid.spacing))
-        return found.y[0, :, SIGNAL_OUTPUT] if is_sound(found.y, found.x_end)[0] else None
+        found, sound = self.sampled.run(grid, start, p, rk4_substeps(self._rate, grid.spacing))
+        return found.y[0, :, SIGNAL_OUTPUT] if sound[0] else None
 
     def cases_by_grid(self) -> list[Mask]:
         """Which cases run on each grid, that is on each reference: a mask of shape (n_cases,) a grid."""
-        return [self._grid_of == g for g in range(len(self.grids))]
+        return [self._grid_index == g for g in range(len(self.grids))]
 
     def dither_periods(self) -> list[float]:
         """The time over which each case is averaged [s]; 0 without dither, or where its amplitude is fixed at 0."""
@@ -181,31 +167,21 @@ class Simulator:
         return [dither.period(rate, self.loop.pid.sample_time) for rate in rates]
 
     def respond(self, points: Array, band: Band, lanes: Mask | None = None) -> Responses:
-        """Simulate candidates.
-
-        Parameters
-        ----------
-        points : ndarray, shape (m, n)
-        band : float or Tolerance
-        lanes : ndarray of bool, shape (m, n_cases), optional
-            Which cases of which candidate; by default all.
-        """
+        """Simulate candidates, shape (m, n), on all cases, or on those that `lanes`, shape (m, n_cases), says."""
         wanted = np.ones((len(points), len(self.cases)), dtype=bool) if lanes is None else lanes
         rows, case = np.nonzero(wanted)
         p, starts = self.lanes(points, rows, case)
-        measured = LaneMetrics.empty(len(rows), self._longest, starts.shape[1], self.response_metrics)
+        measured = LaneMetrics.empty(
+            len(rows), max(len(grid.t) for grid in self.grids), starts.shape[1], self.response_metrics
+        )
         for chunk in self._chunks(case):
             self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
         return Responses(wanted, p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
     def values(self, points: Array, spec: Specification) -> dict[str, Array]:
-        """The values of the requirements for each candidate, the worst over the cases, shape (m,) each.
+        """The values of the requirements for each candidate, shape (m, n), the worst over the cases, shape (m,) each.
 
-        Parameters
-        ----------
-        points : ndarray, shape (m, n)
-        spec : Specification
-            It gives the band, and says whether margins are needed.
+        The specification gives the band, and says whether margins are needed.
         """
         responses = self.respond(points, spec.band)
         every = np.ones(len(points), dtype=bool)
@@ -217,23 +193,20 @@ class Simulator:
         margins = {n: table[0] for n, table in responses.margin_metrics(np.ones(1, dtype=bool)).items()}
         return to_records({n: responses.table(n)[0] for n in self.response_metrics} | margins)
 
-    def _read_margins(self, p: Array, case: Indices, passage: Passage) -> dict[str, Array]:
+    def _read_margins(self, p: Array, case: Indices, passage: ResponsePoints) -> dict[str, Array]:
         """Margins and peaks of loops, the worst over their lanes' operating points."""
         return self.robustness(p, *self.operating_points(p, case, passage), self.margin_metrics)
 
-    def operating_points(self, p: Array, case: Indices, passage: Passage) -> tuple[Array, Array]:
+    def operating_points(self, p: Array, case: Indices, passage: ResponsePoints) -> tuple[Array, Array]:
         """The plant's states and inputs at the lanes' operating points; see `PointFinder`."""
-        lanes = [(self.grids[g], np.flatnonzero(self._grid_of[case] == g)) for g in np.unique(self._grid_of[case])]
-        return self._find_points(lanes, p, self.lane_periods(p), passage)
+        own = self._grid_index[case]
+        lanes = [(self.grids[g], np.flatnonzero(own == g)) for g in np.unique(own)]
+        return self._find_points(lanes, p, self.sampled.periods(p), passage)
 
     def lanes(self, points: Array, rows: Indices, case: Indices) -> tuple[Array, Array]:
         """Parameters, shape (m, n_parameters), and start states, shape (m, n_states), of lanes.
 
-        Parameters
-        ----------
-        points : ndarray, shape (n_points, n)
-        rows, case : ndarray of int, shape (m,)
-            Each lane's candidate, a row of `points`, and its case.
+        Each lane has its candidate, a row of `points`, and its case; shape (m,).
         """
         base, order = self.space.vectors(points)[rows], list(self.space.parameters)
         p, starts = np.empty_like(base), np.empty((len(rows), self.rollout.n_states))
@@ -250,45 +223,26 @@ class Simulator:
             found = np.tile(rest, (len(points), 1))
         else:
             found = np.array([self.cases[case].initial(self.loop, self.space.parameters_at(point)) for point in points])
-        return np.column_stack([found, np.zeros((len(found), int(has_integral(self.loop))))])
+        return self.sampled.with_integral(found)
 
     def starts_vary(self, case: int) -> bool:
         """Whether the state before the step depends on the gains in a case."""
         return self._rest[case] is None
 
-    def lane_periods(self, p: Array) -> Array:
-        """The time over which each lane is averaged, shape (m,) [s]; 0: it is not."""
-        periods = np.zeros(len(p))
-        for period, rows in self.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
-            periods[rows] = period or 0.0
-        return periods
-
-    def grid_of(self, case: int) -> int:
+    def grid_index(self, case: int) -> int:
         """The number of the grid on which a case runs."""
-        return int(self._grid_of[case])
-
-    def lanes_by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
-        """Each averaging time [s], None without dither, and a mask of the sound lanes that it is for."""
-        rates = self._dither_rates(p)
-        for rate in np.unique(rates[sound]).tolist():
-            period = self.loop.dither.period(rate, self.loop.pid.sample_time) if rate and self.loop.dither else None
-            yield period, sound & (rates == rate)
+        return int(self._grid_index[case])
 
     def pad(self, case: Indices) -> tuple[Array, Array, Array, int]:
         """Inputs, instants and steps of lanes, padded to one length, and their RK4 steps a sample.
 
-        Their shapes are (m, n, n_inputs), (m, n) and (m, n).
+        Their shapes are (m, n, n_inputs), (m, n) and (m, n); (n, n_inputs), (n,) and (n,) where all are on one grid.
         """
-        own = self._grid_of[case]
-        n = max(len(self.grids[g].t) for g in np.unique(own))
-        full = {g: self.grids[g].pad(n) for g in np.unique(own).tolist()}
-        u, t, h = (np.array([full[g][k] for g in own.tolist()]) for k in range(3))
-        return u, t, h, max(self.substeps[g] for g in np.unique(own))
-
-    @property
-    def _longest(self) -> int:
-        """The samples of the longest reference."""
-        return max(len(grid.t) for grid in self.grids)
+        used, place = np.unique(self._grid_index[case], return_inverse=True)
+        n = max(len(self.grids[g].t) for g in used)
+        padded = zip(*(self.grids[g].pad(n) for g in used), strict=True)
+        u, t, h = (np.array(arrays)[place] if len(used) > 1 else arrays[0] for arrays in padded)
+        return u, t, h, max(self.substeps[g] for g in used)
 
     def _chunks(self, case: Indices) -> Iterator[Indices]:
         """Indices of lanes that run together: all at once if they are few, otherwise those on the same grid."""
@@ -296,7 +250,7 @@ class Simulator:
             yield np.arange(len(case))
             return
         for g in range(len(self.grids)):
-            own = np.flatnonzero(self._grid_of[case] == g)
+            own = np.flatnonzero(self._grid_index[case] == g)
             yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
 
     def _measure(self, out: LaneMetrics, chunk: Indices, case: Indices, starts: Array, p: Array, band: Band) -> None:
@@ -310,19 +264,13 @@ class Simulator:
         self._read(out, chunk, case, p, (found.x, found.y, found.x_end), band)
 
     def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: Band) -> Responses:
-        """The responses of candidates on every case, of which the outputs and end states are known.
+        """The responses of candidates on every case that ran elsewhere; `shape` is (m, n_cases).
 
-        Parameters
-        ----------
-        p : ndarray, shape (m n_cases, n_parameters)
-        case : ndarray of int, shape (m n_cases,)
-        run : tuple of ndarray, shapes (m n_cases, k, n_states), (m n_cases, n, n_outputs) and (m n_cases, n_states)
-            States at every `KEPT_STATES`-th sample, outputs and end states.
-        shape : tuple of int
-            m and n_cases.
-        band : float or Tolerance
+        Parameters and cases of the lanes have the shapes (m n_cases, n_parameters) and (m n_cases,).
         """
-        measured = LaneMetrics.empty(len(p), self._longest, run[0].shape[2], self.response_metrics)
+        measured = LaneMetrics.empty(
+            len(p), max(len(grid.t) for grid in self.grids), run[0].shape[2], self.response_metrics
+        )
         for chunk in self._chunks(case):
             self._read(measured, chunk, case[chunk], p[chunk], (run[0][chunk], run[1][chunk], run[2][chunk]), band)
         return Responses(np.ones(shape, dtype=bool), p, measured, MarginReader(self.margin_metrics, self._read_margins))
@@ -331,30 +279,21 @@ class Simulator:
         """Fill the rows `chunk` of `out` from states, outputs and end states."""
         states, outputs, ends = run
         out.passage.states[chunk, : states.shape[1]], out.passage.ends[chunk] = states, ends
-        planes = np.ascontiguousarray(np.moveaxis(outputs, 2, 0))  # reading is over time, several times faster so
-        for g in np.unique(self._grid_of[case]).tolist():
-            own, grid = self._grid_of[case] == g, self.grids[g]
-            y = np.moveaxis(planes[:, own, : len(grid.t)], 0, 2)
+        for g in np.unique(self._grid_index[case]).tolist():
+            own, grid, asked = self._grid_index[case] == g, self.grids[g], self.response_metrics
+            y = outputs[own, : len(grid.t)]
             sound = is_sound(y, ends[own])
             out.sound[chunk[own]], out.passage.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
-            for period, rows in self.lanes_by_dither_period(p[own], sound):
-                metrics = read_metrics(
-                    grid,
-                    _select_rows(y, rows),
-                    self.bands(band),
-                    period,
-                    self.response_metrics,
-                    self._envelope,
-                    self.meter_channels,
-                )
+            found = self.sampled.read(grid, y, p[own], sound, self.bands(band), asked, self._envelope)
+            for period, rows, metrics in found:
                 for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value
                 out.passage.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
 
-    def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float | None) -> Indices:
-        """Samples of the largest speed, as `Passage` has them; zeros for a plant without an axis."""
-        k = speed_output(self.loop, self.meter_channels)
-        return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period or 0.0)
+    def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float) -> Indices:
+        """Samples of the largest speed, as `ResponsePoints` has them; zeros for a plant without an axis."""
+        k = speed_output(self.loop, self.sampled.channels)
+        return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period)
 
     def _margin_function(self, references: Sequence[Reference]) -> MarginFunction:
         """Margins of many loops, read from the frequency on at which a slow integral swings against a resting drive."""
@@ -364,37 +303,18 @@ class Simulator:
         slow, fast = np.geomspace(3e-5 * slowest, 0.97 * lowest, 60), np.geomspace(lowest, fastest, 150)
         return batch_margin_function(self.loop, np.concatenate([slow, fast]), lowest)
 
-    def _dither_rates(self, p: Array) -> Array:
-        if self.loop.dither is None:
-            return np.zeros(len(p))
-        order = list(self.loop.parameters)
-        amplitude, frequency = (p[:, order.index(f"dither.{n}")] for n in ("amplitude", "frequency"))
-        return np.where(amplitude == 0, 0.0, frequency)
-
     def _fastest_eigenvalue(self, references: Sequence[Reference]) -> float:
         """The rate of the fastest mode over the gains' box and all plants [1/s].
 
         On the scenarios' plants only the corners that are fastest on the nominal one are examined.
         """
-        states = [x for k in range(len(references)) for x in self._sample_states(k)]
+        given = self.space.start[None]
+        p, starts = self.space.vectors(given)[0], [self.starts(k, given)[0] for k in range(len(references))]
+        along = [self.sampled.states_along(g, x, p, MAX_LOOP_SUBSTEPS) for g, x in zip(self.grids, starts, strict=True)]
+        states = [x for rows in along for x in rows]
         corners, order = self.space.vectors(self.space.corners()), list(self.space.parameters)
         rates = fastest_eigenvalue(self.loop, corners, states)
         worst = corners[np.argsort(rates)[-STIFFEST_CORNERS:]]
         others = [case.case_vectors(worst, order) for case in self.cases[len(references) :: len(references)]]
         fastest = fastest_eigenvalue(self.loop, np.vstack(others), states).max() if others else 0.0
         return float(max(rates.max(), fastest))
-
-    def _sample_states(self, k: int) -> list[Array]:
-        """States along the response of the given gains, from the start on."""
-        grid, given = self.grids[k], self.space.start[None]
-        start, p = self.starts(k, given), self.space.vectors(given)
-        u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-        found = self.rollout.run(start, u, p, t, h, substeps=MAX_LOOP_SUBSTEPS, states=True).x
-        assert found is not None
-        along = np.vstack([start, found[0][:: max(1, len(grid.t) // 10)]])[:, : len(self.loop.states)]
-        return list(along[np.isfinite(along).all(axis=1)])
-
-
-def _select_rows(y: Array, rows: Mask) -> Array:
-    """Select rows of responses without changing the memory order, in which time is contiguous."""
-    return y if rows.all() else np.moveaxis(np.moveaxis(y, 2, 0)[:, rows], 0, 2)

@@ -192,7 +192,7 @@ def has_few_steps(loop: ClosedLoop, references: Sequence[Reference], space: Spac
 
 def _inexact_requirements(spec: Specification) -> list[str]:
     """The names of requirements for which the two-phase problem has no equation."""
-    return [n for n in spec.kinds if not METRICS[n].exact]
+    return [n for n in spec.metric_names if not METRICS[n].exact]
 
 
 def _solve_stable(task: TuningTask, tightened: TuningTask, method: TwoPhase, progress: ProgressCallback) -> Optima:

@@ -15,7 +15,7 @@ from pneuopt.evaluation.certificate import Defect, certificate
 from pneuopt.evaluation.evaluate import metric_cell, metric_units
 from pneuopt.evaluation.expected_plants import ExpectedPlants, PlantAxis
 from pneuopt.evaluation.metric import Requirement
-from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, user_limit
+from pneuopt.evaluation.requirements import METRICS, metric_name, requirement_values, user_limit
 from pneuopt.evaluation.scenarios import Scenarios, apply_scenario
 from pneuopt.evaluation.specification import Objective, Specification, specify
 from pneuopt.quantities.arguments import check_parameters
@@ -168,7 +168,7 @@ def validate_design(
     values = _worst_by_plant(by_case, [n for n in expected.scenarios if n not in restless], steps)
     by_plant = {str(n): {str(m): float(v) for m, v in row.items()} for n, row in values.to_dict().items()}
     breaks = {n: find_breaks(row, spec, accept) for n, row in by_plant.items()} | dict.fromkeys(restless, (NO_REST,))
-    shown = [name for name in METRICS if name in spec.kinds]
+    shown = [name for name in METRICS if name in spec.metric_names]
     worst = {n: _worst_case(by_case, values, n, steps) for n in shown}
     certified, findings = _certify(loop, full, spec, expected.scenarios, steps, list(dict.fromkeys(worst.values())))
     for plant, words in findings:
@@ -243,7 +243,7 @@ def _simulate_plants(
         simulator = Simulator(loop, steps, space, left, spec)
     rows = simulator.table(np.zeros(0), spec)
     found = pd.DataFrame({case.label: row for case, row in zip(simulator.cases, rows, strict=True)})
-    return found.loc[[n for n in METRICS if n in (*spec.kinds, *LANE_DEFECTS)]], restless
+    return found.loc[[n for n in METRICS if n in (*spec.metric_names, *LANE_DEFECTS)]], restless
 
 
 def _rests(
@@ -294,18 +294,13 @@ def _worst_by_plant(by_case: "pd.DataFrame", plants: Sequence[str], steps: Seque
     columns = {str(label): number for number, label in enumerate(by_case)}
     own = np.array([[columns[TuningCase(step, plant).label] for step in steps] for plant in plants])
     table = by_case.to_numpy(dtype=float)[:, own]
-    worst = [[_worst_value(row, str(n)) for row in rows] for n, rows in zip(by_case.index, table, strict=True)]
+    worst = [[row[_rank_order(row, str(n))[-1]] for row in rows] for n, rows in zip(by_case.index, table, strict=True)]
     return pd.DataFrame(worst, index=by_case.index, columns=list(plants))
-
-
-def _worst_value(values: Array, metric: str) -> float:
-    """The worst value of a metric."""
-    return float(values[_rank_order(values, metric)[-1]])
 
 
 def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
     """Indices from the best to the worst value of a metric; NaN is the worst."""
-    cost = -values if larger_is_better(metric) else values
+    cost = METRICS[metric].requirement_value(values)
     return np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")
 
 
@@ -315,19 +310,21 @@ def _figures(
     """The table `DesignValidation.figures`."""
     import pandas as pd
 
-    limits = {metric_name(q): _metric_limit(q) for q in spec.limits}
+    limits = {metric_name(q): q.metric.factor * (user_limit(q) or math.nan) for q in spec.limits}
+    given_rows = {str(n): row.to_numpy(dtype=float) for n, row in values.iterrows()}
+    breaks = {metric_name(q): ~(share <= 0) for q, share in spec.excess(requirement_values(given_rows)).items()}
     rows = {}
     for metric, case in worst.items():
-        given, limit = values.loc[metric].to_numpy(dtype=float), limits.get(metric, math.nan)
+        given = given_rows[metric]
         order = _rank_order(given, metric)
         rows[metric] = {
             "median": _quantile(given, metric, 50.0),
             "p95": _quantile(given, metric, SUMMARY_PERCENTILE),
-            "worst": _worst_value(given, metric),
+            "worst": float(given[order[-1]]),
             "worst_plant": str(values.columns[order[-1]]),
             "certified": float(certified[case].to_dict()[metric]),
-            "limit": limit,
-            "violations": int(np.sum(~_keeps_limit(given, limit, metric))),
+            "limit": limits.get(metric, math.nan),
+            "violations": int(np.sum(breaks.get(metric, ~np.isfinite(given)))),
         }
     return pd.DataFrame.from_dict(rows, orient="index")
 
@@ -335,16 +332,3 @@ def _figures(
 def _quantile(values: Array, metric: str, percent: float) -> float:
     """The value of a metric that so many percent of the plants are as good as or better than."""
     return float(values[_rank_order(values, metric)[math.ceil(len(values) * percent / 100) - 1]])
-
-
-def _metric_limit(requirement: Requirement) -> float:
-    """The limit in the metric's unit, percent where it has percent; NaN without a limit."""
-    limit = user_limit(requirement)
-    return math.nan if limit is None else requirement.metric.factor * limit
-
-
-def _keeps_limit(values: Array, limit: float, metric: str) -> NDArray[np.bool_]:
-    """Which values keep a limit; without one, which are finite."""
-    if math.isnan(limit):
-        return np.isfinite(values)
-    return np.asarray(values >= limit if larger_is_better(metric) else values <= limit)

@@ -15,7 +15,7 @@ from pneuopt.dynamics.simulate import continue_simulation, simulate
 from pneuopt.dynamics.system import System, define
 from pneuopt.evaluation import continuation
 from pneuopt.evaluation.certificate import Certificate, Defect, certificate
-from pneuopt.evaluation.continuation import Course, continue_response
+from pneuopt.evaluation.continuation import ContinuedResponse, continue_response
 from pneuopt.evaluation.evaluate import evaluate_cases
 from pneuopt.evaluation.response import loop_inputs
 from pneuopt.models.drive import ForceDrive
@@ -170,7 +170,7 @@ def test_a_command_that_drifts_under_a_standing_signal_is_followed(rate: float, 
     """An integral that winds up behind static friction: over the 15 horizons to come it would change by 15 rates."""
     t = np.linspace(0.0, 1.0, 101)
     stuck = np.where(t < 0.2, t / 0.2, 1.0)
-    course = Course(first_order(5.0, 20.0)[0], Step(1.0, horizon=1.0), None, t, stuck, 1.0 - rate + rate * t)
+    course = ContinuedResponse(first_order(5.0, 20.0)[0], Step(1.0, horizon=1.0), None, t, stuck, 1.0 - rate + rate * t)
     assert course.stands(0.02)
     assert course.is_decided(0.02) is is_decided
 

@@ -9,7 +9,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import certificate
-from pneuopt.evaluation.continuation import Course
+from pneuopt.evaluation.continuation import ContinuedResponse
 from pneuopt.evaluation.dither_verdict import Usefulness, judge_dither
 from pneuopt.models.friction import Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive
@@ -31,7 +31,7 @@ def test_what_the_signal_does_shortly_before_a_contact_is_not_judged() -> None:
     loop = ClosedLoop(PneumaticDrive(friction=Viscous()).system(), PID())
     t = np.linspace(0.0, 10.0, 1001)
     signal = np.where(t < 9.5, 0.1, 0.6)
-    course = Course(loop, Step(0.1, horizon=1.0), None, t, signal, np.zeros_like(t), contact="the end stop")
+    course = ContinuedResponse(loop, Step(0.1, horizon=1.0), None, t, signal, np.zeros_like(t), contact="the end stop")
     assert course.signal[course.before_contact].max() == pytest.approx(0.1)
     assert np.abs(course.error).max() == pytest.approx(0.0, abs=1e-12)
     free = replace(course, contact="")

@@ -26,7 +26,7 @@ def test_a_term_with_a_limit_is_both() -> None:
     assert spec.weight(SettlingTime) == 1.0
     assert (spec.limit(SettlingTime), spec.limit(Overshoot), spec.limit(PeakControl)) == (0.4, 0.1, math.inf)
     assert not spec.concerns(PeakControl)
-    assert spec.kinds == ("SettlingTime", "Overshoot")
+    assert spec.metric_names == ("SettlingTime", "Overshoot")
 
 
 def test_the_tightest_limit_counts() -> None:

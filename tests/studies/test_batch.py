@@ -79,35 +79,35 @@ def test_a_killed_batch_goes_on_where_it_was_and_gives_the_same_table(
     loop = po.ClosedLoop(po.SecondOrder().system(), po.PID())
     rig = loop.parameters.with_values({"pid.Kp": 0.5, "pid.Ki": 2.0})
     plants, ran = po.samples(rig, {"plant.gain": 0.1}, 12), list[int]()
-    measure = fleet.Fleet.measure
+    measure = fleet.PlantBatch.measure
 
     def evaluate(journal: po.Journal | None) -> po.BatchEvaluation:
         one = ThreadPoolExecutor(1)
         step = po.Step(1.0, horizon=4.0)
         return po.evaluate_batch(loop, step, rig, plants, chunk=5, executor=one, journal=journal, recertify=0.3)
 
-    def measure_until_ctrl_c(self: fleet.Fleet, rows: Indices, columns: Mapping[str, Array]) -> None:
+    def measure_until_ctrl_c(self: fleet.PlantBatch, rows: Indices, columns: Mapping[str, Array]) -> None:
         if len(ran) == 5:
             raise KeyboardInterrupt
         ran.extend(rows.tolist())
         measure(self, rows, columns)
 
     whole = evaluate(None)
-    monkeypatch.setattr(fleet.Fleet, "measure", measure_until_ctrl_c)
+    monkeypatch.setattr(fleet.PlantBatch, "measure", measure_until_ctrl_c)
     journal = po.Journal(tmp_path / "journal", "batch")
     cut = evaluate(journal)
     journal.close(finished=False)
     assert (cut.table["error"] == "interrupted").sum() == 7
     assert cut.table[:5].equals(whole.table[:5])
     assert len(cut.checks) == 0
-    monkeypatch.setattr(fleet.Fleet, "measure", measure)
+    monkeypatch.setattr(fleet.PlantBatch, "measure", measure)
     journal = po.Journal(tmp_path / "journal", "batch", resume=True)
     assert set(journal.known) == set(list(plants)[:5])
     again = evaluate(journal)
     journal.close(finished=False)
     assert again.table.equals(whole.table)
     assert again.checks.equals(whole.checks)
-    monkeypatch.setattr(fleet.Fleet, "measure", None)  # nothing is left to run
+    monkeypatch.setattr(fleet.PlantBatch, "measure", None)  # nothing is left to run
     journal = po.Journal(tmp_path / "journal", "batch", resume=True)
     assert evaluate(journal).table.equals(whole.table)
     journal.close(finished=True)

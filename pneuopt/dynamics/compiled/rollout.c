@@ -92,7 +92,8 @@ static void step_through(Segment *s, int substeps, const volatile int *stop) {
   }
 }
 
-EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stride, Count every,
+EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stride, Count u_stride,
+                                  Count t_stride, Count every,
                                   const double *x0, const double *u, const double *p, const double *t, const double *h,
                                   const double *measured, const double *weight, double *y, double *dy, double *x,
                                   double *x_end, double *dx_end, double *gram, double *squares,
@@ -100,7 +101,7 @@ EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stri
   Segment s;
   for (Count i = first; i < last; i += LANES) {
     const int lanes = last - i < LANES ? (int)(last - i) : LANES;
-    Count row[LANES], sample[LANES], kept[LANES];
+    Count row[LANES], sample[LANES], held[LANES], at[LANES], kept[LANES];
     /* idle lanes repeat the last segment and write nothing */
     for (int lane = 0; lane < LANES; lane++) row[lane] = i + (lane < lanes ? lane : lanes - 1);
     gather(s.x, x0, row, NX);
@@ -109,7 +110,8 @@ EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stri
     start(&s);
     for (Count j = 0; j < n; j++) {
       for (int lane = 0; lane < LANES; lane++) sample[lane] = row[lane] * n + j;
-      gather(s.u, u, sample, NU), gather(s.t, t, sample, 1), gather(s.h, h, sample, 1);
+      for (int lane = 0; lane < LANES; lane++) held[lane] = row[lane] * u_stride + j, at[lane] = row[lane] * t_stride + j;
+      gather(s.u, u, held, NU), gather(s.t, t, at, 1), gather(s.h, h, at, 1);
       if (j % every == 0) {
         for (int lane = 0; lane < LANES; lane++) kept[lane] = row[lane] * ((n - 1) / every + 1) + j / every;
         scatter(s.x, x, kept, NX, lanes);

@@ -179,10 +179,10 @@ class Rollout:
         Parameters
         ----------
         x0 : array_like, shape (m, n_states)
-        u : array_like, shape (m, n, n_inputs)
+        u : array_like, shape (m, n, n_inputs), or (n, n_inputs) for all segments
             Held over each sample.
         p : array_like, shape (n_parameters,) or (m, n_parameters)
-        t, h : array_like, shape (m, n)
+        t, h : array_like, shape (m, n), or (n,) for all segments
             Instant of each sample and the step that follows it [s]; h = 0 pads a short segment.
         substeps : int
             Integration steps a sample.
@@ -217,6 +217,9 @@ class Rollout:
         """
         _check.get()()
         given = self._check_arrays(x0, u, p, t, h, substeps)
+        require(
+            given[1].ndim == 3 and given[3].ndim == 2, "gram: each segment has its own inputs and instants", ModelError
+        )
         y, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (measured, weight))
         shape = (*given[3].shape, self.n_outputs)
         for name, array in (("measured", y), ("weight", w)):
@@ -227,10 +230,10 @@ class Rollout:
         self, x0: ArrayLike, u: ArrayLike, p: ArrayLike, t: ArrayLike, h: ArrayLike, substeps: int
     ) -> tuple[Array, Array, Array, Array, Array]:
         t, h, x0, u, p = (np.ascontiguousarray(a, dtype=np.float64) for a in (t, h, x0, u, p))
-        wrong = f"t and h must have shape (m, n), got {t.shape}, {h.shape}"
-        require(t.ndim == 2 and h.shape == t.shape, wrong, ModelError)
-        m, n = t.shape
-        expected = {"x0": (m, self.n_states), "u": (m, n, self.n_inputs)}
+        wrong = f"t and h must have shape (m, n) or (n,), got {t.shape}, {h.shape}"
+        require(t.ndim in (1, 2) and h.shape == t.shape, wrong, ModelError)
+        m, n = len(x0) if t.ndim == 1 else len(t), t.shape[-1]
+        expected = {"x0": (m, self.n_states), "u": (n, self.n_inputs) if u.ndim == 2 else (m, n, self.n_inputs)}
         for name, array in (("x0", x0), ("u", u)):
             require(array.shape == expected[name], f"{name}: {array.shape}, expected {expected[name]}", ModelError)
         require(p.shape in ((self.n_parameters,), (m, self.n_parameters)), f"p has shape {p.shape}", ModelError)
@@ -239,9 +242,10 @@ class Rollout:
         return x0, u, p, t, h
 
     def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
+        m, n, ny, nx, ns = len(x0), t.shape[-1], self.n_outputs, self.n_states, self.n_columns
         if self._library is None:
+            u, t, h = np.broadcast_to(u, (m, n, self.n_inputs)), np.broadcast_to(t, (m, n)), np.broadcast_to(h, (m, n))
             return self._run_vm((x0, u, p, t, h), substeps, states)
-        (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         x = np.empty((m, -(-n // states), nx)) if states else None
@@ -285,16 +289,18 @@ class Rollout:
     ) -> None:
         """Run the machine code, the segments shared out to the threads."""
         assert self._library is not None
-        p, (m, n) = given[2], given[3].shape
+        (x0, u, p, t, _), n = given, given[3].shape[-1]
+        m = len(x0)
         function, stop = self._library.rollout, ctypes.c_int(0)
-        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int] + [ctypes.c_longlong] * 2 + [ctypes.c_void_p] * 16
+        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int] + [ctypes.c_longlong] * 4 + [ctypes.c_void_p] * 16
         function.restype = None
         arrays = (*given, *others)
         pointers = [a.ctypes.data if a is not None else None for a in arrays]
-        stride, at = p.shape[1] if p.ndim == 2 else 0, ctypes.addressof(stop)
+        strides = p.shape[1] if p.ndim == 2 else 0, n if u.ndim == 3 else 0, n if t.ndim == 2 else 0
+        at = ctypes.addressof(stop)
         steps = m * n * substeps
         parts = self._parts(m) if steps > UNSHARED_STEPS else [(0, m)]
-        calls = [(a, b, n, substeps, stride, states or 1, *pointers, at) for a, b in parts]
+        calls = [(a, b, n, substeps, *strides, states or 1, *pointers, at) for a, b in parts]
         self._share_out(function, calls, steps, stop, arrays)
 
     def race(self, course: Any, m: int, steps: int, arrays: Sequence[Any]) -> None:

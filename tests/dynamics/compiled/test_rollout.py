@@ -305,16 +305,17 @@ def test_threads_of_the_vm_change_nothing(name: str, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("cc", [None, ""])
-def test_one_parameter_vector_serves_all_segments(
+def test_one_vector_or_grid_serves_all_segments(
     cc: str | None, monkeypatch: pytest.MonkeyPatch, forget: Forget
 ) -> None:
     if cc is not None:
         monkeypatch.setenv("PNEUOPT_CC", cc)
     case = Case("stribeck")
     rollout = case.rollout((0,))
-    shared = case.run(rollout, p=case.p[0])
-    repeated = case.run(rollout, p=np.tile(case.p[0], (5, 1)))
-    assert_array_equal(shared.y, repeated.y)
+    for shared in ("p", "u", "th", "uth", "puth"):
+        one = {n: np.array(getattr(case, n)[0]) for n in shared}
+        each = {n: np.tile(a, (5, *[1] * a.ndim)) for n, a in one.items()}
+        assert_array_equal(case.run(rollout, **one).y, case.run(rollout, **each).y)
 
 
 def test_padding_freezes_the_state() -> None:
