@@ -2,9 +2,7 @@
 
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.status import Code
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
-from pneuopt.shooting.search_end import ABANDONED_START
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import ABANDONED_START, MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, Fit
 
 # excess of a parameter over another one that bounds it [1] below which another start is tried: lower takes a basin that
 # has lost it for the answer, higher searches drives twice that have as good as none

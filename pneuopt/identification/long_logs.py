@@ -22,10 +22,13 @@ from pneuopt.identification.multistart import (
 )
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.status import Code
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START, INTERRUPTED_SEARCH
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import (
+    ABANDONED_START,
+    INTERRUPTED_SEARCH,
+    MAX_CHI_SQUARE_RATIO,
+    Fit,
+    solve_least_squares,
+)
 
 # iterations with tight gaps that long logs get before a part of them is tried: more cost time, fewer leave easy logs
 SHORT_ITERATIONS = 10

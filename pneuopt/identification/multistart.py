@@ -23,9 +23,7 @@ from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.predicted_fit import fit_from_predictions
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import ABANDONED_START, JOINED_SEARCH, Fit, LeastSquares, solve_least_squares
 
 GUESS_STAGES = 3  # stages of a search with guesses held: more force a wrong guess on the log, fewer rank starts wrongly
 # squared residuals a sample after the first stage or before the last, in noise variances, beyond which the first start

@@ -15,12 +15,8 @@ from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.width_bias import fixed_widths
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.units import write_value
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.search import Search
-from pneuopt.shooting.search_end import ABANDONED_START
+from pneuopt.shooting.least_squares import ABANDONED_START, MAX_CHI_SQUARE_RATIO, Fit, Search, solve_least_squares
 from pneuopt.shooting.segments import segment
-from pneuopt.shooting.solution import Fit
 
 # share of the misfit [1] that a freed value must explain by the linearised equations to be tried: lower tries what does
 # not help, higher passes over what is far off

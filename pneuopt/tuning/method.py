@@ -11,7 +11,7 @@ from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import ProgressCallback, Status
-from pneuopt.shooting.solution import Solution
+from pneuopt.shooting.full_space import Solution
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 

@@ -19,9 +19,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.models.catalog import b32
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START, INTERRUPTED_SEARCH
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import ABANDONED_START, INTERRUPTED_SEARCH, Fit, LeastSquares, solve_least_squares
 from pneuopt.shooting.transcription import Transcription
 from problems.shared.b32 import GAINS, run_loop
 

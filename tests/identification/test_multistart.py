@@ -21,9 +21,7 @@ from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import ABANDONED_START, JOINED_SEARCH, Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.transcription import Transcription
 
 VELOCITY = "friction.stribeck_velocity"

@@ -23,12 +23,9 @@ from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.budget import CpuBudget
-from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.search_end import ABANDONED_START
+from pneuopt.shooting.equations import ParameterScaling
+from pneuopt.shooting.least_squares import ABANDONED_START, CpuBudget, Fit, LeastSquares
 from pneuopt.shooting.segments import segment
-from pneuopt.shooting.solution import Fit
 
 STATIC, VELOCITY = "friction.static", "friction.stribeck_velocity"
 TRUTH = {"friction.coulomb": 30.0, STATIC: 50.0, VELOCITY: 0.01, "friction.viscous": 60.0}

@@ -10,10 +10,8 @@ from pneuopt.identification import widths
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.widths import CHOSEN_WIDTH, MAX_TRIAL_SAMPLES, advise_widths, choose_widths, excerpts
-from pneuopt.shooting import integration_steps
-from pneuopt.shooting.budget import CpuBudget
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting import segments
+from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.transcription import Transcription
 
 FREE = ("friction.coulomb", "friction.static", "friction.viscous", "friction.stribeck_velocity")
@@ -133,7 +131,7 @@ def test_a_width_too_narrow_for_the_log_rate_is_widened_in_place_of_a_refusal(mo
     system, log = po.ForceDrive(po.Coulomb()).system(), sliding(1e-2, step=2e-3)
     light = system.parameters.with_values({"load.mass": 0.02}).freed("friction.coulomb")
     assert choose_widths(problem(system, log, light))[1][0].value == 1e-3
-    monkeypatch.setattr(integration_steps, "MIN_IMPLICIT_GAIN", np.inf)
+    monkeypatch.setattr(segments, "MIN_IMPLICIT_GAIN", np.inf)
     assert choose_widths(problem(system, log, light))[1][0].value > 1e-3
 
 

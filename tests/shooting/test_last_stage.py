@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from pneuopt.shooting import last_stage
-from pneuopt.shooting.least_squares import LeastSquares, Stage
-from pneuopt.shooting.levenberg_marquardt import Descent, Iterate
-from pneuopt.shooting.search import Search
+from pneuopt.shooting import least_squares as lifted
+from pneuopt.shooting.least_squares import Descent, Iterate, LeastSquares, Search, Stage
 from tests.shooting.first_order import first_order_log
 
 N = 30
@@ -37,7 +35,7 @@ def test_a_search_whose_cost_falls_steeply_goes_on_before_it_is_near_the_noise(
     search.current = replace(search.current, equations=replace(search.current.equations, cost=1e9))
     search.last_decrease = next(falls)
     monkeypatch.setattr(search, "run_stage", fall)
-    last_stage.repeat_last_stage(search)
+    lifted.repeat_last_stage(search)
     assert taken == [0.3] * repeats
 
 

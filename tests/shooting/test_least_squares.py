@@ -14,9 +14,8 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.full_space import solve_full_space
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.segments import IntegrationCorrection, Segments
-from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 H = 0.02

@@ -15,15 +15,21 @@ from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Status
-from pneuopt.shooting import last_stage
-from pneuopt.shooting.budget import BudgetSpentError, CpuBudget
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.equations import missed_curvature, normal_equations
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.levenberg_marquardt import Descent, Iterate, Objective
-from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.search import Search
-from pneuopt.shooting.search_end import end_search
+from pneuopt.shooting import least_squares as lifted
+from pneuopt.shooting.equations import ParameterScaling, missed_curvature, normal_equations
+from pneuopt.shooting.least_squares import (
+    MAX_CHI_SQUARE_RATIO,
+    BudgetSpentError,
+    CpuBudget,
+    Descent,
+    Iterate,
+    LeastSquares,
+    Objective,
+    Search,
+    Stage,
+    end_search,
+    solve_least_squares,
+)
 from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
@@ -146,12 +152,12 @@ def right_squares() -> Transcription:
     return replace(problem, residuals=(replace(problem.residuals[0], measured=measured, noise=np.array([NOISE, 0.5])),))
 
 
-@pytest.mark.parametrize("repeats", [0, last_stage.MAX_REPEATS])
+@pytest.mark.parametrize("repeats", [0, lifted.MAX_REPEATS])
 def test_a_search_that_explains_the_log_is_not_left_short_of_its_optimum(
     repeats: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A log of bristles at rest was, and other starts took 30 CPU s in place of 3 for no answer."""
-    monkeypatch.setattr(last_stage, "MAX_REPEATS", repeats)
+    monkeypatch.setattr(lifted, "MAX_REPEATS", repeats)
     fit = solve_least_squares(
         right_squares(), LeastSquares(stages=(Stage(1e-3, 1, refine=2),), substeps=1, tolerance=1e-4)
     )
@@ -166,15 +172,15 @@ def test_a_trapped_node_is_put_to_the_end_of_the_segment_before_it(helps: bool) 
     search.solve()
     nodes = np.ones((N // 2, 1)) + 0.01
     nodes[9 if helps else slice(0, 9)] += 0.5  # where all nodes before are wrong, this one would be, too
-    search.node_damping[9] = 2 * last_stage.TRAPPING_DAMPING
+    search.node_damping[9] = 2 * lifted.TRAPPING_DAMPING
     search.current = before = search.evaluate(nodes, 0.0 * search.current.z)
-    last_stage.free_nodes(search, np.array([9]))
+    lifted.free_nodes(search, np.array([9]))
     if helps:
         assert_allclose(search.current.nodes, np.ones((N // 2, 1)) + 0.01)
         assert not search.node_damping.any()
     else:
         assert search.current is before
-        assert search.node_damping[9] > last_stage.TRAPPING_DAMPING
+        assert search.node_damping[9] > lifted.TRAPPING_DAMPING
 
 
 def iterate(cost: float) -> Iterate:
@@ -294,7 +300,7 @@ def test_a_search_whose_estimates_move_no_more_has_settled(
     """
     search = near_optimum(deviations, monkeypatch, follows=follows)
     search.noisy_gaps = noisy
-    last_stage.repeat_last_stage(search)
+    lifted.repeat_last_stage(search)
     found = search.assess(search.current)
     assert found.status.converged == (asks is not None)
     assert (f"the estimates have settled; kinks of the model ask for {asks}" in found.status.message) == bool(asks)
@@ -306,14 +312,14 @@ def test_a_search_with_noise_of_the_states_is_repeated_and_frees_no_nodes(monkey
     search.method = replace(search.method, stages=(replace(search.stage, gap=2e-3), search.stage))
     monkeypatch.setattr(search, "_finish_stage", lambda _: True)
     monkeypatch.setattr(search, "_tighten", lambda: None)
-    monkeypatch.setattr(last_stage, "free_nodes", lambda *_: pytest.fail("a node is freed"))
-    repeat = last_stage.repeat_last_stage
+    monkeypatch.setattr(lifted, "free_nodes", lambda *_: pytest.fail("a node is freed"))
+    repeat = lifted.repeat_last_stage
 
     def trap(of: Search) -> Status:
         of.node_damping[3] = 1e6
         return repeat(of)
 
-    monkeypatch.setattr("pneuopt.shooting.search.repeat_last_stage", trap)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.repeat_last_stage", trap)
     found = search._loosen(search.method.stages[0], search.current.nodes, search.current.z)
     assert found.converged
     assert "the estimates have settled" in found.message
@@ -322,7 +328,7 @@ def test_a_search_with_noise_of_the_states_is_repeated_and_frees_no_nodes(monkey
 
 def test_what_kinks_ask_for_widens_the_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     search = near_optimum(0.4, monkeypatch, follows=0.0)
-    last_stage.repeat_last_stage(search)
+    lifted.repeat_last_stage(search)
     step, fit = (
         search.assess(search.current).largest_step,
         end_search(search, search.assess(search.current).status, 0.0),
@@ -336,8 +342,8 @@ def test_what_kinks_ask_for_widens_the_intervals(monkeypatch: pytest.MonkeyPatch
 
 def test_an_estimate_that_moves_has_not_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     search = near_optimum(3.0, monkeypatch, follows=0.3)
-    monkeypatch.setattr(last_stage, "MAX_REPEATS", 1)
-    last_stage.repeat_last_stage(search)
+    monkeypatch.setattr(lifted, "MAX_REPEATS", 1)
+    lifted.repeat_last_stage(search)
     assert search.tolerance == search.method.tolerance
     assert not search.assess(search.current).status.converged
 
@@ -346,7 +352,7 @@ def test_a_search_of_no_iterations_only_assesses_where_it_is(monkeypatch: pytest
     """A width was scored by a search that was to stay at the fit; ten iterations more, and none was rejected."""
     search = near_optimum(0.4, monkeypatch, follows=1.0)
     search.stage = replace(search.stage, iterations=0)
-    last_stage.repeat_last_stage(search)
+    lifted.repeat_last_stage(search)
     assert not search.assess(search.current).status.converged
     fit = solve_least_squares(right_squares(), LeastSquares(stages=(Stage(1e-3, 0, refine=2),), substeps=1))
     assert fit.stats["iterations"] == 0
@@ -362,8 +368,8 @@ def test_a_search_with_noise_of_the_states_that_moves_is_repeated_once(monkeypat
         return follow(steps)
 
     monkeypatch.setattr(search, "run_stage", count)
-    assert not last_stage.repeat_last_stage(search).converged
-    assert taken == [last_stage.REPEAT_ITERATIONS]
+    assert not lifted.repeat_last_stage(search).converged
+    assert taken == [lifted.REPEAT_ITERATIONS]
 
 
 @pytest.mark.parametrize("iterations", [4, 10, 30])
@@ -379,6 +385,6 @@ def test_a_last_stage_is_repeated_three_times_in_all(iterations: int, monkeypatc
 
     monkeypatch.setattr(search, "run_stage", count)
     monkeypatch.setattr(search, "is_noise", lambda _: True)
-    last_stage.repeat_last_stage(search)
-    assert sum(taken) == last_stage.MAX_REPEATS * iterations
-    assert max(taken) == min(iterations, last_stage.REPEAT_ITERATIONS)
+    lifted.repeat_last_stage(search)
+    assert sum(taken) == lifted.MAX_REPEATS * iterations
+    assert max(taken) == min(iterations, lifted.REPEAT_ITERATIONS)

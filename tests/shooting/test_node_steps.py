@@ -7,8 +7,7 @@ from numpy.testing import assert_allclose
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.shooting.least_squares import LeastSquares, Stage
-from pneuopt.shooting.search import Search
+from pneuopt.shooting.least_squares import LeastSquares, Search, Stage
 from pneuopt.shooting.segments import segment
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
@@ -55,7 +54,7 @@ def searched(method: LeastSquares) -> Search:
 def test_nodes_settle_after_a_step_that_opens_the_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
     method = LeastSquares(stages=(Stage(1e-5, 60),))
     settling = searched(method)
-    monkeypatch.setattr("pneuopt.shooting.levenberg_marquardt.MAX_NODE_STEPS", 0)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_NODE_STEPS", 0)
     creeping = searched(method)
     for search in (settling, creeping):
         found = search.scaling.values(search.current.z)

@@ -13,17 +13,23 @@ from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
-from pneuopt.shooting.budget import CpuBudget
-from pneuopt.shooting.equations import correct_residuals, normal_equations, weigh_gaps
-from pneuopt.shooting.integration_steps import refine_steps
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.levenberg_marquardt import Iterate
-from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.search import Search
-from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH, StageEnd, end_search
+from pneuopt.shooting.equations import ParameterScaling, correct_residuals, normal_equations, weigh_gaps
+from pneuopt.shooting.least_squares import (
+    ABANDONED_START,
+    FINE_TOLERANCE,
+    JOINED_SEARCH,
+    CpuBudget,
+    Fit,
+    Iterate,
+    LeastSquares,
+    Search,
+    Stage,
+    StageEnd,
+    end_search,
+    refine_steps,
+    solve_least_squares,
+)
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, segment, start_nodes
-from pneuopt.shooting.solution import Fit
-from pneuopt.shooting.stage_end import FINE_TOLERANCE
 from tests.shooting.test_least_squares import TRUTH, found, shaken, two_logs
 
 FIRST, *OTHERS = LeastSquares().stages
@@ -63,7 +69,7 @@ def test_a_first_stage_that_explains_the_logs_is_followed_by_the_last() -> None:
 def test_a_last_stage_that_does_not_soon_converge_is_left_for_the_stages_between(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("pneuopt.shooting.search.JUMP_ITERATIONS", 1)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.JUMP_ITERATIONS", 1)
     fit, stages = fit_by_stages(LeastSquares())
     assert stages.index("6/6") < stages.index("2/6")
     assert fit.status.converged
@@ -81,7 +87,7 @@ def test_a_budget_that_ends_in_refinement_leaves_coarse_runs_only(monkeypatch: p
         steps.clear()
         return refine_steps(search, status)
 
-    monkeypatch.setattr("pneuopt.shooting.search.refine_steps", spend)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.refine_steps", spend)
     search = Search(segment(two_logs()), LeastSquares(budget=budget))
     fit = search.solve()
     assert fit.status.code is Code.INTERRUPTED
@@ -129,7 +135,7 @@ def test_derivatives_are_computed_anew_only_where_finer_steps_change_much(
 ) -> None:
     search = Search(segment(two_logs()), LeastSquares())
     evaluate = Mock(wraps=search.evaluate)
-    monkeypatch.setattr("pneuopt.shooting.search.MAX_GRADIENT_ERROR", limit)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_GRADIENT_ERROR", limit)
     monkeypatch.setattr(search, "evaluate", evaluate)
     search._correct_residuals(4)
     assert evaluate.call_count == runs
@@ -140,7 +146,7 @@ def test_a_last_stage_that_stays_above_the_noise_is_not_integrated_by_finer_step
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A log with hysteresis in the valve lost two thirds of its search to that."""
-    monkeypatch.setattr("pneuopt.shooting.search.JUMP_ITERATIONS", 1)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.JUMP_ITERATIONS", 1)
     is_noise, jumps = Search.is_noise, list[bool]()
 
     def only_loose(search: Search, cost: float) -> bool:
@@ -169,7 +175,7 @@ def test_a_wrong_model_is_not_searched_with_tight_gaps(monkeypatch: pytest.Monke
     monkeypatch.setattr(Search, "_enter_stage", record)
     fit = solve_least_squares(problem, LeastSquares())
     assert min(entered) == fit.stats["gap_deviation"] > LeastSquares().stages[-1].gap
-    monkeypatch.setattr("pneuopt.shooting.search.MAX_JUMP_MISFIT", math.inf)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_JUMP_MISFIT", math.inf)
     whole = solve_least_squares(problem, LeastSquares())
     assert min(entered) == LeastSquares().stages[-1].gap
     assert fit.covariance is not None
@@ -201,7 +207,7 @@ def test_nothing_is_iterated_to_the_end_before_finer_steps_follow(monkeypatch: p
     """Where the model misses the log, the coarse steps of the last stage end as soon as the parameters do not move."""
     problem = shaken(2e-3)
     fit = solve_least_squares(problem)
-    monkeypatch.setattr("pneuopt.shooting.stage_end.COARSE_TOLERANCE", FINE_TOLERANCE)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.COARSE_TOLERANCE", FINE_TOLERANCE)
     fine = solve_least_squares(problem)
     assert fit.covariance is not None
     assert np.abs((found(fit) - found(fine)) / np.sqrt(np.diag(fit.covariance))).max() < 1e-2
@@ -287,7 +293,9 @@ def test_noise_of_the_states_that_has_not_settled_is_not_tried_again(monkeypatch
         tried.append(stage.gap)
         with monkeypatch.context() as patch:
             patch.setattr(Search, "_finish_stage", lambda *_: False)
-            patch.setattr("pneuopt.shooting.search.repeat_last_stage", lambda _: Status(Code.NOT_CONVERGED, ("no",)))
+            patch.setattr(
+                "pneuopt.shooting.least_squares.repeat_last_stage", lambda _: Status(Code.NOT_CONVERGED, ("no",))
+            )
             return loosen(search, stage, nodes, z)
 
     monkeypatch.setattr(Search, "_loosen", never)
