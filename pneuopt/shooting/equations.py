@@ -143,12 +143,12 @@ class NormalEquations:
         out[np.ix_(keep, keep)] = spread
         return np.asarray(out * np.outer(self.linearisation.chain, self.linearisation.chain))
 
-    def prior_covariance(self, keep: Mask, held: Mask, prior: Array) -> Array | None:
-        """Covariance (own units) that the kept parameters take over from a prior of the held ones.
+    def prior_covariance(self, keep: Mask, fixed: Mask, prior: Array) -> Array | None:
+        """Covariance (own units) that the kept parameters take over from a prior of the fixed ones.
 
         Parameters
         ----------
-        keep, held : ndarray of bool, shape (k,)
+        keep, fixed : ndarray of bool, shape (k,)
         prior : ndarray, shape (k,)
             Standard deviation, as searched; an infinite one counts as `FLAT_PRIOR_WIDTH`.
 
@@ -162,10 +162,10 @@ class NormalEquations:
             return None
         out = np.zeros((len(keep), len(keep)))
         left = np.maximum(np.diag(reduced.schur), SCHUR_ROUNDING * np.diag(self.arrow.corner))
-        alone = 1 / np.sqrt(np.maximum(left[held], 1e-300))
-        spread = np.where(np.isfinite(prior[held]), prior[held], FLAT_PRIOR_WIDTH * alone)
+        alone = 1 / np.sqrt(np.maximum(left[fixed], 1e-300))
+        spread = np.where(np.isfinite(prior[fixed]), prior[fixed], FLAT_PRIOR_WIDTH * alone)
         bread = positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])
-        moved = self.linearisation.chain[keep, None] * (bread @ reduced.schur[np.ix_(keep, held)]) * spread
+        moved = self.linearisation.chain[keep, None] * (bread @ reduced.schur[np.ix_(keep, fixed)]) * spread
         out[np.ix_(keep, keep)] = moved @ moved.T
         return out
 
@@ -399,7 +399,7 @@ class ParameterScaling:
     log : ndarray of bool, shape (k,)
     lower, upper : ndarray, shape (k,)
         As searched.
-    held : ndarray of bool, shape (k,)
+    fixed : ndarray of bool, shape (k,)
         Which parameters have equal bounds.
     start : ndarray, shape (k,)
         The given values, within the bounds.
@@ -413,7 +413,7 @@ class ParameterScaling:
         self.lower, self.upper = (
             self._to_search_units(np.array([getattr(p, b) for p in self._free])) for b in ("lower", "upper")
         )
-        self.held = np.array([p.lower == p.upper for p in self._free], dtype=bool)
+        self.fixed = np.array([p.lower == p.upper for p in self._free], dtype=bool)
         self.start = self.project_to_bounds(self._to_search_units(self._given[self._positions]))
 
     def project_to_bounds(self, z: Array) -> Array:
@@ -458,17 +458,17 @@ class ParameterScaling:
     @property
     def _prior_weight(self) -> Array:
         """One over the prior's variance, shape (k,); zero where it draws nothing."""
-        return np.where(self.log & ~self.held, START_PRIOR_DEVIATION**-2, 0.0)
+        return np.where(self.log & ~self.fixed, START_PRIOR_DEVIATION**-2, 0.0)
 
     def has_effect(self, equations: NormalEquations) -> Mask:
         """The mask of parameters that have an effect on the residuals here."""
         return np.asarray(np.diag(equations.arrow.corner) > np.where(self.log, MIN_LOG_INFORMATION, 0.0))
 
     def movable(self, z: Array, equations: NormalEquations, reduced: ReducedEquations) -> Mask:
-        """The mask of parameters with an effect on the residuals that are neither held nor pressed against a bound."""
+        """The mask of parameters with an effect on the residuals that are neither fixed nor pressed against a bound."""
         below, above = (z <= self.lower) & (reduced.gradient > 0), (z >= self.upper) & (reduced.gradient < 0)
-        # a held one may have no gradient that presses it
-        return np.asarray(self.has_effect(equations) & ~(below | above | self.held))
+        # a fixed one may have no gradient that presses it
+        return np.asarray(self.has_effect(equations) & ~(below | above | self.fixed))
 
     def _to_search_units(self, values: Array) -> Array:
         """Logarithms of log parameters; a bound that is not positive is minus infinity there."""

@@ -1,4 +1,4 @@
-"""Extended Kalman filters over the segments, and the scores of a fit: what segments say about parameters, by themselves.
+"""Extended Kalman filters over the segments, and what each segment of a fit says about the parameters.
 
 `filter_nodes`: the states at the nodes, the parameters known. States that are read off the measurements do not fit
 together where a drive sticks and slips, and a search over all nodes at once frees one such place after the other. The
@@ -330,8 +330,8 @@ class PredictionErrors:
         return z, costs
 
     def _step(self, z: Array, gradient: Array, curvature: Array, damping: float) -> Array:
-        """Where a damped step of the parameters that are not held leads, within the bounds."""
-        free = np.flatnonzero(~self.scaling.held & (np.diag(curvature) > 0))
+        """Where a damped step of the parameters that are not fixed leads, within the bounds."""
+        free = np.flatnonzero(~self.scaling.fixed & (np.diag(curvature) > 0))
         own = curvature[np.ix_(free, free)]
         step = np.zeros(len(z))
         step[free] = -np.linalg.lstsq(own + damping * np.diag(np.diag(own)), gradient[free], rcond=None)[0]

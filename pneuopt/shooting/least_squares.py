@@ -9,7 +9,9 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from enum import Enum
+from functools import wraps
+from typing import Concatenate, NamedTuple, ParamSpec
 
 import numpy as np
 
@@ -33,9 +35,13 @@ from pneuopt.shooting.equations import (
     weigh_gaps,
 )
 from pneuopt.shooting.segments import (
+    MAX_SEARCH_SUBSTEPS,
+    MAX_STAGE_REFINEMENT,
+    MIN_IMPLICIT_SUBSTEPS,
+    STIFFNESS_UPDATE_CHANGE,
     IntegrationCorrection,
-    IntegrationSteps,
     Segments,
+    choose_integration,
     fine_steps,
     gap_scales,
     segment,
@@ -118,6 +124,23 @@ class Optimum:
     substeps: int
 
 
+class SearchEnd(Enum):
+    """Why a search ended, with the status that says so where nothing else is known."""
+
+    OPTIMUM = Status(Code.CONVERGED)
+    UNSETTLED = Status(Code.NOT_CONVERGED)
+    ABANDONED = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
+    DUPLICATE = Status(Code.NOT_CONVERGED, ("a start has led to where another one was",))
+    TOO_STIFF = Status(Code.NOT_CONVERGED, ("the model is too stiff",))
+    DIVERGED = Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
+    INTERRUPTED = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
+
+    @property
+    def status(self) -> Status:
+        """The status of a search that ended so."""
+        return self.value
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The result of a least squares: states over time, parameters, and how well the data determine them.
@@ -129,6 +152,9 @@ class Fit:
     parameters : ParameterSet
         The problem's parameters with the free ones solved for.
     status : Status
+        As it is reported; a caller may say more of it.
+    end : SearchEnd
+        Why the search ended.
     stats : mapping of str to float
         Iterations, seconds, final cost, largest gap, ...
     covariance : ndarray, shape (k, k), or None
@@ -138,7 +164,7 @@ class Fit:
     count : int
         Number of data residuals.
     at_bound : ndarray of bool, shape (k,)
-        Which parameters are at a bound, without those held by equal bounds.
+        Which parameters are at a bound, without those fixed by equal bounds.
     jumps : ndarray, shape (m, n_states), or None
         The gap behind each linked segment, in nominal sizes, if the gaps stand for noise of the states.
     unidentifiable : tuple of str
@@ -146,8 +172,8 @@ class Fit:
     unsettled : tuple of str
         The parameter along which the search was still moving when it gave up; empty where it ended otherwise.
     prior_covariance : ndarray, shape (k, k), or None
-        The covariance due to a weak prior of held parameters (`NormalEquations.prior_covariance`); None where nothing
-        is held.
+        The covariance due to a weak prior of fixed parameters (`NormalEquations.prior_covariance`); None where nothing
+        is fixed.
     variance_inflation : float
         Factor on the estimates' variance by weighted squares (robust losses).
     optimum : Optimum or None
@@ -159,6 +185,7 @@ class Fit:
     trajectories: tuple[Trajectory, ...]
     parameters: ParameterSet
     status: Status
+    end: SearchEnd
     stats: Mapping[str, float]
     covariance: Array | None
     chi_square: float
@@ -240,7 +267,7 @@ class LeastSquares:
         Whether gaps may stand for noise of the states where the model misses the logs with tight ones.
     known_costs : tuple of (float, float)
         Gaps and costs at which a search from another start has ended its stages, none of which explained the logs to
-        their noise; a search that comes to the same ends there (`JOINED_SEARCH`).
+        their noise; a search that comes to the same ends there (`SearchEnd.DUPLICATE`).
     checks_steps : bool
         Whether finer integration steps are tried at the end: not where a refit keeps those of a fit that tried them.
     """
@@ -279,7 +306,9 @@ def solve_least_squares(transcription: Transcription, method: LeastSquares | Non
     Fit
         Whatever its status; an interruption (Ctrl-C) returns the best iterate so far, marked.
     """
-    return Search(segment(transcription), method or LeastSquares()).solve()
+    began, state = time.perf_counter(), start_search(segment(transcription), method or LeastSquares())
+    state = run_search(state)
+    return end_search(state, time.perf_counter() - began)
 
 
 # share of the cost [1] that the gaps may carry: above it they absorb the misfit of a model; lower refuses good fits
@@ -327,7 +356,7 @@ def assess_convergence(
     """
     names = np.array(equations.segments.transcription.parameters.free_names, dtype=object)
     no_sensitivity = np.diag(equations.arrow.corner) == 0  # even at a bound
-    idle = ~space.held & ~space.has_effect(equations) & (no_sensitivity | ~space.at_bound(z))
+    idle = ~space.fixed & ~space.has_effect(equations) & (no_sensitivity | ~space.at_bound(z))
     if idle.any():
         sentences = f"the data do not depend on {' and '.join(names[idle])}", "fix it, or log a run that does"
         return ConvergenceTest(Status(Code.NOT_CONVERGED, sentences), np.flatnonzero(idle))
@@ -353,7 +382,7 @@ def assess_convergence(
         remedy = "try more iterations, other start values, or fix a parameter"
         status = Status(Code.NOT_CONVERGED, (verdict, remedy))
         return ConvergenceTest(status, _least_certain(own, noise * spread, space, z), own[[worst]])
-    bounded = np.flatnonzero(space.at_bound(z) & ~space.held)
+    bounded = np.flatnonzero(space.at_bound(z) & ~space.fixed)
     return ConvergenceTest(
         _optimum_status(equations, message, noisy_gaps=noisy_gaps),
         _least_sensitive(bounded, space, reduced, noise, z),
@@ -415,7 +444,7 @@ MIN_GAIN_RATIO = 0.5
 MAX_NODE_STEPS = 3
 MAX_TRIES = 10  # dampings tried for a step: fewer give up where a step exists, more try what no longer moves anything
 # undamped steps over a kink: fewer turn back before the cost has fallen again, more follow steps that diverge
-MAX_LEAP_STEPS = 10
+MAX_UNDAMPED_STEPS = 10
 MAX_LOG_CHANGE = (
     2.0  # e-folds of a log parameter in a step: longer ones leave the model's range, shorter ones take more
 )
@@ -527,7 +556,7 @@ class Descent:
             self.damping, raise_by = max(self.damping, MIN_DAMPING) * raise_by, 3 * raise_by
         return None
 
-    def leap(self, current: Iterate) -> tuple[Iterate, int]:
+    def undamped_steps(self, current: Iterate) -> tuple[Iterate, int]:
         """Take undamped steps, which may raise the cost for a while: the best iterate among them, and their number.
 
         Over a kink of the model, at which a descent creeps, this is the way (the watchdog technique: Chamberlain et
@@ -535,7 +564,7 @@ class Descent:
         """
         trial: Iterate | None = current
         best, taken = current, 0
-        while trial is not None and math.isfinite(trial.cost) and taken < MAX_LEAP_STEPS:
+        while trial is not None and math.isfinite(trial.cost) and taken < MAX_UNDAMPED_STEPS:
             best, trial = min(best, trial, key=lambda each: each.cost), self._step_undamped(trial)
             taken += trial is not None
         return best if trial is None else min(best, trial, key=lambda each: each.cost), taken
@@ -593,140 +622,6 @@ def _misses_by_gaps(current: Iterate, trial: Iterate) -> bool:
     return math.isfinite(trial.cost) and trial.cost - current.cost > 2 * by_data
 
 
-FIRST_JOINING_STAGE = 2  # stage from which two searches may join: before it the gaps are so wide that all cost alike
-# difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
-# one
-JOINED_COST_TOLERANCE = 1e-3
-GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
-ABANDONED_START = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
-INTERRUPTED_SEARCH = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
-JOINED_SEARCH = Status(Code.NOT_CONVERGED, ("a start has led to where another one was",))
-
-
-class StageEnd(NamedTuple):
-    """Where a stage ended."""
-
-    nodes: Array
-    z: Array
-    cost: float
-
-
-class Snapshot(NamedTuple):
-    """Where a search is, and by which integration."""
-
-    stage: "Stage"
-    current: Iterate
-    correction: IntegrationCorrection | None
-    substeps: int
-    output_substeps: int
-
-
-def joins_known_search(search: "Search") -> bool:
-    """Whether a search has come to where a known one was after the same stage, and would go on as that one."""
-    known = [cost for gap, cost in search.method.known_costs if gap == search.stage.gap]
-    return any(abs(search.cost - cost) <= JOINED_COST_TOLERANCE * cost for cost in known)
-
-
-def end_search(search: "Search", status: Status, seconds: float) -> Fit:
-    """The fit where a search has ended.
-
-    Parameters
-    ----------
-    search : Search
-    status : Status
-    seconds : float
-        That it has taken.
-
-    Returns
-    -------
-    Fit
-    """
-    transcription, current, equations = search.segments.transcription, search.current, search.current.equations
-    q = search.scaling.values(current.z)
-    free = transcription.parameters.free_names
-    values = dict(zip(free, q[transcription.free].tolist(), strict=True))
-    run = _final_run(search, status)
-    at_bound, held = search.scaling.at_bound(current.z) & ~search.scaling.held, search.scaling.held
-    keep = search.scaling.has_effect(equations) & ~at_bound & ~held
-    covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
-    if math.isfinite(equations.cost):
-        covariance = equations.covariance(keep, noisy_gaps=search.noisy_gaps)
-        if covariance is not None and search.tolerance > search.method.tolerance:
-            covariance = covariance + unsettled_covariance(search)
-        prior = equations.prior_covariance(keep, held, search.scaling.weak_prior(current.z)) if held.any() else None
-        names = names if status in (ABANDONED_START, JOINED_SEARCH) else _doubtful_parameters(search)
-    if covariance is not None:
-        gaps = search.stage.gap * search.gap_scales
-        optimum = Optimum(equations, run, current.nodes, q, keep, gaps, search.substeps)
-    return Fit(
-        search.segments.trajectories(run),
-        transcription.parameters.with_values(values),
-        status,
-        _stats(search, status, run, seconds),
-        covariance,
-        equations.chi_square,
-        equations.count,
-        at_bound,
-        equations.gaps[search.segments.linked] if search.noisy_gaps else None,
-        *names,
-        prior,
-        optimum=optimum,
-        stage_costs=_stage_costs(search),
-    )
-
-
-def _final_run(search: "Search", status: Status) -> RolloutResult:
-    """The run of the last iterate by the finest steps, with states; those of an interrupted search are by its own."""
-    correction = search.correction
-    if correction is not None and math.isfinite(search.integration_change):  # of these very nodes
-        return correction.fine_run
-    if status.code is not Code.INTERRUPTED or not math.isfinite(search.current.cost):
-        return search.run(search.output_substeps)
-    run = search.run(search.substeps)
-    return run if correction is None else replace(run, y=run.y + correction.y, x_end=run.x_end + correction.x_end)
-
-
-def _stats(search: "Search", status: Status, run: RolloutResult, seconds: float) -> dict[str, float]:
-    return {
-        "iterations": float(search.iterations),
-        "seconds": seconds,
-        "cost": search.cost,
-        "substeps": float(search.output_substeps),
-        "largest_gap": search.current.equations.largest_gap,
-        "gap_share": search.current.equations.gap_share,
-        "gap_deviation": search.stage.gap,
-        "integration_error": _integration_error(search, status, run),
-    }
-
-
-def _stage_costs(search: "Search") -> tuple[tuple[float, float], ...]:
-    """The gap and the cost of stages at their ends, and those of the search's end."""
-    ended = [(stage.gap, end.cost) for stage, end in zip(search.method.stages, search.stage_ends, strict=False)]
-    return (*ended[FIRST_JOINING_STAGE:], (search.stage.gap, search.cost))
-
-
-def _doubtful_parameters(search: "Search") -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The parameters that the data do not determine, and the one that has not settled; none of a refused start."""
-    if search.steps.are_too_many:
-        return (), ()
-    free, found = search.segments.transcription.parameters.free_names, search.assess(search.current)
-    return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)
-
-
-def _integration_error(search: "Search", status: Status, run: RolloutResult) -> float:
-    """Largest change of an output when the steps are halved [noise standard deviations].
-
-    NaN without an optimum, and where the budget ends before it is measured: the answer is known by then.
-    """
-    if math.isfinite(search.integration_change) or not (status.converged and search.method.checks_steps):
-        return search.integration_change
-    try:
-        with check_during_runs(search.method.budget.check):
-            return search.largest_change(search.run(2 * search.output_substeps).y - run.y)
-    except BudgetSpentError:
-        return math.nan
-
-
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
 # error of the parameters [standard deviations] by derivatives from before the integration was refined: higher shifts
@@ -745,327 +640,6 @@ MAX_LOOSENED = 2
 # take long
 MAX_CREEPING_STEPS = 3
 
-
-class Search:
-    """The stages of a search for the nodes and the free parameters of the segments of one transcription.
-
-    Parameters
-    ----------
-    segments : Segments
-    method : LeastSquares
-    """
-
-    def __init__(self, segments: Segments, method: "LeastSquares") -> None:
-        self.method = method
-        self.scaling = ParameterScaling(segments.transcription)
-        nodes = start_nodes(segments)
-        self.steps = IntegrationSteps(segments, nodes, self.scaling.values(self.scaling.start), method.substeps)
-        self.segments = segments = self.steps.segments
-        self.gap_scales = gap_scales(segments, method.kinematic)
-        self.iterations, self.stage_began, self.noisy_gaps, self.has_stalled = 0, 0, False, False
-        self.last_decrease = 0.0  # of a stage's cost by its last iteration, over itself
-        self.tolerance = method.tolerance  # wider where kinks hold up a search that has settled
-        self.stage, self.stage_ends, self.unsettled_gaps = method.stages[0], list[StageEnd](), set[float]()
-        self.substeps = self.output_substeps = self.steps.start
-        self.correction: IntegrationCorrection | None = None
-        self.integration_change, self.is_coarse = math.nan, False
-        self.node_damping = np.zeros(segments.count)  # where the stage has ended, of each node alone
-        self.current = self.evaluate(nodes, self.scaling.start)
-
-    @property
-    def cost(self) -> float:
-        """Half of the squares of data and gaps, without the prior of a stage."""
-        return self.current.cost - self.stage.has_prior * self.scaling.start_prior_cost(self.current.z)
-
-    def solve(self) -> Fit:
-        """Run all stages; an interruption (Ctrl-C) ends them with the best iterate so far, marked."""
-        began = time.perf_counter()
-        try:
-            with check_during_runs(self.method.budget.check):
-                status = self._run_stages()
-        except KeyboardInterrupt:
-            status = INTERRUPTED_SEARCH
-        return end_search(self, status, time.perf_counter() - began)
-
-    def _run_stages(self) -> Status:
-        if self.steps.are_too_many:
-            verdict = f"the model is so stiff that a sample takes {self.steps.required} integration steps"
-            remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
-            return Status(Code.NOT_CONVERGED, (verdict, remedy))
-        last, allowed = self.method.stages[-1], None
-        for stage in self.method.stages:
-            if stage is last and self._gaps_absorb_misfit() and self.method.allows_state_noise:
-                allowed = self._allow_state_noise()
-                if allowed.converged:
-                    return refine_steps(self, allowed)
-            elif stage is last and self.stage_ends and self._is_hopeless():
-                return ABANDONED_START
-            self._enter_stage(stage, self.current.nodes, self.current.z)
-            if not math.isfinite(self.current.cost):
-                return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
-            self.has_stalled = self._finish_stage(stage.iterations)
-            self.stage_ends.append(StageEnd(self.current.nodes, self.current.z, self.cost))
-            if found := self._early_end(stage):
-                return refine_steps(self, found)
-        status = repeat_last_stage(self)
-        # gaps that absorb the misfit of the model: the answer depends on their weight
-        gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
-        return refine_steps(self, self._allow_state_noise(status) if gaps_absorb else status)
-
-    def _early_end(self, stage: "Stage") -> Status | None:
-        """The status of a search that ends with a stage before the last; None where it goes on."""
-        if joins_known_search(self):
-            return JOINED_SEARCH
-        if stage is not self.method.stages[0]:
-            return None
-        return ABANDONED_START if self._is_hopeless() else self._jump()
-
-    def _is_hopeless(self) -> bool:
-        """Whether this search is to be left for those from other starts."""
-        return 2 * self.current.cost > self.method.max_misfit * self.current.equations.count
-
-    def _jump(self) -> Status | None:
-        """The status of an optimum that is soon reached after a first stage that explains the log; or None."""
-        stays = len(self.method.stages) < 3 or bool(self.method.known_costs)
-        if stays or not self.is_noise(self.current.cost):
-            return None
-        if self.segments.implicit_state is not None:  # the errors of coarse steps add up where no gaps take them
-            self._correct_residuals(fine_steps(self.segments, self.substeps, self.method.stages[-1].refine))
-        count, (first, *between, last) = self.current.equations.count, self.method.stages
-        if not self._promised_squares(last) > MAX_JUMP_MISFIT * count:
-            return self._jump_to_last_stage()
-        if not self.method.allows_state_noise:
-            return None
-        near_noise = [s for s in between if self._promised_squares(s) <= MAX_CHI_SQUARE_RATIO * count]
-        found = self._loosen(near_noise[-1] if near_noise else first, self.current.nodes, self.current.z)
-        return found if found.converged else None
-
-    def _promised_squares(self, stage: "Stage") -> float:
-        """The squares, in noise variances, to which the gaps of a stage would lead by the linearised equations."""
-        equations = weigh_gaps(self.segments, self.current.equations.linearisation, stage.gap * self.gap_scales)
-        return equations.promised_squares(self.scaling.has_effect(equations) & ~self.scaling.held)
-
-    def _jump_to_last_stage(self) -> Status | None:
-        """The status of an optimum that the last stage soon reaches; or None."""
-        before = self.snapshot()
-        self._enter_stage(self.method.stages[-1], self.current.nodes, self.current.z)
-        if math.isfinite(self.current.cost):
-            self.run_stage(JUMP_ITERATIONS)
-            if self.is_noise(self.current.cost):  # finer steps are lost on what has not come near the noise by then
-                self._finish_stage(JUMP_ITERATIONS)
-                if (found := self._convergence_status(self.current)).converged and self.is_noise(self.current.cost):
-                    return found
-        self.restore(before)
-        return None
-
-    def _gaps_absorb_misfit(self) -> bool:
-        """Whether the gaps absorb the misfit of the model in a stalled search: tighter gaps cost more."""
-        absorbing = self.current.equations.gap_share > MAX_GAP_SHARE
-        return self.has_stalled and absorbing and not self.is_noise(self.current.cost)
-
-    def _allow_state_noise(self, status: Status = GAPS_ABSORB_MISFIT) -> Status:
-        """Let the gaps stand for noise of the states of a wrong model: the tightest with which all residuals agree."""
-        if not self.method.allows_state_noise:
-            return status
-        ended = zip(self.method.stages[:-1], self.stage_ends, strict=False)
-        explaining = [(stage, end) for stage, end in ended if self.is_noise(end.cost)]
-        for stage, end in reversed(explaining[-MAX_LOOSENED:]):
-            if stage.gap in self.unsettled_gaps:  # the same squares, from another start: it creeps again
-                continue
-            found = self._loosen(stage, end.nodes, end.z)
-            if found.converged:
-                return found
-        return status
-
-    def _loosen(self, stage: "Stage", nodes: Array, z: Array) -> Status:
-        """The status of the optimum with a stage's gaps as noise of the states, or with tight gaps where it leads.
-
-        Where there is none, nothing moves.
-        """
-        before, last, self.noisy_gaps = self.snapshot(), self.method.stages[-1], True
-        self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), nodes, z)
-        self._finish_stage(last.iterations)
-        found = repeat_last_stage(self)
-        if found.converged:
-            return self._tighten() or found
-        self.unsettled_gaps.add(stage.gap)
-        self.restore(before)
-        self.noisy_gaps = False
-        return found
-
-    def _tighten(self) -> Status | None:
-        """The status of an optimum with tight gaps, where one with noise of the states leads to it; or None.
-
-        The nodes of a first stage may lie across kinks, and its equations then foresee a misfit that a right model has
-        not; at an optimum that is nearer they are right.
-        """
-        before, last = self.snapshot(), self.method.stages[-1]
-        if self._promised_squares(last) > MAX_JUMP_MISFIT * self.current.equations.count:
-            return None
-        self.noisy_gaps = False
-        for stage in self.method.stages:
-            if stage.gap < before.stage.gap and self.is_noise(self.current.cost):
-                self._enter_stage(stage, self.current.nodes, self.current.z)
-                self._finish_stage(stage.iterations)
-        found = self._convergence_status(self.current)
-        if self.stage is last and found.converged and self.is_noise(self.current.cost):
-            return found
-        self.restore(before)
-        self.noisy_gaps = True
-        return None
-
-    def snapshot(self) -> Snapshot:
-        """Where the search is, to which `restore` returns."""
-        return Snapshot(self.stage, self.current, self.correction, self.substeps, self.output_substeps)
-
-    def restore(self, to: Snapshot) -> None:
-        """Return to where the search was."""
-        self.stage, self.current, self.correction, self.substeps, self.output_substeps = to
-        self.segments = self.current.equations.segments
-
-    def _enter_stage(self, stage: "Stage", nodes: Array, z: Array) -> None:
-        """Weigh the gaps as in a stage, with integration steps from the stiffness at these nodes."""
-        self.segments, steps = self.steps.renew(self.segments, nodes, self.scaling.values(z), self.substeps)
-        is_same = self.segments is self.current.equations.segments and nodes is self.current.nodes
-        is_known = is_same and steps == self.substeps and self.correction is None
-        self.stage, self.tolerance = stage, self.method.tolerance
-        self.substeps, self.output_substeps, self.correction = steps, steps, None
-        self.is_coarse, self.node_damping = stage.refine > 1, np.zeros(len(nodes))
-        if is_known:
-            equations = weigh_gaps(self.segments, self.current.equations.linearisation, stage.gap * self.gap_scales)
-            self.current = self._objective().with_prior(nodes, z, equations)
-        else:
-            self.current = self.evaluate(nodes, z)
-
-    def apply_finer_steps(self, steps: int) -> float:
-        """Integrate the current iterate by finer steps; return the largest change of y [standard deviations]."""
-        nodes, z, before = self.current.nodes, self.current.z, self._outputs()
-        self.is_coarse = False
-        if self._corrects_residuals:
-            self._correct_residuals(steps)
-        else:
-            self.substeps, self.output_substeps, self.correction = steps, steps, None
-            self.current = self.evaluate(nodes, z)
-        return self.largest_change(self._outputs() - before)
-
-    @property
-    def _corrects_residuals(self) -> bool:
-        """Whether finer steps are for the residuals alone: derivatives need them where these exceed the noise."""
-        return not self.noisy_gaps and self.is_noise(self.current.cost)
-
-    def _correct_residuals(self, steps: int) -> None:
-        """Add what finer steps change to the current residuals; derivatives are computed anew where that is much."""
-        current, before, fine, self.is_coarse = self.current, self._outputs(), self.run(steps), False
-        slopes = current.equations.linearisation
-        self.correction = IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
-        self.output_substeps, sigma = steps, self.stage.gap * self.gap_scales
-        if self.moves_no_estimate(fine.y - before):
-            equations = correct_residuals(current.equations, current.nodes, self.correction, sigma)
-            self.current = Iterate(current.nodes, current.z, equations)
-        else:
-            self.current = self.evaluate(current.nodes, current.z)
-
-    def moves_no_estimate(self, change: Array) -> bool:
-        """Whether a change of the outputs moves no estimate: none moves by more deviations than the norm of it."""
-        weighted = (change * self.segments.weights)[np.isfinite(self.segments.measured)]
-        return float(np.nansum(weighted**2)) <= MAX_GRADIENT_ERROR**2
-
-    def _outputs(self) -> Array:
-        """The model's outputs with the correction of finer steps, shape (m, n, n_outputs)."""
-        y = self.current.equations.linearisation.y
-        return y if self.correction is None else y + self.correction.y
-
-    def _finish_stage(self, iterations: int) -> bool:
-        """Run a stage, then again with the finer steps that it asks for; return as `run_stage` does.
-
-        Where an iterate explains the log to its noise, the finer steps correct its residuals within the stage.
-        """
-        has_ended = self.run_stage(iterations)
-        if self.stage.refine > 1 and self.correction is None and not self._is_hopeless():
-            before = self.snapshot()
-            self.apply_finer_steps(fine_steps(self.segments, self.substeps, self.stage.refine))
-            if math.isfinite(self.current.cost):
-                return self.run_stage(iterations)
-            self.restore(before)
-        return has_ended
-
-    def is_noise(self, cost: float) -> bool:
-        """Whether this cost is that of the noise alone."""
-        return 2 * cost <= MAX_CHI_SQUARE_RATIO * self.current.equations.count
-
-    def run_stage(self, iterations: int) -> bool:
-        """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
-        damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
-        descent = Descent(self._objective(), damping, self._is_negligible_step)
-        descent.node_damping = np.zeros(len(self.node_damping)) if self.noisy_gaps else self.node_damping
-        hopeless, self.stage_began, self.last_decrease = 0, self.iterations, 0.0
-        for _ in range(iterations):
-            if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
-                self._correct_residuals(fine_steps(self.segments, self.substeps, self.stage.refine))
-                descent.objective = self._objective()
-            descent.damps_nodes = self.noisy_gaps or is_near_end(self)
-            trial = descent.step(self.current)
-            self.node_damping = descent.node_damping
-            if trial is None:
-                return True
-            self.iterations += 1
-            before, self.current = self.current.cost, trial
-            self._report()
-            hopeless = hopeless + 1 if creeps(self, before, descent.promised) else 0
-            if hopeless == MAX_CREEPING_STEPS:
-                if not self._leap(descent):
-                    return True
-                hopeless = 0
-        self.last_decrease = 1 - self.current.cost / before
-        return self.last_decrease < STALL_COST_DECREASE
-
-    def _leap(self, descent: Descent) -> bool:
-        """Leap over a kink at which a descent with noise of the states creeps; return whether that helps."""
-        if not self.noisy_gaps:
-            return False
-        before, (self.current, taken) = self.current.cost, descent.leap(self.current)
-        self.iterations += taken
-        return self.current.cost < before
-
-    def _is_negligible_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
-        return is_negligible_step(self, current, reduced, step)
-
-    def _objective(self) -> Objective:
-        sigma = self.stage.gap * self.gap_scales
-        return Objective(self.segments, self.scaling, sigma, self.substeps, self.correction, self.stage.has_prior)
-
-    def evaluate(self, nodes: Array, z: Array) -> Iterate:
-        """The iterate at these nodes and searched parameters."""
-        return self._objective().evaluate(nodes, z)
-
-    def _convergence_status(self, current: Iterate) -> Status:
-        return self.assess(current).status
-
-    def assess(self, current: Iterate) -> ConvergenceTest:
-        """The convergence test of an iterate."""
-        message = f"{self.iterations} iterations"
-        found = assess_convergence(
-            current.equations, self.scaling, current.z, self.tolerance, message, noisy_gaps=self.noisy_gaps
-        )
-        if not (found.status.converged and found.largest_step > self.method.tolerance):
-            return found
-        asked = f"kinks of the model ask for {found.largest_step:.2g} standard deviations, which the intervals hold"
-        return found._replace(status=found.status.with_details(f"the estimates have settled; {asked}"))
-
-    def largest_change(self, change: Array) -> float:
-        """The largest change of a measured output [noise standard deviations], of all that are given."""
-        weighted = np.abs(change) * self.segments.weights
-        return float(np.max(weighted, where=np.isfinite(self.segments.measured), initial=0.0))
-
-    def run(self, steps: int) -> RolloutResult:
-        """The run of the current iterate by so many integration steps a sample, with states."""
-        return self.segments.run(self.current.nodes, self.scaling.values(self.current.z), steps, states=True)
-
-    def _report(self) -> None:
-        if self.method.progress is not None:
-            self.method.progress(describe_iteration(self))
-
-
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
 # times that the iterations of the last stage are repeated near the noise [1]: fewer leave a search over kinks (bristles
 # at rest) before its end, for other starts that take longer; more follow one that does not end
@@ -1082,128 +656,670 @@ MAX_SETTLED_STEP, MAX_NOISY_STEP = 0.5, 1.0
 # its equations ask: lower moves nodes that are only slow, higher leaves some behind
 TRAPPING_DAMPING = 1.0
 
-
-def is_near_end(search: "Search") -> bool:
-    """Whether a search explains the log to its noise in a last stage that is to converge: one that refines its steps.
-
-    One that only settles a start ends with wide gaps, where nodes that are damped alone are left behind.
-    """
-    is_last = search.stage is search.method.stages[-1] and search.stage.refine > 1
-    return is_last and search.is_noise(search.current.cost)
+FIRST_JOINING_STAGE = 2  # stage from which two searches may join: before it the gaps are so wide that all cost alike
+# difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
+# one
+JOINED_COST_TOLERANCE = 1e-3
 
 
-def repeat_last_stage(search: "Search") -> Status:
-    """Run the last stage again while it lowers the cost steeply, or at the noise at all, but has not converged.
+@dataclass(frozen=True, eq=False)
+class SearchSetup:
+    """What stays the same during a search.
 
-    Parameters
+    Attributes
     ----------
-    search : Search
-        Moves to where it has come by then. Parameters that the data do not determine end this, for a caller holds them.
-        Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
-
-    Returns
-    -------
-    Status
-        Of where it is then.
+    method : LeastSquares
+    scaling : ParameterScaling
+    gap_scales : ndarray, shape (n_states,)
+        Factor on each state's gaps (`segments.gap_scales`).
+    required_substeps, first_substeps : int
+        Integration steps a sample by the stiffness of the start, and those that the search begins with.
     """
-    least_decrease = 0.5 * search.method.tolerance**2  # that of a step of so many deviations
-    count = min(REPEAT_ITERATIONS, search.stage.iterations)
-    for _ in range(MAX_REPEATS * search.stage.iterations // max(1, count)):
-        found, before = search.assess(search.current), search.current
-        falls = search.last_decrease > STEEP_DECREASE and search.stage.iterations > count  # a short one is but a trial
-        goes_on = search.noisy_gaps or is_near_end(search) or falls
-        if found.status.converged or found.unidentifiable.size or not goes_on:
-            return found.status
-        trapped = np.flatnonzero(search.node_damping > TRAPPING_DAMPING)
-        if trapped.size and not search.noisy_gaps:
-            free_nodes(search, trapped)
-        else:
-            search.run_stage(count)
-        has_settled = moved_deviations(search, before.z) <= search.method.tolerance
-        if has_settled:
-            search.tolerance = max(search.tolerance, MAX_NOISY_STEP if search.noisy_gaps else MAX_SETTLED_STEP)
-        is_lost = search.noisy_gaps and not has_settled  # a kink that it creeps over would take hundreds of steps
-        if is_lost or before.cost - search.current.cost < least_decrease:
-            break
-    return search.assess(search.current).status
+
+    method: LeastSquares
+    scaling: ParameterScaling
+    gap_scales: Array
+    required_substeps: int
+    first_substeps: int
+
+    @property
+    def is_too_stiff(self) -> bool:
+        """Whether a sample of the start takes more integration steps than a search can afford."""
+        return self.required_substeps > self.first_substeps
 
 
-def refine_steps(search: "Search", status: Status) -> Status:
-    """Halve the integration steps until no estimate moves; steps that the user gave stay.
+class StageEnd(NamedTuple):
+    """Where a stage ended."""
 
-    Where the finer steps of the last stage have moved none, still finer ones would move it less: these are run once
-    more where the search has ended.
+    nodes: Array
+    z: Array
+    cost: float
 
-    Parameters
+
+@dataclass(frozen=True, eq=False)
+class SearchState:
+    """Where a search is: its iterate, the stage and the integration steps by which it got there, and what it has tried.
+
+    Attributes
     ----------
-    search : Search
-        Of this status; moves to the optimum by the finer steps.
+    setup : SearchSetup
+    iterate : Iterate
+        Nodes, parameters as searched, and the equations linearised there.
+    stage : Stage
+    substeps, output_substeps : int
+        Integration steps a sample of the sensitivities, and of the outputs.
+    stiffness_values : ndarray
+        All parameters' values at which the integration steps were chosen.
+    node_damping : ndarray, shape (m,)
+        Of each node alone, over its diagonal, where the stage has ended.
+    tolerance : float
+        The method's; wider where kinks hold up a search that has settled.
+    correction : IntegrationCorrection, optional
+        What finer steps change in the outputs.
+    is_coarse : bool
+        Whether finer steps are to follow in this stage.
+    noisy_gaps : bool
+        Whether the gaps stand for noise of the states.
+    iterations, stage_began : int
+        Iterations so far, and at the beginning of the stage.
+    has_stalled : bool
+        Whether the stage has converged, or hardly lowered the cost at its end.
+    last_decrease : float
+        Of the stage's cost by its last iteration, over itself.
+    integration_change : float
+        Largest change of an output by the last refinement [noise standard deviations]; NaN where there was none.
+    stage_ends : tuple of StageEnd
+    unsettled_gaps : frozenset of float
+        Gaps at which noise of the states has not settled.
+    tried_state_noise : bool
+        Whether noise of the states was tried before the last stage.
+    end : SearchEnd, optional
+        None while the search goes on.
     status : Status
-
-    Returns
-    -------
-    Status
-        Of where it is then.
+        What is said of the end.
     """
-    for _ in range(MAX_STEP_HALVINGS):
-        if not (status.converged and search.method.checks_steps):
+
+    setup: SearchSetup
+    iterate: Iterate
+    stage: Stage
+    substeps: int
+    output_substeps: int
+    stiffness_values: Array
+    node_damping: Array
+    tolerance: float
+    correction: IntegrationCorrection | None = None
+    is_coarse: bool = False
+    noisy_gaps: bool = False
+    iterations: int = 0
+    stage_began: int = 0
+    has_stalled: bool = False
+    last_decrease: float = 0.0
+    integration_change: float = math.nan
+    stage_ends: tuple[StageEnd, ...] = ()
+    unsettled_gaps: frozenset[float] = frozenset()
+    tried_state_noise: bool = False
+    end: SearchEnd | None = None
+    status: Status = SearchEnd.UNSETTLED.status
+
+    @property
+    def method(self) -> LeastSquares:
+        """The method and its options."""
+        return self.setup.method
+
+    @property
+    def segments(self) -> Segments:
+        """The segments, with their integration."""
+        return self.iterate.equations.segments
+
+    @property
+    def cost(self) -> float:
+        """Half of the squares of data and gaps, without the prior of a stage."""
+        return self.iterate.cost - self.stage.has_prior * self.setup.scaling.start_prior_cost(self.iterate.z)
+
+    @property
+    def is_at_noise(self) -> bool:
+        """Whether the cost is that of the noise alone."""
+        return is_noise_cost(self.iterate.cost, self.iterate.equations.count)
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether this search is to be left for those from other starts."""
+        return 2 * self.iterate.cost > self.method.max_misfit * self.iterate.equations.count
+
+    @property
+    def is_near_end(self) -> bool:
+        """Whether a search explains the log to its noise in a last stage that is to converge, which refines its steps.
+
+        One that only settles a start ends with wide gaps, where nodes that are damped alone are left behind.
+        """
+        return self.stage is self.method.stages[-1] and self.stage.refine > 1 and self.is_at_noise
+
+    @property
+    def gaps_absorb_misfit(self) -> bool:
+        """Whether the gaps absorb the misfit of the model in a stalled search: tighter gaps cost more."""
+        return self.has_stalled and self.iterate.equations.gap_share > MAX_GAP_SHARE and not self.is_at_noise
+
+    @property
+    def corrects_residuals(self) -> bool:
+        """Whether finer steps are for the residuals alone: derivatives need them where these exceed the noise."""
+        return not self.noisy_gaps and self.is_at_noise
+
+    @property
+    def outputs(self) -> Array:
+        """The model's outputs with the correction of finer steps, shape (m, n, n_outputs)."""
+        y = self.iterate.equations.linearisation.y
+        return y if self.correction is None else y + self.correction.y
+
+    @property
+    def gap_deviations(self) -> Array:
+        """Standard deviations of the stage's gaps, in nominal sizes, shape (n_states,)."""
+        return self.stage.gap * self.setup.gap_scales
+
+    def objective(self, segments: Segments | None = None) -> Objective:
+        """The least squares of the stage, by the integration of the state or of other segments."""
+        given = (segments or self.segments, self.setup.scaling, self.gap_deviations, self.substeps, self.correction)
+        return Objective(*given, self.stage.has_prior)
+
+    def at(self, nodes: Array, z: Array, segments: Segments | None = None) -> "SearchState":
+        """The state with the iterate at these nodes and searched parameters."""
+        return replace(self, iterate=self.objective(segments).evaluate(nodes, z))
+
+    def run(self, steps: int) -> RolloutResult:
+        """The run of the iterate by so many integration steps a sample, with states."""
+        return self.segments.run(self.iterate.nodes, self.setup.scaling.values(self.iterate.z), steps, states=True)
+
+    def largest_change(self, change: Array) -> float:
+        """The largest change of a measured output [noise standard deviations], of all that are given."""
+        weighted = np.abs(change) * self.segments.weights
+        return float(np.max(weighted, where=np.isfinite(self.segments.measured), initial=0.0))
+
+    def moves_no_estimate(self, change: Array) -> bool:
+        """Whether a change of the outputs moves no estimate: none moves by more deviations than the norm of it."""
+        weighted = (change * self.segments.weights)[np.isfinite(self.segments.measured)]
+        return float(np.nansum(weighted**2)) <= MAX_GRADIENT_ERROR**2
+
+    def promised_squares(self, stage: Stage) -> float:
+        """The squares, in noise variances, to which the gaps of a stage would lead by the linearised equations."""
+        slopes, scaling = self.iterate.equations.linearisation, self.setup.scaling
+        equations = weigh_gaps(self.segments, slopes, stage.gap * self.setup.gap_scales)
+        return equations.promised_squares(scaling.has_effect(equations) & ~scaling.fixed)
+
+    def assess(self) -> ConvergenceTest:
+        """The convergence test of the iterate."""
+        equations, z, message = self.iterate.equations, self.iterate.z, f"{self.iterations} iterations"
+        found = assess_convergence(
+            equations, self.setup.scaling, z, self.tolerance, message, noisy_gaps=self.noisy_gaps
+        )
+        if not (found.status.converged and found.largest_step > self.method.tolerance):
+            return found
+        asked = f"kinks of the model ask for {found.largest_step:.2g} standard deviations, which the intervals hold"
+        return found._replace(status=found.status.with_details(f"the estimates have settled; {asked}"))
+
+    def ended(self, end: SearchEnd, status: Status | None = None) -> "SearchState":
+        """The state with an end, and its status if that says more than the end does."""
+        return replace(self, end=end, status=status or end.status)
+
+    def concluded(self, found: ConvergenceTest | None = None) -> "SearchState":
+        """The state with the end that its convergence test says."""
+        status = (found or self.assess()).status
+        return self.ended(SearchEnd.OPTIMUM if status.converged else SearchEnd.UNSETTLED, status)
+
+    def resumed_after(self, trial: "SearchState") -> "SearchState":
+        """The state after a trial that led nowhere: nothing has moved but the trial's iterations and stiffness."""
+        return replace(self, iterations=trial.iterations, stiffness_values=trial.stiffness_values)
+
+
+def is_noise_cost(cost: float, count: int) -> bool:
+    """Whether this cost is that of the noise alone in so many residuals."""
+    return 2 * cost <= MAX_CHI_SQUARE_RATIO * count
+
+
+class InterruptedSearchError(KeyboardInterrupt):
+    """An interruption, with the last state before it."""
+
+    def __init__(self, state: SearchState) -> None:
+        super().__init__()
+        self.state = state
+
+
+P = ParamSpec("P")
+
+
+def keeps_state(
+    move: Callable[Concatenate[SearchState, P], SearchState],
+) -> Callable[Concatenate[SearchState, P], SearchState]:
+    """Let an interruption of a move carry the state before it, unless it carries a later one already."""
+
+    @wraps(move)
+    def keeping(state: SearchState, /, *args: P.args, **kwargs: P.kwargs) -> SearchState:
+        try:
+            return move(state, *args, **kwargs)
+        except InterruptedSearchError:
+            raise
+        except KeyboardInterrupt as stop:
+            raise InterruptedSearchError(state) from stop
+
+    return keeping
+
+
+def start_search(segments: Segments, method: LeastSquares) -> SearchState:
+    """The state in which a search begins, at the guesses of a transcription."""
+    scaling, nodes = ParameterScaling(segments.transcription), start_nodes(segments)
+    values = scaling.values(scaling.start)
+    segments, required = choose_integration(segments, nodes, values, method.substeps)
+    first = method.substeps or min(required, MAX_SEARCH_SUBSTEPS)
+    setup = SearchSetup(method, scaling, gap_scales(segments, method.kinematic), required, first)
+    stage = method.stages[0]
+    objective = Objective(segments, scaling, stage.gap * setup.gap_scales, first, None, stage.has_prior)
+    iterate = objective.evaluate(nodes, scaling.start)
+    return SearchState(setup, iterate, stage, first, first, values, np.zeros(segments.count), method.tolerance)
+
+
+def run_search(state: SearchState) -> SearchState:
+    """Run all stages to an end; an interruption (Ctrl-C) ends them with the best iterate so far, marked."""
+    try:
+        with check_during_runs(state.method.budget.check):
+            return refine_steps(run_stages(state))
+    except InterruptedSearchError as stop:
+        return stop.state.ended(SearchEnd.INTERRUPTED)
+    except KeyboardInterrupt:
+        return state.ended(SearchEnd.INTERRUPTED)
+
+
+@keeps_state
+def run_stages(state: SearchState) -> SearchState:
+    """Run the schedule of stages, from loose gaps to tight ones, until one of them ends the search.
+
+    A first stage that explains the logs to their noise is followed by the last one at once; the stages between are for
+    starts from which that does not soon converge. Where the linearised equations say that tight gaps would leave many
+    times the noise, it is followed by the search for noise of the states: the model is wrong, and the stages between
+    would only show that.
+    """
+    if state.setup.is_too_stiff:
+        verdict = f"the model is so stiff that a sample takes {state.setup.required_substeps} integration steps"
+        remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
+        return state.ended(SearchEnd.TOO_STIFF, Status(Code.NOT_CONVERGED, (verdict, remedy)))
+    for stage in state.method.stages:
+        state = pass_stage(state, stage)
+        if state.end is not None:
+            return state
+    concluded = repeat_last_stage(state)
+    # gaps that absorb the misfit of the model: the answer depends on their weight
+    is_absorbed = concluded.iterate.equations.gap_share > MAX_GAP_SHARE and not state.tried_state_noise
+    return allow_state_noise(concluded) if is_absorbed else concluded
+
+
+@keeps_state
+def pass_stage(state: SearchState, stage: Stage) -> SearchState:
+    """One stage of the schedule, with what is tried before the last one and after the first one."""
+    first, last = state.method.stages[0], state.method.stages[-1]
+    if stage is last and state.gaps_absorb_misfit and state.method.allows_state_noise:
+        state = replace(allow_state_noise(state), tried_state_noise=True)
+        if state.end is not None:
+            return state
+    elif stage is last and state.stage_ends and state.is_hopeless:
+        return state.ended(SearchEnd.ABANDONED)
+    state = run_stage(state, stage)
+    if not math.isfinite(state.iterate.cost):
+        return state.ended(SearchEnd.DIVERGED)
+    state = replace(state, stage_ends=(*state.stage_ends, StageEnd(state.iterate.nodes, state.iterate.z, state.cost)))
+    if joins_known_search(state):
+        return state.ended(SearchEnd.DUPLICATE)
+    if stage is not first:
+        return state
+    return state.ended(SearchEnd.ABANDONED) if state.is_hopeless else shorten(state)
+
+
+def run_stage(state: SearchState, stage: Stage) -> SearchState:
+    """The state after a stage that begins where the search is; as it is entered where the model is not finite there."""
+    state = enter_stage(state, stage, state.iterate.nodes, state.iterate.z)
+    return finish_stage(state, stage.iterations) if math.isfinite(state.iterate.cost) else state
+
+
+@keeps_state
+def enter_stage(state: SearchState, stage: Stage, nodes: Array, z: Array) -> SearchState:
+    """Weigh the gaps as in a stage, with integration steps from the stiffness at these nodes."""
+    segments, steps, stiffness_values = renew_integration(state, nodes, z)
+    is_same = segments is state.segments and nodes is state.iterate.nodes
+    is_known = is_same and steps == state.substeps and state.correction is None
+    entered = replace(
+        state,
+        stage=stage,
+        tolerance=state.method.tolerance,
+        substeps=steps,
+        output_substeps=steps,
+        stiffness_values=stiffness_values,
+        correction=None,
+        is_coarse=stage.refine > 1,
+        node_damping=np.zeros(len(nodes)),
+    )
+    if not is_known:
+        return entered.at(nodes, z, segments)
+    equations = weigh_gaps(segments, state.iterate.equations.linearisation, entered.gap_deviations)
+    return replace(entered, iterate=entered.objective().with_prior(nodes, z, equations))
+
+
+def renew_integration(state: SearchState, nodes: Array, z: Array) -> tuple[Segments, int, Array]:
+    """The integration at these nodes and parameters, its steps, and the values that it was chosen for.
+
+    The state's own where hardly a value has changed, or the user gave the steps; fewer steps, too, after a bad start.
+    """
+    values, setup = state.setup.scaling.values(z), state.setup
+    if state.method.substeps or np.allclose(values, state.stiffness_values, rtol=STIFFNESS_UPDATE_CHANGE):
+        return state.segments, state.substeps, state.stiffness_values
+    segments, needed = choose_integration(state.segments, nodes, values)
+    most = MAX_STAGE_REFINEMENT * max(setup.first_substeps, MIN_IMPLICIT_SUBSTEPS)
+    return segments, min(needed, most), values
+
+
+@keeps_state
+def finish_stage(state: SearchState, iterations: int) -> SearchState:
+    """Iterate in a stage, then again with the finer steps that it asks for.
+
+    Where an iterate explains the log to its noise, the finer steps correct its residuals within the stage.
+    """
+    state = iterate(state, iterations)
+    if not (state.stage.refine > 1 and state.correction is None and not state.is_hopeless):
+        return state
+    finer = apply_finer_steps(state, fine_steps(state.segments, state.substeps, state.stage.refine))
+    return iterate(finer, iterations) if math.isfinite(finer.iterate.cost) else replace(state, is_coarse=False)
+
+
+def iterate(state: SearchState, iterations: int) -> SearchState:
+    """Iterate in a stage, until it converges, or its iterations are used up: then it may have stalled."""
+    damping, before = min(INITIAL_DAMPING, 10 * state.stage.gap**2), math.inf  # as the diagonal grows
+    state = replace(state, stage_began=state.iterations, last_decrease=0.0)
+    descent = Descent(
+        state.objective(), damping, lambda at, reduced, step: is_negligible_step(state, at, reduced, step)
+    )
+    descent.node_damping = np.zeros(len(state.node_damping)) if state.noisy_gaps else state.node_damping
+    creeping = 0
+    try:
+        for _ in range(iterations):
+            if state.stage.refine > 1 and state.corrects_residuals and state.correction is None:
+                state = correct_residuals_by(state, fine_steps(state.segments, state.substeps, state.stage.refine))
+                descent.objective = state.objective()
+            descent.damps_nodes = state.noisy_gaps or state.is_near_end
+            trial = descent.step(state.iterate)
+            state = replace(state, node_damping=descent.node_damping)
+            if trial is None:
+                return replace(state, has_stalled=True)
+            before = state.iterate.cost
+            state = replace(state, iterate=trial, iterations=state.iterations + 1)
+            if state.method.progress is not None:
+                state.method.progress(describe_iteration(state))
+            creeping = creeping + 1 if creeps(state, before, descent.promised) else 0
+            if creeping == MAX_CREEPING_STEPS:
+                at, (best, taken) = state.iterate.cost, descent.undamped_steps(state.iterate)
+                state, creeping = replace(state, iterate=best, iterations=state.iterations + taken), 0
+                if not best.cost < at:
+                    return replace(state, has_stalled=True)
+    except KeyboardInterrupt as stop:
+        raise InterruptedSearchError(state) from stop
+    decrease = 1 - state.iterate.cost / before
+    return replace(state, last_decrease=decrease, has_stalled=decrease < STALL_COST_DECREASE)
+
+
+@keeps_state
+def apply_finer_steps(state: SearchState, steps: int) -> SearchState:
+    """Integrate the iterate by finer steps."""
+    if state.corrects_residuals:
+        return correct_residuals_by(state, steps)
+    finer = replace(state, substeps=steps, output_substeps=steps, correction=None, is_coarse=False)
+    return finer.at(state.iterate.nodes, state.iterate.z)
+
+
+def correct_residuals_by(state: SearchState, steps: int) -> SearchState:
+    """Add what finer steps change to the residuals of the iterate; derivatives are computed anew where that is much."""
+    slopes, fine = state.iterate.equations.linearisation, state.run(steps)
+    correction = IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
+    corrected = replace(state, correction=correction, output_substeps=steps, is_coarse=False)
+    nodes, z, equations = state.iterate.nodes, state.iterate.z, state.iterate.equations
+    if not state.moves_no_estimate(fine.y - state.outputs):
+        return corrected.at(nodes, z)
+    equations = correct_residuals(equations, nodes, correction, state.gap_deviations)
+    return replace(corrected, iterate=Iterate(nodes, z, equations))
+
+
+class Shortcut(Enum):
+    """What may follow a first stage in place of the stages between it and the last."""
+
+    NONE = "the stages between"
+    LAST_STAGE = "the last stage at once, while it soon converges"
+    STATE_NOISE = "gaps as noise of the states"
+
+
+def choose_shortcut(state: SearchState) -> tuple[Shortcut, Stage]:
+    """The shortcut after the first stage of a search that explains its logs, and the stage in which it goes on."""
+    count, (first, *between, last) = state.iterate.equations.count, state.method.stages
+    if not state.promised_squares(last) > MAX_JUMP_MISFIT * count:
+        return Shortcut.LAST_STAGE, last
+    if not state.method.allows_state_noise:
+        return Shortcut.NONE, first
+    near_noise = [s for s in between if state.promised_squares(s) <= MAX_CHI_SQUARE_RATIO * count]
+    return Shortcut.STATE_NOISE, near_noise[-1] if near_noise else first
+
+
+@keeps_state
+def shorten(state: SearchState) -> SearchState:
+    """The optimum that a shortcut after the first stage leads to; where it does not, the state goes on from there."""
+    stays = len(state.method.stages) < 3 or bool(state.method.known_costs)
+    if stays or not state.is_at_noise:
+        return state
+    if state.segments.implicit_state is not None:  # the errors of coarse steps add up where no gaps take them
+        state = correct_residuals_by(state, fine_steps(state.segments, state.substeps, state.method.stages[-1].refine))
+    shortcut, stage = choose_shortcut(state)
+    if shortcut is Shortcut.LAST_STAGE:
+        return jump_to_last_stage(state)
+    if shortcut is Shortcut.NONE:
+        return state
+    return loosen(state, stage, state.iterate.nodes, state.iterate.z)
+
+
+def jump_to_last_stage(state: SearchState) -> SearchState:
+    """The optimum that the last stage soon reaches; where it does not, the state goes on from there."""
+    trial = enter_stage(state, state.method.stages[-1], state.iterate.nodes, state.iterate.z)
+    if math.isfinite(trial.iterate.cost):
+        trial = iterate(trial, JUMP_ITERATIONS)
+        if trial.is_at_noise:  # finer steps are lost on what has not come near the noise by then
+            trial = finish_stage(trial, JUMP_ITERATIONS).concluded()
+            if trial.end is SearchEnd.OPTIMUM and trial.is_at_noise:
+                return trial
+    return state.resumed_after(trial)
+
+
+def stages_to_loosen(state: SearchState) -> tuple[tuple[Stage, StageEnd], ...]:
+    """The stages whose gaps may stand for noise of the states, tightest first, and where they ended.
+
+    They explained the logs to their noise; those that did not settle would, from another start, creep again.
+    """
+    ended = zip(state.method.stages[:-1], state.stage_ends, strict=False)
+    explaining = [(s, e) for s, e in ended if is_noise_cost(e.cost, state.iterate.equations.count)]
+    return tuple((s, e) for s, e in reversed(explaining[-MAX_LOOSENED:]) if s.gap not in state.unsettled_gaps)
+
+
+def allow_state_noise(state: SearchState) -> SearchState:
+    """The optimum with gaps that stand for noise of the states of a wrong model; where there is none, nothing moves.
+
+    They are the tightest with which all residuals agree.
+    """
+    for stage, at in stages_to_loosen(state) if state.method.allows_state_noise else ():
+        state = loosen(state, stage, at.nodes, at.z)
+        if state.end is SearchEnd.OPTIMUM:
             break
-        before, correction = search.snapshot(), search.correction
-        are_fine = correction is not None and search.moves_no_estimate(correction.y)
-        change = search.apply_finer_steps((1 if search.method.substeps or are_fine else 2) * search.output_substeps)
-        if are_fine and search.correction is not None:
-            change = search.largest_change(search.correction.y)
-        if not math.isfinite(search.current.cost):
-            search.restore(before)
+    return state
+
+
+@keeps_state
+def loosen(state: SearchState, stage: Stage, nodes: Array, z: Array) -> SearchState:
+    """The optimum with a stage's gaps as noise of the states, or with tight gaps where it leads.
+
+    Where there is none, nothing moves.
+    """
+    last, noisy = state.method.stages[-1], replace(state, noisy_gaps=True)
+    trial = enter_stage(noisy, replace(stage, iterations=last.iterations, refine=last.refine), nodes, z)
+    trial = repeat_last_stage(finish_stage(trial, last.iterations))
+    if trial.end is SearchEnd.OPTIMUM:
+        return tighten(trial)
+    back = state.resumed_after(trial)
+    return replace(back, unsettled_gaps=state.unsettled_gaps | {stage.gap})
+
+
+@keeps_state
+def tighten(state: SearchState) -> SearchState:
+    """The optimum with tight gaps, where one with noise of the states leads to it; else that one.
+
+    The nodes of a first stage may lie across kinks, and its equations then foresee a misfit that a right model has
+    not; at an optimum that is nearer they are right.
+    """
+    last, trial = state.method.stages[-1], replace(state, noisy_gaps=False)
+    if state.promised_squares(last) > MAX_JUMP_MISFIT * state.iterate.equations.count:
+        return state
+    for stage in state.method.stages:
+        if stage.gap < state.stage.gap and trial.is_at_noise:
+            trial = run_stage(trial, stage)
+    trial = trial.concluded()
+    if trial.stage is last and trial.end is SearchEnd.OPTIMUM and trial.is_at_noise:
+        return trial
+    return state.resumed_after(trial)
+
+
+class Repeat(Enum):
+    """How a last stage goes on that has used up its iterations."""
+
+    STOP = "not at all"
+    FREE_NODES = "from where trapped nodes are put to the ends of the segments before them"
+    GO_ON = "from where it is"
+
+
+def choose_repeat(state: SearchState, found: ConvergenceTest) -> Repeat:
+    """How the last stage goes on: while it lowers the cost steeply, or at the noise at all, but has not converged.
+
+    Parameters that the data do not determine end it, for a caller holds them. Friction at rest has a kink in the speed,
+    over which Gauss-Newton steps overshoot; nodes that do so are damped alone, and one that ends where its equations
+    no longer move it is trapped, and keeps the rest of the log from its optimum. Gaps that stand for noise of the
+    states are what is estimated, and free no node.
+    """
+    is_trial = state.stage.iterations <= REPEAT_ITERATIONS
+    falls = state.last_decrease > STEEP_DECREASE and not is_trial
+    goes_on = state.noisy_gaps or state.is_near_end or falls
+    if found.status.converged or found.unidentifiable.size or not goes_on:
+        return Repeat.STOP
+    return Repeat.FREE_NODES if trapped_nodes(state).size and not state.noisy_gaps else Repeat.GO_ON
+
+
+def trapped_nodes(state: SearchState) -> Indices:
+    """Positions of nodes that a kink of the model traps."""
+    return np.flatnonzero(state.node_damping > TRAPPING_DAMPING).astype(np.intp)
+
+
+@keeps_state
+def repeat_last_stage(state: SearchState) -> SearchState:
+    """Run the last stage again as `choose_repeat` says, and conclude.
+
+    Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
+    """
+    least_decrease = 0.5 * state.method.tolerance**2  # that of a step of so many deviations
+    count = min(REPEAT_ITERATIONS, state.stage.iterations)
+    for _ in range(MAX_REPEATS * state.stage.iterations // max(1, count)):
+        before, found = state, state.assess()
+        repeat = choose_repeat(state, found)
+        if repeat is Repeat.STOP:
+            return state.concluded(found)
+        state = free_nodes(state, trapped_nodes(state)) if repeat is Repeat.FREE_NODES else iterate(state, count)
+        has_settled = moved_deviations(state, before.iterate.z) <= state.method.tolerance
+        if has_settled:
+            state = replace(state, tolerance=max(state.tolerance, settled_step(state)))
+        is_lost = state.noisy_gaps and not has_settled  # a kink that it creeps over would take hundreds of steps
+        if is_lost or before.iterate.cost - state.iterate.cost < least_decrease:
             break
-        if search.assess(search.current).status.converged:
-            search.integration_change = math.nan if search.method.substeps else change
-            if search.noisy_gaps:
-                search.run_stage(search.stage.iterations)  # the finer steps have moved its optimum a little
-            break
-        search.run_stage(search.stage.iterations)
-        status = search.assess(search.current).status
-    return status
+    return state.concluded()
 
 
-def moved_deviations(search: "Search", z: Array) -> float:
-    """How far the parameters have moved from z, at most [standard deviations]; infinite where one has none."""
-    equations, current = search.current.equations, search.current.z
-    reduced = equations.arrow.eliminate(0.0)
-    if reduced is None:
-        return math.inf
-    keep = search.scaling.movable(current, equations, reduced)
-    return largest_parameter_step(equations, keep, reduced, current - z)
+def settled_step(state: SearchState) -> float:
+    """The step that may be asked for where a repeat has moved no estimate [standard deviations]."""
+    return MAX_NOISY_STEP if state.noisy_gaps else MAX_SETTLED_STEP
 
 
-def unsettled_covariance(search: "Search") -> Array:
-    """The covariance (own units) of the step that kinks still ask for. Shape (k, k)."""
-    equations, z = search.current.equations, search.current.z
-    asked, reduced = np.zeros(len(z)), equations.arrow.eliminate(0.0)
-    solved = None if reduced is None else reduced.step(search.scaling.movable(z, equations, reduced))
-    if solved is not None:
-        asked = equations.linearisation.chain * solved.parameters
-    return np.outer(asked, asked)
-
-
-def free_nodes(search: "Search", trapped: Indices) -> None:
+@keeps_state
+def free_nodes(state: SearchState, trapped: Indices) -> SearchState:
     """Run the last stage from where trapped nodes are put to the ends of the segments before them, if that helps.
 
     Parameters
     ----------
-    search : Search
-        Stays where it is unless its cost falls.
+    state : SearchState
     trapped : ndarray of int
         Positions of nodes.
+
+    Returns
+    -------
+    SearchState
+        The given one, with the iterations of the trial, unless the cost falls.
     """
-    before, damping, nodes = search.snapshot(), search.node_damping, search.current.nodes.copy()
-    behind = trapped[trapped > 0]
-    nodes[behind] += search.current.equations.gaps[behind - 1] * search.segments.nominal
-    search.current, search.node_damping = search.evaluate(nodes, search.current.z), np.zeros(len(nodes))
-    search.run_stage(search.stage.iterations)
-    if not search.current.cost < before.current.cost:
-        search.restore(before)
-        search.node_damping = damping
+    nodes, behind = state.iterate.nodes.copy(), trapped[trapped > 0]
+    nodes[behind] += state.iterate.equations.gaps[behind - 1] * state.segments.nominal
+    freed = iterate(
+        replace(state.at(nodes, state.iterate.z), node_damping=np.zeros(len(nodes))), state.stage.iterations
+    )
+    return freed if freed.iterate.cost < state.iterate.cost else state.resumed_after(freed)
+
+
+def choose_finer_steps(state: SearchState) -> int:
+    """The steps a sample that show what the integration still changes at an optimum; 0 where none are to be tried.
+
+    They are half as long; as long as they are where those that the last stage has taken have moved no estimate, for
+    still finer ones would move it less, and where the user gave the steps.
+    """
+    if state.end is not SearchEnd.OPTIMUM or not state.method.checks_steps:
+        return 0
+    return (1 if state.method.substeps or steps_are_fine(state) else 2) * state.output_substeps
+
+
+def steps_are_fine(state: SearchState) -> bool:
+    """Whether the finer steps of the last stage have moved no estimate."""
+    return state.correction is not None and state.moves_no_estimate(state.correction.y)
+
+
+@keeps_state
+def refine_steps(state: SearchState) -> SearchState:
+    """Halve the integration steps of an optimum until no estimate moves; steps that the user gave stay."""
+    for _ in range(MAX_STEP_HALVINGS):
+        steps = choose_finer_steps(state)
+        if not steps:
+            break
+        finer = apply_finer_steps(state, steps)
+        change = finer.outputs - state.outputs
+        if steps_are_fine(state) and finer.correction is not None:
+            change = finer.correction.y
+        if not math.isfinite(finer.iterate.cost):
+            break
+        if finer.assess().status.converged:
+            shown = math.nan if state.method.substeps else finer.largest_change(change)
+            state = replace(finer, integration_change=shown)
+            # the finer steps have moved the optimum with noise of the states a little
+            return iterate(state, state.stage.iterations) if state.noisy_gaps else state
+        state = iterate(finer, finer.stage.iterations).concluded()
+    return state
+
+
+def moved_deviations(state: SearchState, z: Array) -> float:
+    """How far the parameters have moved from z, at most [standard deviations]; infinite where one has none."""
+    equations, current = state.iterate.equations, state.iterate.z
+    reduced = equations.arrow.eliminate(0.0)
+    if reduced is None:
+        return math.inf
+    keep = state.setup.scaling.movable(current, equations, reduced)
+    return largest_parameter_step(equations, keep, reduced, current - z)
+
+
+def unsettled_covariance(state: SearchState) -> Array:
+    """The covariance (own units) of the step that kinks still ask for. Shape (k, k)."""
+    equations, z = state.iterate.equations, state.iterate.z
+    asked, reduced = np.zeros(len(z)), equations.arrow.eliminate(0.0)
+    solved = None if reduced is None else reduced.step(state.setup.scaling.movable(z, equations, reduced))
+    if solved is not None:
+        asked = equations.linearisation.chain * solved.parameters
+    return np.outer(asked, asked)
 
 
 # promised decrease over the cost [1] at which a stage ends: lower wastes iterations, higher ends it too early
@@ -1230,7 +1346,7 @@ JUMP_COST_TOLERANCE = 1e-2
 CREEPING_SHARE = 0.3
 
 
-def is_negligible_step(search: "Search", current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
+def is_negligible_step(state: SearchState, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
     """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
 
     The states of noisy gaps estimate that noise, and settle long after the parameters, whose step then counts; so it
@@ -1240,7 +1356,7 @@ def is_negligible_step(search: "Search", current: Iterate, reduced: ReducedEquat
 
     Parameters
     ----------
-    search : Search
+    state : SearchState
     current : Iterate
     reduced : ReducedEquations
     step : GaussNewtonStep
@@ -1250,31 +1366,31 @@ def is_negligible_step(search: "Search", current: Iterate, reduced: ReducedEquat
     bool
     """
     promised, equations = 0.5 * current.equations.arrow.descent_rate(step), current.equations
-    is_last, misfit = search.stage.gap <= search.method.stages[-1].gap, max(1.0, 2 * current.cost / equations.count)
-    if not (search.noisy_gaps or is_last):
-        is_first = search.stage is search.method.stages[0] and search.is_noise(current.cost)
+    is_last, misfit = state.stage.gap <= state.method.stages[-1].gap, max(1.0, 2 * current.cost / equations.count)
+    if not (state.noisy_gaps or is_last):
+        is_first = state.stage is state.method.stages[0] and is_noise_cost(current.cost, equations.count)
         return promised < (JUMP_COST_TOLERANCE if is_first else STAGE_COST_TOLERANCE) * current.cost
     if is_last and promised < FINAL_COST_TOLERANCE * misfit:
         return True
-    is_slow = search.iterations - search.stage_began >= PATIENT_ITERATIONS
+    is_slow = state.iterations - state.stage_began >= PATIENT_ITERATIONS
     is_wrong = is_last and is_slow and misfit > MAX_CHI_SQUARE_RATIO
-    asks_parameters = bool(search.segments.transcription.parameters.free_names)
-    is_settled = asks_parameters and (search.is_coarse or is_wrong or promised < SETTLED_COST_DECREASE * misfit)
-    if not ((is_settled or search.noisy_gaps) and promised < STAGE_COST_TOLERANCE * current.cost):
+    asks_parameters = bool(state.segments.transcription.parameters.free_names)
+    is_settled = asks_parameters and (state.is_coarse or is_wrong or promised < SETTLED_COST_DECREASE * misfit)
+    if not ((is_settled or state.noisy_gaps) and promised < STAGE_COST_TOLERANCE * current.cost):
         return False
-    keep = search.scaling.movable(current.z, equations, reduced)
-    largest = largest_parameter_step(equations, keep, reduced, step.parameters) / search.method.tolerance
+    keep = state.setup.scaling.movable(current.z, equations, reduced)
+    largest = largest_parameter_step(equations, keep, reduced, step.parameters) / state.method.tolerance
     if is_wrong:
         return largest < MISFIT_TOLERANCE * math.sqrt(max(1.0, equations.chi_square / max(1, equations.count)))
-    return largest < (COARSE_TOLERANCE if search.is_coarse else FINE_TOLERANCE)
+    return largest < (COARSE_TOLERANCE if state.is_coarse else FINE_TOLERANCE)
 
 
-def creeps(search: "Search", before: float, promised: float) -> bool:
+def creeps(state: SearchState, before: float, promised: float) -> bool:
     """Whether a step of a search with noise of the states has fallen far short of its promise, and changed little.
 
     Parameters
     ----------
-    search : Search
+    state : SearchState
         After the step.
     before : float
         Cost before it.
@@ -1285,19 +1401,128 @@ def creeps(search: "Search", before: float, promised: float) -> bool:
     -------
     bool
     """
-    return search.noisy_gaps and before - search.current.cost < min(
+    return state.noisy_gaps and before - state.iterate.cost < min(
         CREEPING_SHARE * promised, STAGE_COST_TOLERANCE * before
     )
 
 
-def describe_iteration(search: "Search") -> str:
+def describe_iteration(state: SearchState) -> str:
     """A line of progress: the stage, the iteration, the cost and the largest gap."""
-    stages = search.method.stages
-    number = "loosened" if search.noisy_gaps else f"stage {stages.index(search.stage) + 1}/{len(stages)}"
+    stages = state.method.stages
+    number = "loosened" if state.noisy_gaps else f"stage {stages.index(state.stage) + 1}/{len(stages)}"
     return (
-        f"{number}  iteration {search.iterations}  cost {search.cost:.6g}  "
-        f"largest gap {search.current.equations.largest_gap:.1e}"
+        f"{number}  iteration {state.iterations}  cost {state.cost:.6g}  "
+        f"largest gap {state.iterate.equations.largest_gap:.1e}"
     )
+
+
+def joins_known_search(state: SearchState) -> bool:
+    """Whether a search has come to where a known one was after the same stage, and would go on as that one."""
+    known = [cost for gap, cost in state.method.known_costs if gap == state.stage.gap]
+    return any(abs(state.cost - cost) <= JOINED_COST_TOLERANCE * cost for cost in known)
+
+
+def end_search(state: SearchState, seconds: float) -> Fit:
+    """The fit where a search has ended.
+
+    Parameters
+    ----------
+    state : SearchState
+        With an end.
+    seconds : float
+        That it has taken.
+
+    Returns
+    -------
+    Fit
+    """
+    transcription, current, equations = state.segments.transcription, state.iterate, state.iterate.equations
+    q = state.setup.scaling.values(current.z)
+    free = transcription.parameters.free_names
+    values = dict(zip(free, q[transcription.free].tolist(), strict=True))
+    run = _final_run(state)
+    at_bound, fixed = state.setup.scaling.at_bound(current.z) & ~state.setup.scaling.fixed, state.setup.scaling.fixed
+    keep = state.setup.scaling.has_effect(equations) & ~at_bound & ~fixed
+    covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
+    if math.isfinite(equations.cost):
+        covariance = equations.covariance(keep, noisy_gaps=state.noisy_gaps)
+        if covariance is not None and state.tolerance > state.method.tolerance:
+            covariance = covariance + unsettled_covariance(state)
+        prior = (
+            equations.prior_covariance(keep, fixed, state.setup.scaling.weak_prior(current.z)) if fixed.any() else None
+        )
+        names = names if state.end in (SearchEnd.ABANDONED, SearchEnd.DUPLICATE) else _doubtful_parameters(state)
+    if covariance is not None:
+        gaps = state.stage.gap * state.setup.gap_scales
+        optimum = Optimum(equations, run, current.nodes, q, keep, gaps, state.substeps)
+    return Fit(
+        state.segments.trajectories(run),
+        transcription.parameters.with_values(values),
+        state.status,
+        state.end or SearchEnd.UNSETTLED,
+        _stats(state, run, seconds),
+        covariance,
+        equations.chi_square,
+        equations.count,
+        at_bound,
+        equations.gaps[state.segments.linked] if state.noisy_gaps else None,
+        *names,
+        prior,
+        optimum=optimum,
+        stage_costs=_stage_costs(state),
+    )
+
+
+def _final_run(state: SearchState) -> RolloutResult:
+    """The run of the last iterate by the finest steps, with states; those of an interrupted search are by its own."""
+    correction = state.correction
+    if correction is not None and math.isfinite(state.integration_change):  # of these very nodes
+        return correction.fine_run
+    if state.end is not SearchEnd.INTERRUPTED or not math.isfinite(state.iterate.cost):
+        return state.run(state.output_substeps)
+    run = state.run(state.substeps)
+    return run if correction is None else replace(run, y=run.y + correction.y, x_end=run.x_end + correction.x_end)
+
+
+def _stats(state: SearchState, run: RolloutResult, seconds: float) -> dict[str, float]:
+    return {
+        "iterations": float(state.iterations),
+        "seconds": seconds,
+        "cost": state.cost,
+        "substeps": float(state.output_substeps),
+        "largest_gap": state.iterate.equations.largest_gap,
+        "gap_share": state.iterate.equations.gap_share,
+        "gap_deviation": state.stage.gap,
+        "integration_error": _integration_error(state, run),
+    }
+
+
+def _stage_costs(state: SearchState) -> tuple[tuple[float, float], ...]:
+    """The gap and the cost of stages at their ends, and those of the search's end."""
+    ended = [(stage.gap, end.cost) for stage, end in zip(state.method.stages, state.stage_ends, strict=False)]
+    return (*ended[FIRST_JOINING_STAGE:], (state.stage.gap, state.cost))
+
+
+def _doubtful_parameters(state: SearchState) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The parameters that the data do not determine, and the one that has not settled; none of a refused start."""
+    if state.setup.is_too_stiff:
+        return (), ()
+    free, found = state.segments.transcription.parameters.free_names, state.assess()
+    return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)
+
+
+def _integration_error(state: SearchState, run: RolloutResult) -> float:
+    """Largest change of an output when the steps are halved [noise standard deviations].
+
+    NaN without an optimum, and where the budget ends before it is measured: the answer is known by then.
+    """
+    if math.isfinite(state.integration_change) or not (state.end is SearchEnd.OPTIMUM and state.method.checks_steps):
+        return state.integration_change
+    try:
+        with check_during_runs(state.method.budget.check):
+            return state.largest_change(state.run(2 * state.output_substeps).y - run.y)
+    except BudgetSpentError:
+        return math.nan
 
 
 # Newton steps: fewer leave gaps that another would close, more cost as much as a run from end to end

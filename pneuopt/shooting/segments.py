@@ -242,10 +242,10 @@ def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.
     The stiffness is taken at nodes all along the start and at the extremes of every state and input; the result is
     `SUBSTEPS_CAP` at most, for a start may be absurd.
     """
-    return count_steps(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
+    return substeps_for(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
 
 
-def count_steps(segments: Segments, rate: float, step: float) -> int:
+def substeps_for(segments: Segments, rate: float, step: float) -> int:
     """Integration steps a sample that keep h times a rate [1/s] within `step`, `SUBSTEPS_CAP` at most."""
     return min(max(1, math.ceil(float(segments.h.max()) * rate / step)), SUBSTEPS_CAP)
 
@@ -407,7 +407,7 @@ def choose_integration(
     state, steps = None, 1
     if nodes.shape[1]:
         jacobians = stiffness_jacobians(segments, nodes, values)
-        steps = count_steps(segments, largest_rate(jacobians), RK4_MAX_H_LAMBDA)
+        steps = substeps_for(segments, largest_rate(jacobians), RK4_MAX_H_LAMBDA)
         if steps > STABILITY_RESERVE * (given or MIN_IMPLICIT_GAIN * MIN_IMPLICIT_SUBSTEPS / STABILITY_RESERVE):
             state, steps = _choose_implicit_state(segments, nodes, values, jacobians, steps)
     if state != segments.implicit_state:
@@ -432,8 +432,8 @@ def _choose_implicit_state(
     others[:, state, state] = 0.0
     needed = max(
         MIN_IMPLICIT_SUBSTEPS,
-        count_steps(segments, largest_rate(others), PARTITIONED_MAX_H_LAMBDA),
-        count_steps(segments, growth, PARTITIONED_MAX_H_GROWTH),
+        substeps_for(segments, largest_rate(others), PARTITIONED_MAX_H_LAMBDA),
+        substeps_for(segments, growth, PARTITIONED_MAX_H_GROWTH),
     )
     return (state, needed) if steps >= MIN_IMPLICIT_GAIN * needed else (None, steps)
 
@@ -441,41 +441,3 @@ def _choose_implicit_state(
 def fine_steps(segments: Segments, steps: int, refine: int) -> int:
     """The steps a sample that correct the residuals of coarse ones; those implicit in a state are of lower order."""
     return steps * refine * (1 if segments.implicit_state is None else IMPLICIT_REFINEMENT)
-
-
-class IntegrationSteps:
-    """The integration of a search, and its steps a sample.
-
-    Parameters
-    ----------
-    segments : Segments
-    nodes : ndarray, shape (m, n_states)
-        Of the start.
-    values : ndarray
-        All parameters of the start.
-    given : int, optional
-        What the user has asked for, in place of all this.
-
-    Attributes
-    ----------
-    segments : Segments
-        By the integration at the start.
-    """
-
-    def __init__(self, segments: Segments, nodes: Array, values: Array, given: int | None) -> None:
-        self._values, self._given = values, given
-        self.segments, self.required = choose_integration(segments, nodes, values, given)
-        self.start = given or min(self.required, MAX_SEARCH_SUBSTEPS)
-
-    @property
-    def are_too_many(self) -> bool:
-        """Whether a sample of the start takes more integration steps than a search can afford."""
-        return self.required > self.start
-
-    def renew(self, segments: Segments, nodes: Array, values: Array, current: int) -> tuple[Segments, int]:
-        """The integration at these nodes and parameters, or the current one; fewer steps, too, after a bad start."""
-        if not self._given and not np.allclose(values, self._values, rtol=STIFFNESS_UPDATE_CHANGE):
-            self._values = values
-            segments, needed = choose_integration(segments, nodes, values)
-            return segments, min(needed, MAX_STAGE_REFINEMENT * max(self.start, MIN_IMPLICIT_SUBSTEPS))
-        return segments, current

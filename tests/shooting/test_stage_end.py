@@ -24,20 +24,19 @@ def negligible(
     equations = SimpleNamespace(arrow=arrow, count=1000, chi_square=1000 * misfit)
     method = LeastSquares()
     transcription = SimpleNamespace(parameters=SimpleNamespace(free_names=("a",)))
-    search: Any = SimpleNamespace(
+    state: Any = SimpleNamespace(
         stage=method.stages[-1],
         method=method,
         noisy_gaps=False,
         is_coarse=False,
         iterations=5 + iterations,
         stage_began=5,
-        scaling=SimpleNamespace(movable=lambda *_: None),
+        setup=SimpleNamespace(scaling=SimpleNamespace(movable=lambda *_: None)),
         segments=SimpleNamespace(transcription=transcription),
-        is_noise=lambda _: False,
     )
     current: Any = SimpleNamespace(equations=equations, cost=500 * misfit, z=np.zeros(1))
     nothing: Any = SimpleNamespace(parameters=None)
-    return is_negligible_step(search, current, nothing, nothing)
+    return is_negligible_step(state, current, nothing, nothing)
 
 
 @pytest.mark.parametrize(
