@@ -223,11 +223,21 @@ class Stage:
     refine : int
         Integration steps at the end of the stage, as a multiple of those before. Let the last stage have more than 1:
         with 1 and a gap above `WIDE_GAP` a stage draws log parameters to their start (`has_prior`).
+
+    Raises
+    ------
+    InputError
+        If an option is not in its range.
     """
 
     gap: float
     iterations: int
     refine: int = 1
+
+    def __post_init__(self) -> None:
+        require(0 < self.gap < math.inf, f"Stage(gap={self.gap}): give a positive fraction of a state's size, as 1e-3")
+        require(self.iterations >= 0, f"Stage(iterations={self.iterations}): give 0 or more")
+        require(self.refine >= 1, f"Stage(refine={self.refine}): give 1 (no finer steps) or more")
 
     @property
     def has_prior(self) -> bool:
@@ -270,6 +280,11 @@ class LeastSquares:
         their noise; a search that comes to the same ends there (`SearchEnd.DUPLICATE`).
     checks_steps : bool
         Whether finer integration steps are tried at the end: not where a refit keeps those of a fit that tried them.
+
+    Raises
+    ------
+    InputError
+        If an option is not in its range.
     """
 
     stages: tuple[Stage, ...] = (
@@ -290,6 +305,16 @@ class LeastSquares:
     allows_state_noise: bool = True
     known_costs: tuple[tuple[float, float], ...] = field(default=(), repr=False, compare=False)
     checks_steps: bool = field(default=True, repr=False)
+
+    def __post_init__(self) -> None:
+        lead, substeps = "LeastSquares", self.substeps
+        require(len(self.stages) > 0, f"{lead}(stages=()): give one Stage or more, or leave it out")
+        require(self.segment_time > 0, f"{lead}(segment_time={self.segment_time}): give seconds above 0, or math.inf")
+        is_count = substeps is None or (float(substeps).is_integer() and substeps >= 1)
+        require(is_count, f"{lead}(substeps={substeps}): give a whole number from 1 on, or leave it out")
+        for name in ("tolerance", "kinematic"):
+            value = getattr(self, name)
+            require(0 < value < math.inf, f"{lead}({name}={value}): give a positive number")
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:
