@@ -381,3 +381,27 @@ def test_a_last_stage_is_repeated_three_times_in_all(iterations: int, monkeypatc
     lifted.repeat_last_stage(replace(state, setup=setup, stage=stage))
     assert sum(taken) == lifted.MAX_REPEATS * iterations
     assert max(taken) == min(iterations, lifted.REPEAT_ITERATIONS)
+
+
+@pytest.mark.parametrize("move", ["step", "undamped_steps"])
+def test_nodes_follow_the_step_that_a_bound_has_left(move: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a linear model one step ends where no node's step is left, at the bound, too, and not at that of no bound."""
+    problem = wrong_squares()
+    linear = problem.residuals[0]
+    measured = np.column_stack([H * np.arange(N), np.full(N, np.nan)])  # a rate of 1 m/s
+    bounded = ParameterSet({"rate": Parameter(0.5, "m/s", -5.0, 0.6, free=True)})
+    problem = replace(problem, parameters=bounded, residuals=(replace(linear, measured=measured),))
+    monkeypatch.setattr(lifted, "MAX_NODE_STEPS", 0)  # which would mend it
+    objective = start_search(segment(problem), LeastSquares(substeps=1)).objective()
+    descent = Descent(objective, 0.0, lambda *_: False)
+    begun = objective.evaluate(np.zeros((N // 2, 1)), objective.scaling.start)
+    if move == "step":
+        found = descent.step(begun)
+    else:
+        monkeypatch.setattr(lifted, "MAX_UNDAMPED_STEPS", 1)
+        found, _ = descent.undamped_steps(begun)
+    assert found is not None
+    assert found.z.tolist() == [0.6]
+    left = found.equations.arrow.node_step(np.zeros(N // 2))
+    assert left is not None
+    assert_allclose(left, 0.0, atol=1e-6)

@@ -11,21 +11,28 @@ from numpy.testing import assert_allclose
 
 from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.status import Code
+from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.equations import ParameterScaling, correct_residuals, normal_equations, weigh_gaps
 from pneuopt.shooting.least_squares import (
     FINE_TOLERANCE,
+    MAX_CHI_SQUARE_RATIO,
+    ConvergenceTest,
     CpuBudget,
     Fit,
     Iterate,
     LeastSquares,
     Objective,
+    Repeat,
     SearchEnd,
     SearchState,
+    Shortcut,
     Stage,
     StageEnd,
     apply_finer_steps,
+    choose_finer_steps,
+    choose_repeat,
+    choose_shortcut,
     correct_residuals_by,
     end_search,
     enter_stage,
@@ -37,6 +44,7 @@ from pneuopt.shooting.least_squares import (
     run_stage,
     run_stages,
     solve_least_squares,
+    stages_to_loosen,
     start_search,
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, segment, start_nodes
@@ -353,3 +361,118 @@ def test_a_refit_keeps_steps_that_were_tried_before(monkeypatch: pytest.MonkeyPa
     assert kept.status.converged
     assert math.isnan(kept.stats["integration_error"])
     assert kept.stats["cost"] == pytest.approx(checked.stats["cost"], rel=1e-6)
+
+
+def begun(stages: tuple[Stage, ...] = LeastSquares().stages, **options: Any) -> SearchState:
+    """The state in which a search of the two logs begins."""
+    return start_search(segment(two_logs()), LeastSquares(stages=stages, **options))
+
+
+def with_cost(state: SearchState, share: float) -> SearchState:
+    """The state at so many times the largest cost of the noise alone."""
+    cost = 0.5 * share * MAX_CHI_SQUARE_RATIO * state.iterate.equations.count
+    return replace(state, iterate=replace(state.iterate, equations=replace(state.iterate.equations, cost=cost)))
+
+
+@pytest.mark.parametrize(
+    ("squares", "allows", "shortcut", "gap"),
+    [
+        ({1e-5: 9.0}, True, Shortcut.LAST_STAGE, 1e-5),
+        ({1e-5: 11.0}, False, Shortcut.NONE, 1e-2),
+        ({1e-5: 11.0, 3e-3: 1.0, 1e-3: 1.1, 3e-4: 5.0, 1e-4: 8.0}, True, Shortcut.STATE_NOISE, 1e-3),
+        ({1e-5: 11.0, 3e-3: 2.0, 1e-3: 3.0, 3e-4: 5.0, 1e-4: 8.0}, True, Shortcut.STATE_NOISE, 1e-2),
+    ],
+)
+def test_the_shortcut_after_a_first_stage_is_chosen_by_what_other_gaps_promise(
+    squares: dict[float, float], allows: bool, shortcut: Shortcut, gap: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Squares by gap, over their number: tight gaps where they promise little, else the tightest at the noise."""
+    state = begun(allows_state_noise=allows)
+    count = state.iterate.equations.count
+    monkeypatch.setattr(SearchState, "promised_squares", lambda _, stage: squares[stage.gap] * count)
+    chosen, stage = choose_shortcut(state)
+    assert (chosen, stage.gap) == (shortcut, gap)
+
+
+@pytest.mark.parametrize(
+    ("cost", "fall", "noisy", "trapped", "repeat"),
+    [
+        (5.0, 0.05, False, False, Repeat.STOP),  # above the noise, and the cost hardly falls
+        (5.0, 0.2, False, False, Repeat.GO_ON),
+        (5.0, 0.2, False, True, Repeat.FREE_NODES),
+        (0.9, 0.0, False, False, Repeat.GO_ON),
+        (0.9, 0.0, False, True, Repeat.FREE_NODES),
+        (5.0, 0.0, True, True, Repeat.GO_ON),  # gaps as noise of the states free no node
+    ],
+)
+def test_a_last_stage_is_repeated_as_its_state_says(
+    cost: float, fall: float, noisy: bool, trapped: bool, repeat: Repeat
+) -> None:
+    state = with_cost(begun(stages=(Stage(1e-5, 30, refine=2),)), cost)
+    damping = np.where(np.arange(state.segments.count) == 2, 5.0 * trapped, 0.0)
+    state = replace(state, last_decrease=fall, noisy_gaps=noisy, node_damping=damping)
+    moving = ConvergenceTest(Status(Code.NOT_CONVERGED))
+    assert choose_repeat(state, moving) is repeat
+    assert choose_repeat(state, ConvergenceTest(Status(Code.CONVERGED))) is Repeat.STOP
+    assert choose_repeat(state, moving._replace(unidentifiable=np.array([0]))) is Repeat.STOP
+
+
+def test_stages_that_explained_the_logs_are_loosened_the_tightest_first() -> None:
+    state, method = begun(), LeastSquares()
+    noise = 0.5 * MAX_CHI_SQUARE_RATIO * state.iterate.equations.count
+    nodes, z = state.iterate.nodes, state.iterate.z
+    ends = tuple(StageEnd(nodes, z, noise * share) for share in (0.5, 0.8, 0.9, 1.1, 4.0))
+    state = replace(state, stage_ends=ends)
+    assert [stage.gap for stage, _ in stages_to_loosen(state)] == [1e-3, 3e-3]
+    assert [end for _, end in stages_to_loosen(state)] == [ends[2], ends[1]]
+    assert [s.gap for s, _ in stages_to_loosen(replace(state, unsettled_gaps=frozenset({1e-3})))] == [3e-3]
+    assert method.stages[2].gap == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("end", "options", "change", "factor"),
+    [
+        (SearchEnd.UNSETTLED, {}, None, 0),
+        (SearchEnd.OPTIMUM, {"checks_steps": False}, None, 0),
+        (SearchEnd.OPTIMUM, {}, None, 2),
+        (SearchEnd.OPTIMUM, {}, 1e-9, 1),  # the finer steps of the last stage have moved no estimate
+        (SearchEnd.OPTIMUM, {}, 1.0, 2),
+        (SearchEnd.OPTIMUM, {"substeps": 3}, None, 1),
+    ],
+)
+def test_finer_steps_are_tried_at_an_optimum_that_they_may_move(
+    end: SearchEnd, options: dict[str, Any], change: float | None, factor: int
+) -> None:
+    state = begun(**options).ended(end)
+    if change is not None:
+        run = state.run(state.substeps)
+        state = replace(state, correction=IntegrationCorrection(run.y * 0 + change, run.x_end * 0, run))
+    assert choose_finer_steps(state) == factor * state.output_substeps
+
+
+def test_a_move_leaves_the_state_before_it_as_it_was() -> None:
+    state = begun()
+    nodes, z, damping = state.iterate.nodes.copy(), state.iterate.z.copy(), state.node_damping.copy()
+    ended = run_search(state)
+    assert (state.iterations, state.end, state.stage_ends) == (0, None, ())
+    assert ended.end is SearchEnd.OPTIMUM
+    for before, after in zip(
+        (nodes, z, damping), (state.iterate.nodes, state.iterate.z, state.node_damping), strict=True
+    ):
+        assert_allclose(after, before, rtol=0, atol=0)
+
+
+def test_an_interruption_leaves_the_last_iterate() -> None:
+    """Wherever Ctrl-C comes: in a trial of the last stage after the first, it is that trial's iterate."""
+    costs = list[str]()
+
+    def stop(line: str) -> None:
+        costs.append(line)
+        if line.startswith("stage 6/6"):
+            raise KeyboardInterrupt
+
+    state = run_search(begun(progress=stop))
+    assert state.end is SearchEnd.INTERRUPTED
+    assert state.status.code is Code.INTERRUPTED
+    assert state.iterations == len(costs)
+    assert state.stage.gap == LeastSquares().stages[-1].gap
