@@ -661,8 +661,8 @@ MAX_JUMP_MISFIT = 10.0
 # stages at whose gaps noise of the states is tried [1]: fewer miss those at which a search settles, more of them hardly
 # hold the states together
 MAX_LOOSENED = 2
-# creeping steps in a row after which a search with noise of the states leaps: fewer leave a way that leads on, more
-# take long
+# creeping steps in a row after which a search with noise of the states takes undamped ones: fewer leave a way that
+# leads on, more take long
 MAX_CREEPING_STEPS = 3
 
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
@@ -1254,16 +1254,12 @@ def repeat_last_stage(state: SearchState) -> SearchState:
         state = free_nodes(state, trapped_nodes(state)) if repeat is Repeat.FREE_NODES else iterate(state, count)
         has_settled = moved_deviations(state, before.iterate.z) <= state.method.tolerance
         if has_settled:
-            state = replace(state, tolerance=max(state.tolerance, settled_step(state)))
+            settled = MAX_NOISY_STEP if state.noisy_gaps else MAX_SETTLED_STEP
+            state = replace(state, tolerance=max(state.tolerance, settled))
         is_lost = state.noisy_gaps and not has_settled  # a kink that it creeps over would take hundreds of steps
         if is_lost or before.iterate.cost - state.iterate.cost < least_decrease:
             break
     return state.concluded()
-
-
-def settled_step(state: SearchState) -> float:
-    """The step that may be asked for where a repeat has moved no estimate [standard deviations]."""
-    return MAX_NOISY_STEP if state.noisy_gaps else MAX_SETTLED_STEP
 
 
 @keeps_state

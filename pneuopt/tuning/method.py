@@ -60,6 +60,8 @@ class SearchResult:
         At least "optimum", the objective there, where the status is "converged".
     is_complete : bool
         False where Ctrl-C ended the search.
+    uses_simulator : bool
+        Whether the method has searched on the task's simulator, so that closer samples of that matter to it.
     """
 
     point: Array
@@ -67,6 +69,7 @@ class SearchResult:
     active: tuple[str, ...]
     stats: Mapping[str, float]
     is_complete: bool = True
+    uses_simulator: bool = False
 
 
 class LimitPath(Protocol):

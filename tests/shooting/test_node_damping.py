@@ -209,7 +209,7 @@ def test_a_search_with_noise_of_the_states_that_creeps_takes_undamped_steps(
     helps: bool, steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a log with encoder steps it took 60 steps of .13 each where 35 were promised, and gave up."""
-    begun, leaps, taken = start_search(segment(wrong_squares()), LeastSquares()), list[float](), list[float]()
+    begun, walks, taken = start_search(segment(wrong_squares()), LeastSquares()), list[float](), list[float]()
     state = replace(begun, noisy_gaps=True, iterate=iterate(1000.0))
 
     def creep(descent: Descent, current: Iterate) -> Iterate:
@@ -217,19 +217,19 @@ def test_a_search_with_noise_of_the_states_that_creeps_takes_undamped_steps(
         taken.append(current.cost)
         return iterate(current.cost - 0.1)
 
-    def leap(_: Descent, current: Iterate) -> tuple[Iterate, int]:
-        leaps.append(current.cost)
-        return iterate(current.cost - 1.0) if helps and len(leaps) < 3 else current, 4
+    def walk(_: Descent, current: Iterate) -> tuple[Iterate, int]:
+        walks.append(current.cost)
+        return iterate(current.cost - 1.0) if helps and len(walks) < 3 else current, 4
 
     monkeypatch.setattr(Descent, "step", creep)
-    monkeypatch.setattr(Descent, "undamped_steps", leap)
+    monkeypatch.setattr(Descent, "undamped_steps", walk)
     monkeypatch.setattr(SearchState, "segments", begun.segments)
     monkeypatch.setattr(SearchState, "is_at_noise", False)
     lifted.iterate(state, 30)
     assert len(taken) == steps
-    leaps.clear()
+    walks.clear()
     lifted.iterate(replace(state, noisy_gaps=False), 5)
-    assert not leaps
+    assert not walks
 
 
 def test_a_budget_ends_a_step_between_its_tries() -> None:
