@@ -880,14 +880,14 @@ class SearchState:
         asked = f"kinks of the model ask for {found.largest_step:.2g} standard deviations, which the intervals hold"
         return found._replace(status=found.status.with_details(f"the estimates have settled; {asked}"))
 
-    def ended(self, end: SearchEnd, status: Status | None = None) -> "SearchState":
+    def end_with(self, end: SearchEnd, status: Status | None = None) -> "SearchState":
         """The state with an end, and its status if that says more than the end does."""
         return replace(self, end=end, status=status or end.status)
 
-    def concluded(self, found: ConvergenceTest | None = None) -> "SearchState":
+    def conclude(self, found: ConvergenceTest | None = None) -> "SearchState":
         """The state with the end that its convergence test says."""
         status = (found or self.assess()).status
-        return self.ended(SearchEnd.OPTIMUM if status.converged else SearchEnd.UNSETTLED, status)
+        return self.end_with(SearchEnd.OPTIMUM if status.converged else SearchEnd.UNSETTLED, status)
 
     def resumed_after(self, trial: "SearchState") -> "SearchState":
         """The state after a trial that led nowhere: nothing has moved but the trial's iterations and stiffness."""
@@ -946,9 +946,9 @@ def run_search(state: SearchState) -> SearchState:
         with check_during_runs(state.method.budget.check):
             return refine_steps(run_stages(state))
     except InterruptedSearchError as stop:
-        return stop.state.ended(SearchEnd.INTERRUPTED)
+        return stop.state.end_with(SearchEnd.INTERRUPTED)
     except KeyboardInterrupt:
-        return state.ended(SearchEnd.INTERRUPTED)
+        return state.end_with(SearchEnd.INTERRUPTED)
 
 
 @keeps_state
@@ -963,7 +963,7 @@ def run_stages(state: SearchState) -> SearchState:
     if state.setup.is_too_stiff:
         verdict = f"the model is so stiff that a sample takes {state.setup.required_substeps} integration steps"
         remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
-        return state.ended(SearchEnd.TOO_STIFF, Status(Code.NOT_CONVERGED, (verdict, remedy)))
+        return state.end_with(SearchEnd.TOO_STIFF, Status(Code.NOT_CONVERGED, (verdict, remedy)))
     for stage in state.method.stages:
         state = pass_stage(state, stage)
         if state.end is not None:
@@ -983,16 +983,16 @@ def pass_stage(state: SearchState, stage: Stage) -> SearchState:
         if state.end is not None:
             return state
     elif stage is last and state.stage_ends and state.is_hopeless:
-        return state.ended(SearchEnd.ABANDONED)
+        return state.end_with(SearchEnd.ABANDONED)
     state = run_stage(state, stage)
     if not math.isfinite(state.iterate.cost):
-        return state.ended(SearchEnd.DIVERGED)
+        return state.end_with(SearchEnd.DIVERGED)
     state = replace(state, stage_ends=(*state.stage_ends, StageEnd(state.iterate.nodes, state.iterate.z, state.cost)))
     if joins_known_search(state):
-        return state.ended(SearchEnd.DUPLICATE)
+        return state.end_with(SearchEnd.DUPLICATE)
     if stage is not first:
         return state
-    return state.ended(SearchEnd.ABANDONED) if state.is_hopeless else shorten(state)
+    return state.end_with(SearchEnd.ABANDONED) if state.is_hopeless else shorten(state)
 
 
 def run_stage(state: SearchState, stage: Stage) -> SearchState:
@@ -1147,7 +1147,7 @@ def jump_to_last_stage(state: SearchState) -> SearchState:
     if math.isfinite(trial.iterate.cost):
         trial = iterate(trial, JUMP_ITERATIONS)
         if trial.is_at_noise:  # finer steps are lost on what has not come near the noise by then
-            trial = finish_stage(trial, JUMP_ITERATIONS).concluded()
+            trial = finish_stage(trial, JUMP_ITERATIONS).conclude()
             if trial.end is SearchEnd.OPTIMUM and trial.is_at_noise:
                 return trial
     return state.resumed_after(trial)
@@ -1203,7 +1203,7 @@ def tighten(state: SearchState) -> SearchState:
     for stage in state.method.stages:
         if stage.gap < state.stage.gap and trial.is_at_noise:
             trial = run_stage(trial, stage)
-    trial = trial.concluded()
+    trial = trial.conclude()
     if trial.stage is last and trial.end is SearchEnd.OPTIMUM and trial.is_at_noise:
         return trial
     return state.resumed_after(trial)
@@ -1250,7 +1250,7 @@ def repeat_last_stage(state: SearchState) -> SearchState:
         before, found = state, state.assess()
         repeat = choose_repeat(state, found)
         if repeat is Repeat.STOP:
-            return state.concluded(found)
+            return state.conclude(found)
         state = free_nodes(state, trapped_nodes(state)) if repeat is Repeat.FREE_NODES else iterate(state, count)
         has_settled = moved_deviations(state, before.iterate.z) <= state.method.tolerance
         if has_settled:
@@ -1259,7 +1259,7 @@ def repeat_last_stage(state: SearchState) -> SearchState:
         is_lost = state.noisy_gaps and not has_settled  # a kink that it creeps over would take hundreds of steps
         if is_lost or before.iterate.cost - state.iterate.cost < least_decrease:
             break
-    return state.concluded()
+    return state.conclude()
 
 
 @keeps_state
@@ -1319,7 +1319,7 @@ def refine_steps(state: SearchState) -> SearchState:
             state = replace(finer, integration_change=shown)
             # the finer steps have moved the optimum with noise of the states a little
             return iterate(state, state.stage.iterations) if state.noisy_gaps else state
-        state = iterate(finer, finer.stage.iterations).concluded()
+        state = iterate(finer, finer.stage.iterations).conclude()
     return state
 
 

@@ -443,7 +443,7 @@ def test_stages_that_explained_the_logs_are_loosened_the_tightest_first() -> Non
 def test_finer_steps_are_tried_at_an_optimum_that_they_may_move(
     end: SearchEnd, options: dict[str, Any], change: float | None, factor: int
 ) -> None:
-    state = begun(**options).ended(end)
+    state = begun(**options).end_with(end)
     if change is not None:
         run = state.run(state.substeps)
         state = replace(state, correction=IntegrationCorrection(run.y * 0 + change, run.x_end * 0, run))
