@@ -47,7 +47,7 @@ def check_steps(
     InputError
         With the steps, the minutes that they take, what makes them so many, and how to raise the budget.
     """
-    needed = [plants * count_steps(loop, reference, parameters) for reference in references]
+    needed = [plants * simulation_steps(loop, reference, parameters) for reference in references]
     if sum(needed) <= max_steps:
         return
     longest = references[needed.index(max(needed))]
@@ -63,7 +63,7 @@ def check_steps(
     )
 
 
-def count_steps(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> float:
+def simulation_steps(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> float:
     """How many steps the independent simulation of a response takes, at least."""
     spacing = sample_spacing(loop, reference, parameters)
     points = POINTS_PER_READING * readings_a_sample(loop, reference) * reference.horizon / spacing

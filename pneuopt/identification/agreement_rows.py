@@ -10,7 +10,7 @@ from pneuopt.identification.statistics import agreement, cross_correlation, ljun
 from pneuopt.identification.windows import run_freely
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,9 +10,7 @@ from dataclasses import replace
 from pneuopt.identification.fit_order import is_optimum
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.status import Code
-from pneuopt.shooting.convergence import MAX_GAP_SHARE
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import MAX_GAP_SHARE, Fit, solve_least_squares
 
 # squared residuals over the noise's [1], and the gaps' share of them [1], above which a model does not follow whole
 # logs, so that windows are tried: lower cuts logs that it follows but for a sensor's lag (60 and .17), higher iterates

@@ -24,7 +24,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import ProgressReporter
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
-from pneuopt.shooting.budget import CpuBudget
+from pneuopt.shooting.least_squares import CpuBudget
 
 BLOCKS = 8  # of the shortest run: more are refined longer, fewer make poorer mixtures
 MOST_REPEATS = 4  # times that the shortest run fits into the duration: more make runs without slow motions

@@ -15,10 +15,9 @@ from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array
-from pneuopt.shooting.budget import BudgetSpentError
-from pneuopt.shooting.integration_steps import choose_integration
-from pneuopt.shooting.segments import segment, start_nodes
-from pneuopt.shooting.state_filter import GATHERED_DEVIATION, filter_nodes
+from pneuopt.shooting.filters import GATHERED_DEVIATION, filter_nodes
+from pneuopt.shooting.least_squares import BudgetSpentError
+from pneuopt.shooting.segments import choose_integration, segment, start_nodes
 
 # segments of an excerpt: fewer may lack motion that a parameter needs, more cost time
 EXCERPT_SEGMENTS = 1000

@@ -2,9 +2,7 @@
 
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.status import Code
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
-from pneuopt.shooting.search_end import ABANDONED_START
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, Fit, SearchEnd
 
 # excess of a parameter over another one that bounds it [1] below which another start is tried: lower takes a basin that
 # has lost it for the answer, higher searches drives twice that have as good as none
@@ -16,7 +14,7 @@ def is_optimum(fit: Fit) -> bool:
     """Whether a search ended at an optimum, be it of a model so wrong that the gaps absorb its misfit."""
     is_settled = not (fit.unsettled or fit.unidentifiable)
     is_missed = fit.status.code is Code.NOT_CONVERGED and is_settled and fit.stats["gap_share"] > MAX_GAP_SHARE
-    is_missed &= fit.status is not ABANDONED_START
+    is_missed &= fit.end is not SearchEnd.ABANDONED
     return fit.status.converged or is_missed
 
 
@@ -38,7 +36,7 @@ def rank(fit: Fit, tightest: float) -> tuple[int, float]:
     fits come after those that explain the log without.
     """
     cost = fit.stats["cost"]
-    is_cut = fit.status is ABANDONED_START or fit.status.code is Code.INTERRUPTED
+    is_cut = fit.end is SearchEnd.ABANDONED or fit.status.code is Code.INTERRUPTED
     if is_cut and fit.stats["gap_deviation"] > tightest:
         return 3, cost
     if fit.jumps is not None:

@@ -25,10 +25,8 @@ from pneuopt.identification.widths import excerpts
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS, choose_integration
-from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.segments import Segments, segment, start_nodes
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, LeastSquares
+from pneuopt.shooting.segments import MAX_SEARCH_SUBSTEPS, Segments, choose_integration, segment, start_nodes
 
 if TYPE_CHECKING:
     import pandas as pd

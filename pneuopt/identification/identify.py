@@ -53,10 +53,7 @@ from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.budget import CpuBudget
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, CpuBudget, Fit, LeastSquares, solve_least_squares
 
 if TYPE_CHECKING:
     import pandas as pd

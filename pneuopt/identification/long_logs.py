@@ -22,10 +22,12 @@ from pneuopt.identification.multistart import (
 )
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.status import Code
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START, INTERRUPTED_SEARCH
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import (
+    MAX_CHI_SQUARE_RATIO,
+    Fit,
+    SearchEnd,
+    solve_least_squares,
+)
 
 # iterations with tight gaps that long logs get before a part of them is tried: more cost time, fewer leave easy logs
 SHORT_ITERATIONS = 10
@@ -52,7 +54,7 @@ def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], C
         if not tried:
             raise
         held, fit, label = tried[0]
-        found = held, replace(fit, status=INTERRUPTED_SEARCH), label
+        found = held, replace(fit, status=SearchEnd.INTERRUPTED.status), label
     if found[1].status.code is not Code.INTERRUPTED:
         return found
     held, fit, label = min([found, *tried], key=lambda each: rank(each[1], problem.method.stages[-1].gap))
@@ -106,7 +108,7 @@ def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
         last = replace(problem.method, stages=stages[-1:])
         longer = solve_least_squares(problem.transcription(problem.start_from(short)), last)
         yield problem, longer.with_effort_of(short), rough.label
-    elif not is_near and (found := _fit_filtered(problem, rough, is_far=short.status is ABANDONED_START)):
+    elif not is_near and (found := _fit_filtered(problem, rough, is_far=short.end is SearchEnd.ABANDONED)):
         yield found
     held, fit, label = fit_from_starts(parts)
     if fit.status.code is Code.INTERRUPTED:

@@ -19,9 +19,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, Fit, LeastSquares, solve_least_squares
 
 MAX_REFITS = 12  # refits with new weights, at most: fewer leave the weights unsettled, more cost time
 # standard deviations that an estimate may still move from refit to refit: smaller takes more refits, larger stops early

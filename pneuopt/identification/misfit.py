@@ -30,10 +30,9 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.scores import FitScores, fit_scores
+from pneuopt.shooting.filters import FitScores, fit_scores
+from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, Fit, Optimum
 from pneuopt.shooting.segments import Segments, segment
-from pneuopt.shooting.solution import Fit, Optimum
 
 # classes of a simulated signal, equally full: more see finer effects with less certainty
 MOTION_CLASSES = 6

@@ -23,9 +23,7 @@ from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.predicted_fit import fit_from_predictions
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, LeastSquares, SearchEnd, solve_least_squares
 
 GUESS_STAGES = 3  # stages of a search with guesses held: more force a wrong guess on the log, fewer rank starts wrongly
 # squared residuals a sample after the first stage or before the last, in noise variances, beyond which the first start
@@ -92,7 +90,7 @@ def fit_from_starts(
             tried = replace(problem, method=_method_after(problem, fits)) if known else problem
             held, fit = fit_holding_unidentifiable(tried, start, limit, known)
             held = replace(held, method=problem.method)
-            if fit.status is JOINED_SEARCH:
+            if fit.end is SearchEnd.DUPLICATE:
                 break
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
             if explains_to_noise(held, fit) and not held.held and is_in_order(held, fit):
@@ -123,7 +121,7 @@ def _fit_predicted(problem: EstimationProblem, first: Fit) -> Fit | None:
 
     Raises `KeyboardInterrupt` if it was interrupted.
     """
-    found = fit_from_predictions(problem, HOPELESS_MISFIT) if first.status is ABANDONED_START else None
+    found = fit_from_predictions(problem, HOPELESS_MISFIT) if first.end is SearchEnd.ABANDONED else None
     if found is not None and found.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     if found is None or not explains_to_noise(problem, found) or not is_in_order(problem, found):
@@ -204,7 +202,7 @@ def starts_by_cost(
 def _stages_before_left(problem: EstimationProblem, fit: Fit) -> int:
     """The stages after which a search was left for other starts; 0 if it was not."""
     gaps = [stage.gap for stage in problem.method.stages]
-    return 1 + gaps.index(fit.stats["gap_deviation"]) if fit.status is ABANDONED_START else 0
+    return 1 + gaps.index(fit.stats["gap_deviation"]) if fit.end is SearchEnd.ABANDONED else 0
 
 
 def _cost_after_guesses(problem: EstimationProblem, fits: Sequence[Candidate]) -> float:

@@ -28,7 +28,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.shooting.budget import CpuBudget
+from pneuopt.shooting.least_squares import CpuBudget
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,7 +15,7 @@ from pneuopt.identification.identifiability import rejects_held_values, verdict_
 from pneuopt.identification.multistart import fit_holding_unidentifiable
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.result import IdentificationResult, Mark
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit
 
 # deviations [1] by which one estimate lies below another that bounds it, beyond which the model is wrong: lower blames
 # chance, higher passes friction that no drive has

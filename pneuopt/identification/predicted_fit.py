@@ -17,11 +17,10 @@ from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.excerpts import filter_states, liveliest_part
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.quantities.arrays import Array, Indices
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.prediction_errors import PredictionErrors
-from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.equations import ParameterScaling
+from pneuopt.shooting.filters import PredictionErrors
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
 from pneuopt.shooting.segments import Segments, segment, start_nodes
-from pneuopt.shooting.solution import Fit
 
 # segments of all logs that the filter follows: fewer may lack motion that a parameter needs, more cost time
 PART_SEGMENTS = 300

@@ -22,8 +22,7 @@ from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, LeastSquares
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 STATIC_SEGMENTS = 100  # segments of a static map's log: fewer make uneven blocks of time, more cost time

@@ -10,8 +10,7 @@ from dataclasses import replace
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.identification.profiles import Profile
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
 
 
 def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[Profile]) -> Fit | None:

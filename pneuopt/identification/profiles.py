@@ -18,8 +18,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.shown import Shown
 from pneuopt.quantities.status import Code
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 
 if TYPE_CHECKING:
     import pandas as pd

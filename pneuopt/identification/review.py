@@ -30,8 +30,8 @@ from pneuopt.identification.result import (
 from pneuopt.identification.widths import advise_widths
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.equations import segment_gaps
+from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.segments import segment, start_nodes
 
 if TYPE_CHECKING:

@@ -18,8 +18,7 @@ from pneuopt.identification.misfit import Misfit
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.widths import SIGNIFICANT_FALL
 from pneuopt.quantities.arrays import Array
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.solution import Fit, Optimum
+from pneuopt.shooting.least_squares import Fit, Optimum, solve_least_squares
 
 # change of an estimate by a rejected width, in its deviations [1], up to which it is no bias: a 95 % interval that is
 # shifted by half a deviation still holds the truth 92 times in 100; lower marks what does no harm

@@ -23,12 +23,9 @@ from pneuopt.identification.result import ChosenWidth
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
-from pneuopt.shooting.budget import BudgetSpentError
 from pneuopt.shooting.equations import weigh_gaps
-from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS, choose_integration
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import BudgetSpentError, Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.segments import MAX_SEARCH_SUBSTEPS, choose_integration, segment, stable_substeps, start_nodes
 from pneuopt.shooting.transcription import Transcription
 
 CHOSEN_WIDTH = "chosen by identify from the logs"

@@ -25,11 +25,8 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.convergence import MAX_GAP_SHARE
-from pneuopt.shooting.free_run import close_gaps
-from pneuopt.shooting.integration_steps import choose_integration
-from pneuopt.shooting.segments import segment, start_nodes
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import MAX_GAP_SHARE, Fit, close_gaps
+from pneuopt.shooting.segments import choose_integration, segment, start_nodes
 
 # measured samples of the shortest window that is tried: with fewer its start states take most of what it tells, with
 # more a plant that runs away quickly is not followed

@@ -15,12 +15,8 @@ from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.width_bias import fixed_widths
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.units import write_value
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.search import Search
-from pneuopt.shooting.search_end import ABANDONED_START
+from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, Fit, SearchEnd, solve_least_squares, start_search
 from pneuopt.shooting.segments import segment
-from pneuopt.shooting.solution import Fit
 
 # share of the misfit [1] that a freed value must explain by the linearised equations to be tried: lower tries what does
 # not help, higher passes over what is far off
@@ -190,10 +186,10 @@ def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict
         return math.nan, {}
     freed = replace(problem, parameters=problem.parameters.freed(*names))
     here = replace(problem.method, stages=problem.method.stages[-1:], progress=None)
-    search = Search(segment(freed.transcription(freed.start_from(fit))), here)
-    equations, scaling, free = search.current.equations, search.scaling, freed.unknowns().free_names
+    begun = start_search(segment(freed.transcription(freed.start_from(fit))), here)
+    equations, scaling, free = begun.iterate.equations, begun.setup.scaling, freed.unknowns().free_names
     tested = np.isin(free, names)
-    movable = scaling.has_effect(equations) & ~scaling.held & ~scaling.at_bound(search.current.z)
+    movable = scaling.has_effect(equations) & ~scaling.fixed & ~scaling.at_bound(begun.iterate.z)
     squares = {name: equations.promised_squares(movable & (~tested | (np.array(free) == name))) for name in names}
     return equations.promised_squares(movable & ~tested), squares
 
@@ -234,7 +230,7 @@ def _search_freed(freed: EstimationProblem, fit: Fit, allowed: float) -> Fit | N
         found = solve_least_squares(freed.transcription(freed.start_from(found)), replace(method, stages=stages))
         if found.status.code is Code.INTERRUPTED:
             raise KeyboardInterrupt
-        optimum, is_left = found.optimum, found.status is ABANDONED_START
+        optimum, is_left = found.optimum, found.end is SearchEnd.ABANDONED
         if is_left or optimum is None or optimum.equations.promised_squares(optimum.keep) > allowed * fit.count:
             return None
     return found

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled.rollout import Gram, Pieces, Rollout, RolloutResult
+from pneuopt.dynamics.partitioned_step import PARTITIONED_MAX_H_GROWTH, PARTITIONED_MAX_H_LAMBDA
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import DiscreteSystem, names
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import ModelError, require
@@ -240,10 +242,10 @@ def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.
     The stiffness is taken at nodes all along the start and at the extremes of every state and input; the result is
     `SUBSTEPS_CAP` at most, for a start may be absurd.
     """
-    return count_steps(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
+    return substeps_for(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
 
 
-def count_steps(segments: Segments, rate: float, step: float) -> int:
+def substeps_for(segments: Segments, rate: float, step: float) -> int:
     """Integration steps a sample that keep h times a rate [1/s] within `step`, `SUBSTEPS_CAP` at most."""
     return min(max(1, math.ceil(float(segments.h.max()) * rate / step)), SUBSTEPS_CAP)
 
@@ -360,3 +362,82 @@ def _cut_phase(
         np.full(m, index),
         ends - phase.nodes,
     )
+
+
+# relative change of a parameter [1] after which the stiffness is computed anew: higher risks unstable steps
+STIFFNESS_UPDATE_CHANGE = 0.03
+MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample: a search with more would take hours, fewer refuse stiff models
+MAX_STAGE_REFINEMENT = 8  # factor on the start's integration steps in a stage: higher takes long, lower may be unstable
+# RK4 steps over steps that are implicit in a state, at least [1]: such a step takes as long as one and a half of RK4's
+# and is of lower order; higher leaves stiff plants slow, lower gives exactness away
+MIN_IMPLICIT_GAIN = 4.0
+# steps a sample that are implicit in a state, at least: fewer take crossings of rest so coarsely that estimates move,
+# more take longer
+MIN_IMPLICIT_SUBSTEPS = 4
+# factor on a stage's refinement where steps are implicit in a state [1]: lower leaves errors that add up along a log,
+# higher takes longer
+IMPLICIT_REFINEMENT = 4
+STABILITY_RESERVE = 1.3  # RK4 steps over those that it needs, as they are counted, below which it becomes unstable [1]
+# values of a state at which its growth rate is asked for, on either side of zero, and the range that they span [1]:
+# fewer may miss the steepest fall of friction, more take longer
+GROWTH_POINTS, GROWTH_RANGE = 12, 1e-3
+
+
+def choose_integration(
+    segments: Segments, nodes: Array, values: Array, given: int | None = None
+) -> tuple[Segments, int]:
+    """Choose how segments are integrated: by RK4, or implicitly in the state that makes RK4 slow.
+
+    Parameters
+    ----------
+    segments : Segments
+    nodes : ndarray, shape (m, n_states)
+    values : ndarray
+        All the problem's parameters.
+    given : int, optional
+        The steps a sample, where they are known.
+
+    Returns
+    -------
+    segments : Segments
+        The same, or a copy with another `implicit_state`.
+    steps : int
+        Integration steps a sample.
+    """
+    state, steps = None, 1
+    if nodes.shape[1]:
+        jacobians = stiffness_jacobians(segments, nodes, values)
+        steps = substeps_for(segments, largest_rate(jacobians), RK4_MAX_H_LAMBDA)
+        if steps > STABILITY_RESERVE * (given or MIN_IMPLICIT_GAIN * MIN_IMPLICIT_SUBSTEPS / STABILITY_RESERVE):
+            state, steps = _choose_implicit_state(segments, nodes, values, jacobians, steps)
+    if state != segments.implicit_state:
+        segments = segments.with_implicit_state(state)
+    return segments, given or steps
+
+
+def _choose_implicit_state(
+    segments: Segments, nodes: Array, values: Array, jacobians: Array, steps: int
+) -> tuple[int | None, int]:
+    """The state whose own rate asks RK4 for so many steps, and the steps with it implicit; None if that is no gain."""
+    if segments.system.pieces.ode is None:
+        return None, steps
+    state = int(np.argmin(np.einsum("kii->ki", jacobians).min(axis=0, initial=0.0)))
+    reach = float(np.abs(nodes[:, state]).max())
+    sizes = reach * np.geomspace(GROWTH_RANGE, 1.0, GROWTH_POINTS)
+    if not 0 < reach < np.inf:
+        return None, steps
+    moving = stiffness_jacobians(segments, nodes, values, (state, np.concatenate([-sizes, sizes])))
+    others = np.concatenate([jacobians, moving])
+    growth = float(others[:, state, state].max(initial=0.0))
+    others[:, state, state] = 0.0
+    needed = max(
+        MIN_IMPLICIT_SUBSTEPS,
+        substeps_for(segments, largest_rate(others), PARTITIONED_MAX_H_LAMBDA),
+        substeps_for(segments, growth, PARTITIONED_MAX_H_GROWTH),
+    )
+    return (state, needed) if steps >= MIN_IMPLICIT_GAIN * needed else (None, steps)
+
+
+def fine_steps(segments: Segments, steps: int, refine: int) -> int:
+    """The steps a sample that correct the residuals of coarse ones; those implicit in a state are of lower order."""
+    return steps * refine * (1 if segments.implicit_state is None else IMPLICIT_REFINEMENT)

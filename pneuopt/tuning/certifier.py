@@ -32,7 +32,7 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.agreement import describe_agreement
 from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.responses import worst_values
-from pneuopt.tuning.result import RELAXATION_COLUMNS, TuningResult, requirement_table
+from pneuopt.tuning.result import RELAXATION_COLUMNS, Refusal, TuningResult, requirement_table
 from pneuopt.tuning.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -105,7 +105,8 @@ class Certifier:
             status = Status(Code.NOT_CERTIFIED, (str(error),))
         deviation = (claimed - certified).abs().max(axis=1).items() if found is not None else ()
         marks = {"contacts": float(len(contacts))} if contacts else {}
-        marks |= {"fails_late": 1.0} if within and not contacts and not status.converged else {}
+        fails_late = within and not contacts and not status.converged
+        marks |= {"fails_late": 1.0} if fails_late else {}
         active, stats = (found.active, found.stats) if found is not None else ((), {})
         return TuningResult(
             self.task.space.parameters,
@@ -118,6 +119,7 @@ class Certifier:
             {**stats, **{f"deviation.{n}": float(v) for n, v in deviation}, **marks, **slopes},
             self._provenance(),
             proof,
+            refusal=Refusal.END_STOP if contacts else Refusal.LATE if fails_late else None,
         )
 
     def _provenance(self) -> dict[str, str]:

@@ -25,7 +25,7 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.solution import Solution
+from pneuopt.shooting.full_space import Solution
 from pneuopt.tuning.method import LimitPath, Method, SearchResult
 from pneuopt.tuning.relaxation import limits_with_settling
 from pneuopt.tuning.responses import to_records

@@ -12,7 +12,7 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arguments import check_number
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import ProgressCallback, Status
-from pneuopt.shooting.solution import Solution
+from pneuopt.shooting.full_space import Solution
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
@@ -61,6 +61,8 @@ class SearchResult:
         At least "optimum", the objective there, where the status is "converged".
     is_complete : bool
         False where Ctrl-C ended the search.
+    uses_simulator : bool
+        Whether the method has searched on the task's simulator, so that closer samples of that matter to it.
     """
 
     point: Array
@@ -68,6 +70,7 @@ class SearchResult:
     active: tuple[str, ...]
     stats: Mapping[str, float]
     is_complete: bool = True
+    uses_simulator: bool = False
 
 
 class LimitPath(Protocol):

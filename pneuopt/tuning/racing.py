@@ -140,7 +140,7 @@ class Racing:
         result = search_result(task, simulator, spec, best.point)
         counts = {"simulations": best.count, "starts": best.starts, "starts_agreeing": best.agreeing}
         stats = {**result.stats, **{n: float(count) for n, count in counts.items()}}
-        return replace(result, stats=stats, is_complete=best.is_complete)
+        return replace(result, stats=stats, is_complete=best.is_complete, uses_simulator=True)
 
     def shorten(self, margin: float) -> "Racing":
         """The method for a short search from a point that is close."""

@@ -29,8 +29,7 @@ def confirm_refusal(search: Search, refused: TuningResult) -> tuple[TuningResult
         Whose design was refused.
     refused : TuningResult
     """
-    resting = replace(search, rests=True)
-    vars(resting)["simulator"] = search.simulator
+    resting = search.among_resting()
     longer = resting.lengthen(rests=True)
     try:
         points, count = find_candidates(lambda at: _excess(resting, longer, at), search.space, search.progress)

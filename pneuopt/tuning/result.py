@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from math import isfinite, isnan, nan
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.rest_check import RestCheck
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.archive import NOT_SAVED
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.shown import Result
@@ -39,6 +41,13 @@ REQUIREMENT_COLUMNS = ("claimed", "certified", "allowed", "room", "case")
 RELAXATION_COLUMNS = ("asked", "needed", "share")
 MIN_DERIVATIVE_RATIO = 0.01
 """Td/Tf below which a derivative adds less than 1 % to Kp at any frequency: its time would be a riddle."""
+
+
+class Refusal(Enum):
+    """What a certificate has refused a design for, where another rounding of it would not help."""
+
+    END_STOP = "a response ran into an end stop"
+    LATE = "only what comes after a horizon"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,6 +103,8 @@ class TuningResult(Result):
     best : mapping of str to float
         Where the given gains stand, the tuned parameters' values in the best candidate that was found, rounded [SI],
         of which `claimed` and `certified` tell; empty where the design is certified, or none was found.
+    refusal : Refusal, optional
+        What the search goes on by where the certificate has refused the design.
     """
 
     parameters: ParameterSet
@@ -113,6 +124,7 @@ class TuningResult(Result):
     limits: Mapping[str, float] = field(default_factory=dict)
     rest: RestCheck | None = None
     best: Mapping[str, float] = field(default_factory=dict)
+    refusal: Refusal | None = field(default=None, metadata=NOT_SAVED)
 
     @property
     def candidate(self) -> ParameterSet | None:

@@ -26,7 +26,7 @@ from pneuopt.tuning.relaxation import (
     relaxation_specification,
 )
 from pneuopt.tuning.responses import to_records
-from pneuopt.tuning.result import TuningResult, relaxation_share, with_relaxations
+from pneuopt.tuning.result import Refusal, TuningResult, relaxation_share, with_relaxations
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
@@ -59,7 +59,7 @@ RELAXATION_MARGIN = 0.002
 UNTRIED = "it was not tried on other plants"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Search:
     """Search, round the gains and certify them; search again with a wider margin where the certificate fails.
 
@@ -113,7 +113,7 @@ class Search:
                 return self._result_so_far(simulator, found)
             if found.status.converged:
                 result, start = self.certify_roundings(found, margin), found.point
-                if result.status.converged or (self.rests and "contacts" in result.stats):
+                if result.status.converged or (self.rests and result.refusal is Refusal.END_STOP):
                     return result
                 if not self.rests and _ends_elsewhere(result):
                     return self._run_with_rest(result)
@@ -141,10 +141,14 @@ class Search:
     def _run_with_rest(self, refused: TuningResult) -> TuningResult:
         """Search again for designs that end in the band; the refused one's result where there is none."""
         self.progress("the design found does not end at the reference; searching for one that does")
-        other = replace(self, rests=True)
-        vars(other)["simulator"] = self.simulator
-        result = other.run(self.space.start)
+        result = self.among_resting().run(self.space.start)
         return result if result.status.converged or result.status.code is Code.INTERRUPTED else refused
+
+    def among_resting(self) -> "Search":
+        """The search among responses that settle within the horizon, on the same compiled simulator."""
+        other = replace(self, rests=True)
+        other.simulator = self.simulator
+        return other
 
     def lengthen(self, *, rests: bool) -> "Search":
         """A search over a longer horizon, in which a response that hunts or creeps later never settles.
@@ -193,8 +197,8 @@ class Search:
             finer = self._resolve(found.point) if found.is_complete else coarser
             if finer is coarser:
                 break
-            vars(self)["simulator"] = finer
-            if "simulations" in found.stats:  # otherwise the method has samples of its own
+            self.simulator = finer
+            if found.uses_simulator:  # otherwise the method has samples of its own
                 self.progress("the response is too fast for the samples of the search; searching again on closer ones")
                 attempt = attempt if finer.grids is not coarser.grids else max(1, attempt)
                 found = self.method.find(self.task, finer, spec, found.point, attempt, self.progress)
@@ -231,7 +235,7 @@ class Search:
         result = None
         for point in self._round_gains(self.simulator, found, margin):
             result = self.certifier.certify(self.simulator, found, point)
-            if result.status.converged or "contacts" in result.stats or _fails_late(result):
+            if result.status.converged or result.refusal is Refusal.END_STOP or _fails_late(result):
                 break
         assert result is not None
         return result
@@ -250,7 +254,7 @@ class Search:
     def with_specification(self, spec: Specification, method: Method) -> "Search":
         """A search for another specification of the same kinds of requirements, on the same compiled simulator."""
         other = replace(self, task=replace(self.task, spec=spec), method=method)
-        vars(other)["simulator"] = self.simulator
+        other.simulator = self.simulator
         return other
 
     def _result_so_far(self, simulator: Simulator, found: SearchResult) -> TuningResult:
@@ -309,13 +313,13 @@ def _ends_elsewhere(result: TuningResult) -> bool:
     """Whether a design was refused because its response does not end at the reference, or runs into an end stop."""
     findings = result.certificate.findings if result.certificate is not None else ()
     elsewhere = any(f.defect in ENDS_ELSEWHERE and f.sentence in result.status.sentences for f in findings)
-    return elsewhere or "contacts" in result.stats
+    return elsewhere or result.refusal is Refusal.END_STOP
 
 
 def _fails_late(result: TuningResult) -> bool:
     """Whether it was refused for what it does after its horizon, which no rounding mends and a longer one shows."""
     findings = result.certificate.findings if result.certificate is not None else ()
-    return "fails_late" in result.stats or any(f.defect in LATE_DEFECTS for f in findings)
+    return result.refusal is Refusal.LATE or any(f.defect in LATE_DEFECTS for f in findings)
 
 
 def _interruption_result(point: Array) -> SearchResult:

@@ -21,8 +21,14 @@ from pneuopt.quantities.arguments import as_tuple, check_argument, check_number
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import Code, ProgressCallback, Status
-from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path, prepare_full_space, solve_from
-from pneuopt.shooting.solution import Solution
+from pneuopt.shooting.full_space import (
+    FullSpace,
+    FullSpaceProblem,
+    Solution,
+    follow_path,
+    prepare_full_space,
+    solve_from,
+)
 from pneuopt.tuning.agreement import Agreement, compare_starts
 from pneuopt.tuning.merit import WIDEN_BOUNDS
 from pneuopt.tuning.method import SearchResult, TuningTask, check_method_options

@@ -12,7 +12,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import MAX_STEPS, simulate
-from pneuopt.evaluation.budget import check_steps, count_steps
+from pneuopt.evaluation.budget import check_steps, simulation_steps
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.models.linear import FirstOrder
@@ -58,14 +58,14 @@ def test_the_count_is_that_of_the_response() -> None:
     ):
         step = Step(1.0, horizon=0.5)
         assert len(respond(loop, step, loop.parameters)) == pytest.approx(
-            count_steps(loop, step, loop.parameters), rel=0.01
+            simulation_steps(loop, step, loop.parameters), rel=0.01
         )
 
 
 def test_plants_count_and_the_budget_can_be_raised_by_name() -> None:
     loop = ClosedLoop(PLANT, PID(sample_time=1e-3))
     plants = {"a": {"plant.gain": 1.0}, "b": {"plant.gain": 1.1}}
-    needed = 3 * count_steps(loop, Step(1.0), loop.parameters)
+    needed = 3 * simulation_steps(loop, Step(1.0), loop.parameters)
     with pytest.raises(InputError, match="on 3 plants"):
         evaluate(loop, Step(1.0), loop.parameters, scenarios=plants, max_steps=0.99 * needed)
     assert evaluate(loop, Step(1.0), loop.parameters, scenarios=plants, max_steps=needed).shape[1] == 3

@@ -43,7 +43,7 @@ def test_a_search_begins_again_where_a_budget_has_ended_it(monkeypatch: pytest.M
         return evaluations[-1]
 
     monkeypatch.setattr(Rollout, "gram", evaluate)
-    monkeypatch.setattr("pneuopt.shooting.budget.time.process_time", lambda: float(len(evaluations)))
+    monkeypatch.setattr("pneuopt.shooting.least_squares.time.process_time", lambda: float(len(evaluations)))
     stated = PARAMETERS.with_values({"friction.smoothing": 1.1e-3})  # no width is left to choose before the search
     ended = fit(4.0, stated)
     monkeypatch.undo()

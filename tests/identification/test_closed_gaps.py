@@ -19,9 +19,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.convergence import MAX_GAP_SHARE
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import MAX_GAP_SHARE, Fit, LeastSquares, solve_least_squares
 
 STEP, LAG, NOISE = 2e-3, 1e-3, 3e-5  # [s], [s] of the position's sensor, [m]
 TIME = np.arange(0, 3.0, STEP)

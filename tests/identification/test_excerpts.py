@@ -19,9 +19,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.models.catalog import b32
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START, INTERRUPTED_SEARCH
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, LeastSquares, SearchEnd, solve_least_squares
 from pneuopt.shooting.transcription import Transcription
 from problems.shared.b32 import GAINS, run_loop
 
@@ -274,7 +272,7 @@ def test_the_whole_log_is_left_where_the_answer_of_its_part_does_not_explain_it(
     precise = replace(problem, experiments=(replace(log, noise={n: v / 30 for n, v in log.noise.items()}),))
     *_, (_, whole, label) = long_logs._tries_of_long_logs(precise)
     assert label.endswith("of a part")
-    assert whole.status is ABANDONED_START
+    assert whole.end is SearchEnd.ABANDONED
     assert whole.stats["iterations"] <= problem.method.stages[-1].iterations
 
 
@@ -322,7 +320,7 @@ def test_ctrl_c_between_the_tries_ends_all(stage: int, monkeypatch: pytest.Monke
     def cut(transcription: Transcription, method: LeastSquares) -> Fit:
         fit = solve_least_squares(transcription, method)
         runs.append(len(runs))
-        return replace(fit, status=INTERRUPTED_SEARCH) if runs[-1] == stage else fit
+        return replace(fit, status=SearchEnd.INTERRUPTED.status) if runs[-1] == stage else fit
 
     for module in (long_logs, multistart):
         monkeypatch.setattr(module, "solve_least_squares", cut)

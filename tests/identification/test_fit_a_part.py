@@ -9,8 +9,7 @@ from pneuopt.identification import multistart
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
 from tests.identification.test_multistart import VELOCITY, posed
 
 

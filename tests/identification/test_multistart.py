@@ -21,9 +21,7 @@ from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, LeastSquares, SearchEnd, Stage, solve_least_squares
 from pneuopt.shooting.transcription import Transcription
 
 VELOCITY = "friction.stribeck_velocity"
@@ -113,7 +111,12 @@ def test_a_start_explains_the_log_by_tight_gaps_only(
 def test_the_others_settle_by_no_more_stages_than_the_first_start_had() -> None:
     problem = posed(Stribeck())
     fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
-    left = [replace(fit, status=ABANDONED_START, stats={**fit.stats, "gap_deviation": gap}) for gap in (1e-2, 1e-4)]
+    left = [
+        replace(
+            fit, end=SearchEnd.ABANDONED, status=SearchEnd.ABANDONED.status, stats={**fit.stats, "gap_deviation": gap}
+        )
+        for gap in (1e-2, 1e-4)
+    ]
     assert [starting._stages_before_left(problem, each) for each in (*left, fit)] == [1, 5, 0]
 
 
@@ -247,7 +250,7 @@ def test_a_first_start_that_is_far_off_waits_for_the_others(monkeypatch: pytest.
 
     def counted(transcription: Transcription, method: LeastSquares) -> Fit:
         fit = solve_least_squares(transcription, method)
-        stages.append(1 if fit.status is ABANDONED_START else len(method.stages))
+        stages.append(1 if fit.end is SearchEnd.ABANDONED else len(method.stages))
         return fit
 
     monkeypatch.setattr(starting, "solve_least_squares", counted)
@@ -276,7 +279,7 @@ def test_a_lone_start_that_is_far_off_is_searched_to_its_end(monkeypatch: pytest
     monkeypatch.setattr(starting, "HOPELESS_MISFIT", 0.0)
     _, fit, _ = starting.fit_from_starts(problem)
     assert fit.status.converged
-    assert tried == [ABANDONED_START.verdict, fit.status.verdict]
+    assert tried == [SearchEnd.ABANDONED.status.verdict, fit.status.verdict]
 
 
 def test_a_fit_at_the_noise_that_leaves_one_parameter_unsettled_takes_one_more_start(
@@ -308,7 +311,7 @@ def test_a_start_that_joins_the_best_confirms_it(monkeypatch: pytest.MonkeyPatch
     ) -> tuple[EstimationProblem, Fit]:
         known.append(costs)
         held, fit = fit_holding_unidentifiable(problem, start, most)
-        return held, replace(fit, status=JOINED_SEARCH) if costs else fit
+        return held, replace(fit, end=SearchEnd.DUPLICATE) if costs else fit
 
     monkeypatch.setattr(starting, "explains_to_noise", lambda *_: False)
     monkeypatch.setattr(starting, "fit_holding_unidentifiable", joined)

@@ -12,8 +12,7 @@ from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
 
 SYSTEM = po.ForceDrive(po.Stribeck()).system()
 COULOMB, STATIC, VELOCITY = (f"friction.{n}" for n in ("coulomb", "static", "stribeck_velocity"))

@@ -23,16 +23,15 @@ from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.budget import CpuBudget
-from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.search_end import ABANDONED_START
+from pneuopt.shooting.equations import ParameterScaling
+from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, SearchEnd
 from pneuopt.shooting.segments import segment
-from pneuopt.shooting.solution import Fit
 
 STATIC, VELOCITY = "friction.static", "friction.stribeck_velocity"
 TRUTH = {"friction.coulomb": 30.0, STATIC: 50.0, VELOCITY: 0.01, "friction.viscous": 60.0}
 NOISE = 2e-6  # [m]
+
+END = SearchEnd.ABANDONED
 
 
 def posed(friction: FrictionModel, *, disturbance: float = 0.0) -> EstimationProblem:
@@ -155,7 +154,7 @@ def test_a_fit_that_is_no_answer_is_left_for_the_other_starts(fault: str, monkey
         "order": replace(fit, parameters=fit.parameters.with_values({STATIC: 1.02 * TRUTH["friction.coulomb"]})),
         "status": replace(fit, status=Status(Code.NOT_CONVERGED)),
     }[fault]
-    left = replace(fit, status=ABANDONED_START)
+    left = replace(fit, end=END, status=END.status)
     monkeypatch.setattr(multistart, "fit_from_predictions", lambda *_: fit)
     assert multistart._fit_predicted(problem, left) is not None
     assert multistart._fit_predicted(problem, fit) is None
@@ -166,7 +165,10 @@ def test_a_fit_that_is_no_answer_is_left_for_the_other_starts(fault: str, monkey
 def test_ctrl_c_ends_all_with_the_first_start(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, search = posed(Stribeck()), multistart.fit_holding_unidentifiable
     _, fit = search(problem, problem.candidates()[0])
-    left, cut = replace(fit, status=ABANDONED_START), replace(fit, status=Status(Code.INTERRUPTED))
+    left, cut = (
+        replace(fit, end=END, status=END.status),
+        replace(fit, status=Status(Code.INTERRUPTED)),
+    )
     monkeypatch.setattr(multistart, "fit_holding_unidentifiable", lambda *_: (problem, left))
     monkeypatch.setattr(multistart, "fit_from_predictions", lambda *_: cut)
     _, best, label = fit_from_starts(problem)
@@ -184,8 +186,8 @@ def test_it_is_tried_where_the_first_start_is_left(
 
     def first(posed: EstimationProblem, start: Start, *given: float) -> tuple[EstimationProblem, Fit]:
         held, fit = search(posed, start)
-        status = ABANDONED_START if left and not calls else fit.status
-        return held, replace(fit, status=status)
+        left_now = left and not calls
+        return held, replace(fit, end=END, status=END.status) if left_now else fit
 
     def predicted(posed: EstimationProblem, max_misfit: float) -> Fit:
         calls.append(max_misfit)

@@ -16,8 +16,7 @@ from pneuopt.identification.review import review_fit
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
 from tests.identification.test_multistart import TRUTH, VELOCITY, posed
 
 

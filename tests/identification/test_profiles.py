@@ -23,8 +23,7 @@ from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.shooting.transcription import Transcription
 
 LEVELS = {"friction.coulomb": 30.0, "friction.static": 42.0, "friction.stribeck_velocity": 0.025}

@@ -16,8 +16,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Viscous
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
 
 WIDTH = "friction.smoothing"
 FREE = ("friction.coulomb", "friction.viscous")

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 import pneuopt as po
+from pneuopt.dynamics.excitation import Width
 from pneuopt.identification import widths
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.widths import CHOSEN_WIDTH, MAX_TRIAL_SAMPLES, advise_widths, choose_widths, excerpts
-from pneuopt.shooting import integration_steps
-from pneuopt.shooting.budget import CpuBudget
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting import segments
+from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.transcription import Transcription
 
 FREE = ("friction.coulomb", "friction.static", "friction.viscous", "friction.stribeck_velocity")
@@ -133,7 +132,7 @@ def test_a_width_too_narrow_for_the_log_rate_is_widened_in_place_of_a_refusal(mo
     system, log = po.ForceDrive(po.Coulomb()).system(), sliding(1e-2, step=2e-3)
     light = system.parameters.with_values({"load.mass": 0.02}).freed("friction.coulomb")
     assert choose_widths(problem(system, log, light))[1][0].value == 1e-3
-    monkeypatch.setattr(integration_steps, "MIN_IMPLICIT_GAIN", np.inf)
+    monkeypatch.setattr(segments, "MIN_IMPLICIT_GAIN", np.inf)
     assert choose_widths(problem(system, log, light))[1][0].value > 1e-3
 
 
@@ -204,3 +203,26 @@ def test_widths_are_confirmed_at_the_same_gaps(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(widths, "_is_foreseen", lambda *_: False)
     choose_widths(posed)
     assert gaps == [LeastSquares().stages[widths.CONFIRMING_STAGES - 1].gap] * 2
+
+
+@pytest.mark.parametrize(("tight_cost", "is_taken"), [(900.0, False), (100.0, True)])
+def test_a_width_that_tight_gaps_do_not_confirm_is_not_taken(tight_cost: float, is_taken: bool) -> None:
+    """A narrower one lowers the cost with loose gaps by a half, which the given one's equations do not foresee."""
+    width = Width(WIDTH, 4.0)
+    parameters = po.ParameterSet({WIDTH: po.Parameter(1e-3, "m/s", 1e-6, 1.0)})
+
+    def trial(value: float, cost: float) -> widths._Trial:
+        return widths._Trial({WIDTH: value}, cost, np.inf, 1000, parameters, too_stiff=False)
+
+    class Race:
+        def run_scaled(self, at: widths._Trial, _: Width, factor: float) -> widths._Trial:
+            value = at.widths[WIDTH] * factor
+            return trial(value, 300.0 if value == pytest.approx(2.5e-4) else 1e4)
+
+        def run(self, at: dict[str, float], *, confirms: bool) -> widths._Trial:
+            assert confirms
+            return trial(at[WIDTH], 500.0 if at[WIDTH] == 1e-3 else tight_cost)
+
+    given = trial(1e-3, 600.0)
+    found, _ = widths._search_width(Race(), width, given)  # type: ignore[arg-type]
+    assert (found is not given) == is_taken

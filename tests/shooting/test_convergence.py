@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.shooting.convergence import _least_certain
-from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.equations import ParameterScaling
+from pneuopt.shooting.least_squares import _least_certain
 
 
 @pytest.mark.parametrize(

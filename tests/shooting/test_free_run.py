@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pneuopt.shooting.free_run import close_gaps
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.solution import Optimum
+from pneuopt.shooting.least_squares import LeastSquares, Optimum, Stage, close_gaps, solve_least_squares
 from tests.shooting.test_least_squares import propagate, two_logs
 
 
@@ -30,5 +28,5 @@ def test_closed_gaps_leave_the_run_from_end_to_end() -> None:
 
 
 def test_gaps_that_stay_open_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pneuopt.shooting.free_run.MAX_STEPS", 1)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_STEPS", 1)
     assert close_gaps(jumping_fit()) is None

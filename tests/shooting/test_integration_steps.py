@@ -8,8 +8,15 @@ from pneuopt.dynamics.system import discretise, names
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.arrays import Array
-from pneuopt.shooting.integration_steps import MIN_IMPLICIT_SUBSTEPS, choose_integration, fine_steps
-from pneuopt.shooting.segments import Segments, segment, stable_substeps, start_nodes
+from pneuopt.shooting.segments import (
+    MIN_IMPLICIT_SUBSTEPS,
+    Segments,
+    choose_integration,
+    fine_steps,
+    segment,
+    stable_substeps,
+    start_nodes,
+)
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 

@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import pytest
 
-from pneuopt.shooting import last_stage
-from pneuopt.shooting.least_squares import LeastSquares, Stage
-from pneuopt.shooting.levenberg_marquardt import Descent, Iterate
-from pneuopt.shooting.search import Search
+from pneuopt.shooting import least_squares as lifted
+from pneuopt.shooting.least_squares import Descent, Iterate, LeastSquares, SearchState, Stage, start_search
 from tests.shooting.first_order import first_order_log
 
 N = 30
+
+
+def with_cost(state: SearchState, cost: float) -> SearchState:
+    """The state at a cost that its equations only claim."""
+    return replace(state, iterate=replace(state.iterate, equations=replace(state.iterate.equations, cost=cost)))
 
 
 @pytest.mark.parametrize(
@@ -25,31 +28,27 @@ def test_a_search_whose_cost_falls_steeply_goes_on_before_it_is_near_the_noise(
     A short trial of a long log ends: the next way is cheaper.
     """
     method = LeastSquares(stages=(Stage(1e-5, iterations, refine=2),))
-    search, falls, taken = Search(first_order_log(N).segments, method), iter(decreases), list[float]()
+    falls, taken = iter(decreases), list[float]()
 
-    def fall(*_: object) -> bool:
-        cost = search.current.equations.cost
-        taken.append(search.last_decrease)
-        search.current = replace(search.current, equations=replace(search.current.equations, cost=0.1 * cost))
-        search.last_decrease = next(falls)
-        return False
+    def fall(state: SearchState, _: object = None) -> SearchState:
+        taken.append(state.last_decrease)
+        return replace(with_cost(state, 0.1 * state.iterate.cost), last_decrease=next(falls))
 
-    search.current = replace(search.current, equations=replace(search.current.equations, cost=1e9))
-    search.last_decrease = next(falls)
-    monkeypatch.setattr(search, "run_stage", fall)
-    last_stage.repeat_last_stage(search)
+    state = replace(with_cost(start_search(first_order_log(N).segments, method), 1e9), last_decrease=next(falls))
+    monkeypatch.setattr(lifted, "iterate", fall)
+    lifted.repeat_last_stage(state)
     assert taken == [0.3] * repeats
 
 
 def test_a_stage_keeps_by_how_much_its_last_iteration_has_lowered_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     costs = iter([50.0, 45.0])
-    search = Search(first_order_log(N).segments, LeastSquares())
-    search.current = replace(search.current, equations=replace(search.current.equations, cost=100.0))
+    state = with_cost(start_search(first_order_log(N).segments, LeastSquares()), 100.0)
 
     def step(_: Descent, current: Iterate) -> Iterate:
         return replace(current, equations=replace(current.equations, cost=next(costs)))
 
     monkeypatch.setattr(Descent, "step", step)
-    monkeypatch.setattr(Search, "_corrects_residuals", False)
-    assert not search.run_stage(2)
-    assert search.last_decrease == pytest.approx(0.1)
+    monkeypatch.setattr(SearchState, "corrects_residuals", False)
+    state = lifted.iterate(state, 2)
+    assert not state.has_stalled
+    assert state.last_decrease == pytest.approx(0.1)

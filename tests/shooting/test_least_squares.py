@@ -1,4 +1,6 @@
 import math
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -14,9 +16,8 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.full_space import solve_full_space
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.segments import IntegrationCorrection, Segments
-from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 H = 0.02
@@ -397,3 +398,32 @@ def test_the_steps_fall_again_where_a_start_was_stiffer_than_the_answer(monkeypa
     assert fit.stats["substeps"] <= 8
     # the answer's steps are finer, without a derivative at them
     assert fit.stats["substeps"] > steps[-1]
+
+
+@pytest.mark.parametrize(
+    ("make", "option", "allowed"),
+    [
+        (lambda: LeastSquares(stages=()), "stages=()", "one Stage or more"),
+        (lambda: LeastSquares(segment_time=math.nan), "segment_time=nan", "seconds above 0"),
+        (lambda: LeastSquares(segment_time=-1.0), "segment_time=-1.0", "seconds above 0"),
+        (lambda: LeastSquares(substeps=0), "substeps=0", "a whole number from 1"),
+        (lambda: LeastSquares(substeps=2.5), "substeps=2.5", "a whole number from 1"),  # type: ignore[arg-type]
+        (lambda: LeastSquares(tolerance=0.0), "tolerance=0.0", "a positive number"),
+        (lambda: LeastSquares(kinematic=math.nan), "kinematic=nan", "a positive number"),
+        (lambda: Stage(-1e-3, 8), "gap=-0.001", "a positive fraction"),
+        (lambda: Stage(math.nan, 8), "gap=nan", "a positive fraction"),
+        (lambda: Stage(1e-3, -1), "iterations=-1", "0 or more"),
+        (lambda: Stage(1e-3, 8, refine=0), "refine=0", "or more"),
+    ],
+)
+def test_an_option_out_of_its_range_is_refused_by_its_name(
+    make: Callable[[], object], option: str, allowed: str
+) -> None:
+    """They ended in a traceback from inside, or meant another search: a gap of -1e-3 was one of 1e-3."""
+    with pytest.raises(ValueError, match=re.escape(option)) as refused:
+        make()
+    assert allowed in str(refused.value)
+
+
+def test_options_at_the_ends_of_their_ranges_are_taken() -> None:
+    assert LeastSquares(segment_time=math.inf, substeps=1, stages=(Stage(1e-12, 0),)).stages[0].iterations == 0

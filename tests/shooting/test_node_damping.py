@@ -14,16 +14,23 @@ from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.status import Status
-from pneuopt.shooting import last_stage
-from pneuopt.shooting.budget import BudgetSpentError, CpuBudget
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.equations import missed_curvature, normal_equations
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.levenberg_marquardt import Descent, Iterate, Objective
-from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.search import Search
-from pneuopt.shooting.search_end import end_search
+from pneuopt.shooting import least_squares as lifted
+from pneuopt.shooting.equations import ParameterScaling, missed_curvature, normal_equations
+from pneuopt.shooting.least_squares import (
+    MAX_CHI_SQUARE_RATIO,
+    BudgetSpentError,
+    CpuBudget,
+    Descent,
+    Iterate,
+    LeastSquares,
+    Objective,
+    SearchEnd,
+    SearchState,
+    Stage,
+    end_search,
+    solve_least_squares,
+    start_search,
+)
 from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
@@ -124,16 +131,16 @@ def test_nodes_are_damped_alone_near_an_optimum_only(
     Before, nodes would be left behind that tighter gaps cannot free; so they would in a stage that settles a start: a
     log of bristles took 45 CPU s for an answer with noise of the states, in place of 7.
     """
-    damped, search = list[bool](), Search(segment(wrong_squares()), LeastSquares(stages=LeastSquares().stages[stages]))
-    search.noisy_gaps = noisy
-    search.current = replace(search.current, equations=replace(search.current.equations, cost=cost))
+    damped, method = list[bool](), LeastSquares(stages=LeastSquares().stages[stages])
+    state = replace(start_search(segment(wrong_squares()), method), noisy_gaps=noisy)
+    at = replace(state.iterate, equations=replace(state.iterate.equations, cost=cost))
 
     def take_no_step(descent: Descent, *_: object) -> None:
         damped.append(descent.damps_nodes)
 
     monkeypatch.setattr(Descent, "step", take_no_step)
-    monkeypatch.setattr(Search, "_corrects_residuals", False)
-    search.run_stage(8)
+    monkeypatch.setattr(SearchState, "corrects_residuals", False)
+    lifted.iterate(replace(state, iterate=at), 8)
     assert damped == [damps]
 
 
@@ -146,12 +153,12 @@ def right_squares() -> Transcription:
     return replace(problem, residuals=(replace(problem.residuals[0], measured=measured, noise=np.array([NOISE, 0.5])),))
 
 
-@pytest.mark.parametrize("repeats", [0, last_stage.MAX_REPEATS])
+@pytest.mark.parametrize("repeats", [0, lifted.MAX_REPEATS])
 def test_a_search_that_explains_the_log_is_not_left_short_of_its_optimum(
     repeats: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A log of bristles at rest was, and other starts took 30 CPU s in place of 3 for no answer."""
-    monkeypatch.setattr(last_stage, "MAX_REPEATS", repeats)
+    monkeypatch.setattr(lifted, "MAX_REPEATS", repeats)
     fit = solve_least_squares(
         right_squares(), LeastSquares(stages=(Stage(1e-3, 1, refine=2),), substeps=1, tolerance=1e-4)
     )
@@ -162,19 +169,21 @@ def test_a_search_that_explains_the_log_is_not_left_short_of_its_optimum(
 @pytest.mark.parametrize("helps", [True, False])
 def test_a_trapped_node_is_put_to_the_end_of_the_segment_before_it(helps: bool) -> None:
     """One node over a kink, which no longer moved, kept a log of 1400 from its optimum, 11 lower in cost."""
-    search = Search(segment(right_squares()), LeastSquares(stages=(Stage(1e-3, 0, refine=2),), substeps=1))
-    search.solve()
-    nodes = np.ones((N // 2, 1)) + 0.01
+    method = LeastSquares(stages=(Stage(1e-3, 0, refine=2),), substeps=1)
+    state = lifted.run_search(start_search(segment(right_squares()), method))
+    nodes, damping = np.ones((N // 2, 1)) + 0.01, np.zeros(N // 2)
     nodes[9 if helps else slice(0, 9)] += 0.5  # where all nodes before are wrong, this one would be, too
-    search.node_damping[9] = 2 * last_stage.TRAPPING_DAMPING
-    search.current = before = search.evaluate(nodes, 0.0 * search.current.z)
-    last_stage.free_nodes(search, np.array([9]))
+    damping[9] = 2 * lifted.TRAPPING_DAMPING
+    state = replace(state.at(nodes, 0.0 * state.iterate.z), node_damping=damping)
+    trapped = lifted.trapped_nodes(state)
+    assert trapped.tolist() == [9]
+    freed = lifted.free_nodes(state, trapped)
     if helps:
-        assert_allclose(search.current.nodes, np.ones((N // 2, 1)) + 0.01)
-        assert not search.node_damping.any()
+        assert_allclose(freed.iterate.nodes, np.ones((N // 2, 1)) + 0.01)
+        assert not freed.node_damping.any()
     else:
-        assert search.current is before
-        assert search.node_damping[9] > last_stage.TRAPPING_DAMPING
+        assert freed.iterate is state.iterate
+        assert freed.node_damping[9] > lifted.TRAPPING_DAMPING
 
 
 def iterate(cost: float) -> Iterate:
@@ -184,44 +193,43 @@ def iterate(cost: float) -> Iterate:
 @pytest.mark.parametrize(
     ("costs", "best", "taken"), [((30.0, 12.0, 5.0), 5.0, 3), ((30.0, 20.0), 10.0, 2), ((30.0, math.inf, 1.0), 10.0, 2)]
 )
-def test_a_leap_may_raise_the_cost_for_a_while(
+def test_undamped_steps_may_raise_the_cost_for_a_while(
     costs: tuple[float, ...], best: float, taken: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Undamped steps end at a negligible one, or where the model is not finite; the least cost counts."""
     steps = iter([*map(iterate, costs), None])
     monkeypatch.setattr(Descent, "_step_undamped", lambda *_: next(steps))
-    search = Search(segment(wrong_squares()), LeastSquares())
-    found, count = Descent(search._objective(), 0.0, lambda *_: False).leap(iterate(10.0))
+    objective = start_search(segment(wrong_squares()), LeastSquares()).objective()
+    found, count = Descent(objective, 0.0, lambda *_: False).undamped_steps(iterate(10.0))
     assert (found.cost, count) == (best, taken)
 
 
 @pytest.mark.parametrize(("helps", "steps"), [(False, 3), (True, 9)])
-def test_a_search_with_noise_of_the_states_that_creeps_leaps(
+def test_a_search_with_noise_of_the_states_that_creeps_takes_undamped_steps(
     helps: bool, steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a log with encoder steps it took 60 steps of .13 each where 35 were promised, and gave up."""
-    search, leaps, taken = Search(segment(wrong_squares()), LeastSquares()), list[float](), list[float]()
-    search.noisy_gaps, search.current = True, iterate(1000.0)
+    begun, walks, taken = start_search(segment(wrong_squares()), LeastSquares()), list[float](), list[float]()
+    state = replace(begun, noisy_gaps=True, iterate=iterate(1000.0))
 
     def creep(descent: Descent, current: Iterate) -> Iterate:
         descent.promised = 35.0
         taken.append(current.cost)
         return iterate(current.cost - 0.1)
 
-    def leap(_: Descent, current: Iterate) -> tuple[Iterate, int]:
-        leaps.append(current.cost)
-        return iterate(current.cost - 1.0) if helps and len(leaps) < 3 else current, 4
+    def walk(_: Descent, current: Iterate) -> tuple[Iterate, int]:
+        walks.append(current.cost)
+        return iterate(current.cost - 1.0) if helps and len(walks) < 3 else current, 4
 
     monkeypatch.setattr(Descent, "step", creep)
-    monkeypatch.setattr(Descent, "leap", leap)
-    monkeypatch.setattr(Search, "_report", lambda _: None)
-    monkeypatch.setattr(Search, "is_noise", lambda *_: False)
-    search.run_stage(30)
+    monkeypatch.setattr(Descent, "undamped_steps", walk)
+    monkeypatch.setattr(SearchState, "segments", begun.segments)
+    monkeypatch.setattr(SearchState, "is_at_noise", False)
+    lifted.iterate(state, 30)
     assert len(taken) == steps
-    search.noisy_gaps = False
-    leaps.clear()
-    search.run_stage(5)
-    assert not leaps
+    walks.clear()
+    lifted.iterate(replace(state, noisy_gaps=False), 5)
+    assert not walks
 
 
 def test_a_budget_ends_a_step_between_its_tries() -> None:
@@ -246,31 +254,28 @@ def test_a_budget_ends_a_step_between_its_tries() -> None:
     assert len(tried) == 1
 
 
-def variance(search: Search) -> float:
-    covariance = search.current.equations.covariance(np.array([True]))
+def variance(state: SearchState) -> float:
+    covariance = state.iterate.equations.covariance(np.array([True]))
     assert covariance is not None
     return float(covariance[0, 0])
 
 
-def near_optimum(deviations: float, monkeypatch: pytest.MonkeyPatch, *, follows: float) -> Search:
+def near_optimum(deviations: float, monkeypatch: pytest.MonkeyPatch, *, follows: float) -> SearchState:
     """A search so many deviations beside its optimum, which an iteration follows by a share of that."""
     method = LeastSquares(stages=(Stage(1e-3, 30, refine=2),), substeps=1, tolerance=0.1)
-    search = Search(segment(right_squares()), method)
-    search.solve()
-    search.tolerance = method.tolerance
-    optimum = search.current
-    deviation, t = math.sqrt(variance(search)), search.segments.t[:, :1]
+    state = lifted.run_search(start_search(segment(right_squares()), method))
+    state = replace(state, tolerance=method.tolerance, end=None)
+    optimum = state.iterate
+    deviation, t = math.sqrt(variance(state)), state.segments.t[:, :1]
 
-    def beside(away: Array) -> Iterate:
-        return search.evaluate(optimum.nodes + away * (t - t.mean()), optimum.z + away)
+    def beside(at: SearchState, away: Array) -> SearchState:
+        return at.at(optimum.nodes + away * (t - t.mean()), optimum.z + away)
 
-    def follow(*_: object) -> bool:
-        search.current = beside((1 - follows) * (search.current.z - optimum.z))
-        return False
+    def follow(at: SearchState, _: int) -> SearchState:
+        return beside(at, (1 - follows) * (at.iterate.z - optimum.z))
 
-    search.current = beside(np.array([deviations * deviation]))
-    monkeypatch.setattr(search, "run_stage", follow)
-    return search
+    monkeypatch.setattr(lifted, "iterate", follow)
+    return beside(state, np.array([deviations * deviation]))
 
 
 @pytest.mark.parametrize(
@@ -292,93 +297,111 @@ def test_a_search_whose_estimates_move_no_more_has_settled(
     What is asked for widens the interval, and the status says so; a search that would go farther has not converged.
     With noise of the states, a rig with hysteresis was refused for .77 deviations, while three steps moved .003.
     """
-    search = near_optimum(deviations, monkeypatch, follows=follows)
-    search.noisy_gaps = noisy
-    last_stage.repeat_last_stage(search)
-    found = search.assess(search.current)
-    assert found.status.converged == (asks is not None)
+    state = replace(near_optimum(deviations, monkeypatch, follows=follows), noisy_gaps=noisy)
+    found = lifted.repeat_last_stage(state)
+    assert (found.end is SearchEnd.OPTIMUM) == found.status.converged == (asks is not None)
     assert (f"the estimates have settled; kinks of the model ask for {asks}" in found.status.message) == bool(asks)
 
 
 def test_a_search_with_noise_of_the_states_is_repeated_and_frees_no_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its gaps are what is estimated; closing one where a kink holds a node would take that away."""
-    search = near_optimum(0.85, monkeypatch, follows=0.02)
-    search.method = replace(search.method, stages=(replace(search.stage, gap=2e-3), search.stage))
-    monkeypatch.setattr(search, "_finish_stage", lambda _: True)
-    monkeypatch.setattr(search, "_tighten", lambda: None)
-    monkeypatch.setattr(last_stage, "free_nodes", lambda *_: pytest.fail("a node is freed"))
-    repeat = last_stage.repeat_last_stage
+    state = near_optimum(0.85, monkeypatch, follows=0.02)
+    method = replace(state.method, stages=(replace(state.stage, gap=2e-3), state.stage))
+    state = replace(state, setup=replace(state.setup, method=method))
+    monkeypatch.setattr(lifted, "finish_stage", lambda at, _: at)
+    monkeypatch.setattr(lifted, "tighten", lambda at: at)
+    monkeypatch.setattr(lifted, "free_nodes", lambda *_: pytest.fail("a node is freed"))
+    repeat = lifted.repeat_last_stage
 
-    def trap(of: Search) -> Status:
-        of.node_damping[3] = 1e6
-        return repeat(of)
+    def trap(of: SearchState) -> SearchState:
+        return repeat(replace(of, node_damping=np.where(np.arange(N // 2) == 3, 1e6, of.node_damping)))
 
-    monkeypatch.setattr("pneuopt.shooting.search.repeat_last_stage", trap)
-    found = search._loosen(search.method.stages[0], search.current.nodes, search.current.z)
-    assert found.converged
-    assert "the estimates have settled" in found.message
-    assert search.noisy_gaps
+    monkeypatch.setattr(lifted, "repeat_last_stage", trap)
+    found = lifted.loosen(state, method.stages[0], state.iterate.nodes, state.iterate.z)
+    assert found.end is SearchEnd.OPTIMUM
+    assert "the estimates have settled" in found.status.message
+    assert found.noisy_gaps
 
 
 def test_what_kinks_ask_for_widens_the_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
-    search = near_optimum(0.4, monkeypatch, follows=0.0)
-    last_stage.repeat_last_stage(search)
-    step, fit = (
-        search.assess(search.current).largest_step,
-        end_search(search, search.assess(search.current).status, 0.0),
-    )
+    state = lifted.repeat_last_stage(near_optimum(0.4, monkeypatch, follows=0.0))
+    step, fit = state.assess().largest_step, end_search(state, 0.0)
     assert 0.3 < step < 0.5
     assert fit.covariance is not None
-    assert fit.covariance[0, 0] / variance(search) == pytest.approx(1 + step**2, rel=0.05)
-    search._enter_stage(search.stage, search.current.nodes, search.current.z)
-    assert not search.assess(search.current).status.converged
+    assert fit.covariance[0, 0] / variance(state) == pytest.approx(1 + step**2, rel=0.05)
+    again = lifted.enter_stage(state, state.stage, state.iterate.nodes, state.iterate.z)
+    assert not again.assess().status.converged
 
 
 def test_an_estimate_that_moves_has_not_settled(monkeypatch: pytest.MonkeyPatch) -> None:
-    search = near_optimum(3.0, monkeypatch, follows=0.3)
-    monkeypatch.setattr(last_stage, "MAX_REPEATS", 1)
-    last_stage.repeat_last_stage(search)
-    assert search.tolerance == search.method.tolerance
-    assert not search.assess(search.current).status.converged
+    state = near_optimum(3.0, monkeypatch, follows=0.3)
+    monkeypatch.setattr(lifted, "MAX_REPEATS", 1)
+    state = lifted.repeat_last_stage(state)
+    assert state.tolerance == state.method.tolerance
+    assert state.end is SearchEnd.UNSETTLED
 
 
 def test_a_search_of_no_iterations_only_assesses_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """A width was scored by a search that was to stay at the fit; ten iterations more, and none was rejected."""
-    search = near_optimum(0.4, monkeypatch, follows=1.0)
-    search.stage = replace(search.stage, iterations=0)
-    last_stage.repeat_last_stage(search)
-    assert not search.assess(search.current).status.converged
+    state = near_optimum(0.4, monkeypatch, follows=1.0)
+    state = lifted.repeat_last_stage(replace(state, stage=replace(state.stage, iterations=0)))
+    assert state.end is SearchEnd.UNSETTLED
+    monkeypatch.undo()
     fit = solve_least_squares(right_squares(), LeastSquares(stages=(Stage(1e-3, 0, refine=2),), substeps=1))
     assert fit.stats["iterations"] == 0
 
 
 def test_a_search_with_noise_of_the_states_that_moves_is_repeated_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A log that sticks and slips took 220 iterations, 52 CPU s, before another start was tried."""
-    search, taken = near_optimum(1e3, monkeypatch, follows=0.01), list[int]()
-    search.noisy_gaps, follow = True, search.run_stage
+    state, taken = near_optimum(1e3, monkeypatch, follows=0.01), list[int]()
+    follow = lifted.iterate
 
-    def count(steps: int) -> bool:
+    def count(at: SearchState, steps: int) -> SearchState:
         taken.append(steps)
-        return follow(steps)
+        return follow(at, steps)
 
-    monkeypatch.setattr(search, "run_stage", count)
-    assert not last_stage.repeat_last_stage(search).converged
-    assert taken == [last_stage.REPEAT_ITERATIONS]
+    monkeypatch.setattr(lifted, "iterate", count)
+    assert lifted.repeat_last_stage(replace(state, noisy_gaps=True)).end is SearchEnd.UNSETTLED
+    assert taken == [lifted.REPEAT_ITERATIONS]
 
 
 @pytest.mark.parametrize("iterations", [4, 10, 30])
 def test_a_last_stage_is_repeated_three_times_in_all(iterations: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    search, taken = near_optimum(1e3, monkeypatch, follows=0.01), list[int]()
-    search.stage = replace(search.stage, iterations=iterations)
-    search.method = replace(search.method, stages=(search.stage,))
-    follow = search.run_stage
+    state, taken = near_optimum(1e3, monkeypatch, follows=0.01), list[int]()
+    stage = replace(state.stage, iterations=iterations)
+    setup = replace(state.setup, method=replace(state.method, stages=(stage,)))
+    follow = lifted.iterate
 
-    def count(steps: int) -> bool:
+    def count(at: SearchState, steps: int) -> SearchState:
         taken.append(steps)
-        return follow(steps)
+        return follow(at, steps)
 
-    monkeypatch.setattr(search, "run_stage", count)
-    monkeypatch.setattr(search, "is_noise", lambda _: True)
-    last_stage.repeat_last_stage(search)
-    assert sum(taken) == last_stage.MAX_REPEATS * iterations
-    assert max(taken) == min(iterations, last_stage.REPEAT_ITERATIONS)
+    monkeypatch.setattr(lifted, "iterate", count)
+    monkeypatch.setattr(SearchState, "is_at_noise", True)
+    lifted.repeat_last_stage(replace(state, setup=setup, stage=stage))
+    assert sum(taken) == lifted.MAX_REPEATS * iterations
+    assert max(taken) == min(iterations, lifted.REPEAT_ITERATIONS)
+
+
+@pytest.mark.parametrize("move", ["step", "undamped_steps"])
+def test_nodes_follow_the_step_that_a_bound_has_left(move: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a linear model one step ends where no node's step is left, at the bound, too, and not at that of no bound."""
+    problem = wrong_squares()
+    linear = problem.residuals[0]
+    measured = np.column_stack([H * np.arange(N), np.full(N, np.nan)])  # a rate of 1 m/s
+    bounded = ParameterSet({"rate": Parameter(0.5, "m/s", -5.0, 0.6, free=True)})
+    problem = replace(problem, parameters=bounded, residuals=(replace(linear, measured=measured),))
+    monkeypatch.setattr(lifted, "MAX_NODE_STEPS", 0)  # which would mend it
+    objective = start_search(segment(problem), LeastSquares(substeps=1)).objective()
+    descent = Descent(objective, 0.0, lambda *_: False)
+    begun = objective.evaluate(np.zeros((N // 2, 1)), objective.scaling.start)
+    if move == "step":
+        found = descent.step(begun)
+    else:
+        monkeypatch.setattr(lifted, "MAX_UNDAMPED_STEPS", 1)
+        found, _ = descent.undamped_steps(begun)
+    assert found is not None
+    assert found.z.tolist() == [0.6]
+    left = found.equations.arrow.node_step(np.zeros(N // 2))
+    assert left is not None
+    assert_allclose(left, 0.0, atol=1e-6)

@@ -7,8 +7,7 @@ from numpy.testing import assert_allclose
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.shooting.least_squares import LeastSquares, Stage
-from pneuopt.shooting.search import Search
+from pneuopt.shooting.least_squares import LeastSquares, SearchState, Stage, run_search, start_search
 from pneuopt.shooting.segments import segment
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
@@ -46,26 +45,25 @@ def run(system: DiscreteSystem, push: Array, values: dict[str, float]) -> Array:
     return out
 
 
-def searched(method: LeastSquares) -> Search:
-    search = Search(segment(pushed(START)), method)
-    search.solve()
-    return search
+def searched(method: LeastSquares) -> SearchState:
+    return run_search(start_search(segment(pushed(START)), method))
 
 
 def test_nodes_settle_after_a_step_that_opens_the_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
     method = LeastSquares(stages=(Stage(1e-5, 60),))
     settling = searched(method)
-    monkeypatch.setattr("pneuopt.shooting.levenberg_marquardt.MAX_NODE_STEPS", 0)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_NODE_STEPS", 0)
     creeping = searched(method)
-    for search in (settling, creeping):
-        found = search.scaling.values(search.current.z)
+    for state in (settling, creeping):
+        found = state.setup.scaling.values(state.iterate.z)
         assert dict(zip(TRUTH, found.tolist(), strict=True)) == pytest.approx(TRUTH, rel=1e-3)
-        assert search.current.cost == pytest.approx(N / 2, rel=0.05)
+        assert state.iterate.cost == pytest.approx(N / 2, rel=0.05)
     assert settling.iterations <= 0.4 * creeping.iterations
 
 
 def test_a_node_step_is_the_step_with_no_parameter_free() -> None:
-    arrow = Search(segment(pushed(START)), LeastSquares(stages=(Stage(1e-2, 1),))).current.equations.arrow
+    begun = start_search(segment(pushed(START)), LeastSquares(stages=(Stage(1e-2, 1),)))
+    arrow = begun.iterate.equations.arrow
     reduced = arrow.eliminate(1e-3)
     step = arrow.node_step(np.full(len(arrow.node_gradient), 1e-3))
     assert reduced is not None

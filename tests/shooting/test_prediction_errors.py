@@ -5,11 +5,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pneuopt.quantities.arrays import Array, Indices
-from pneuopt.shooting import prediction_errors
-from pneuopt.shooting.prediction_errors import ROBUST_SQUARES, PredictionErrors
-from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting import filters
+from pneuopt.shooting.equations import ParameterScaling
+from pneuopt.shooting.filters import ROBUST_SQUARES, START_DEVIATION, PredictionErrors
 from pneuopt.shooting.segments import Segments, start_nodes
-from pneuopt.shooting.state_filter import START_DEVIATION
 from tests.shooting.first_order import GAIN, NOISE, ROUGH, SAMPLE, SAMPLES, TIME_CONSTANT, first_order_log, forced
 
 N = 120  # samples
@@ -84,7 +83,7 @@ def test_the_stiffest_set_counts_for_the_integration_steps(monkeypatch: pytest.M
     def choose(_: Segments, __: Array, q: Array) -> tuple[Segments, int]:
         return (stiff, 12) if q.max() > 2.0 else (segments, 4)
 
-    monkeypatch.setattr(prediction_errors, "choose_integration", choose)
+    monkeypatch.setattr(filters, "choose_integration", choose)
     errors.adapt_steps(z[:1])
     assert (errors.segments.implicit_state, errors.substeps) == (None, 4)
     errors.descend(z, GATHERED, 0)

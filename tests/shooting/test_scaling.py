@@ -6,8 +6,7 @@ import pytest
 
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.shooting.arrow import ArrowEquations
-from pneuopt.shooting.equations import NormalEquations
-from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.equations import NormalEquations, ParameterScaling
 
 
 def test_a_held_parameter_is_never_movable() -> None:

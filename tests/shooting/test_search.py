@@ -13,17 +13,41 @@ from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
-from pneuopt.shooting.budget import CpuBudget
-from pneuopt.shooting.equations import correct_residuals, normal_equations, weigh_gaps
-from pneuopt.shooting.integration_steps import refine_steps
-from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.levenberg_marquardt import Iterate
-from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.search import Search
-from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH, StageEnd, end_search
+from pneuopt.shooting.equations import ParameterScaling, correct_residuals, normal_equations, weigh_gaps
+from pneuopt.shooting.least_squares import (
+    FINE_TOLERANCE,
+    MAX_CHI_SQUARE_RATIO,
+    ConvergenceTest,
+    CpuBudget,
+    Fit,
+    Iterate,
+    LeastSquares,
+    Objective,
+    Repeat,
+    SearchEnd,
+    SearchState,
+    Shortcut,
+    Stage,
+    StageEnd,
+    apply_finer_steps,
+    choose_finer_steps,
+    choose_repeat,
+    choose_shortcut,
+    correct_residuals_by,
+    end_search,
+    enter_stage,
+    is_negligible_step,
+    jump_to_last_stage,
+    loosen,
+    refine_steps,
+    run_search,
+    run_stage,
+    run_stages,
+    solve_least_squares,
+    stages_to_loosen,
+    start_search,
+)
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, segment, start_nodes
-from pneuopt.shooting.solution import Fit
-from pneuopt.shooting.stage_end import FINE_TOLERANCE
 from tests.shooting.test_least_squares import TRUTH, found, shaken, two_logs
 
 FIRST, *OTHERS = LeastSquares().stages
@@ -63,7 +87,7 @@ def test_a_first_stage_that_explains_the_logs_is_followed_by_the_last() -> None:
 def test_a_last_stage_that_does_not_soon_converge_is_left_for_the_stages_between(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("pneuopt.shooting.search.JUMP_ITERATIONS", 1)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.JUMP_ITERATIONS", 1)
     fit, stages = fit_by_stages(LeastSquares())
     assert stages.index("6/6") < stages.index("2/6")
     assert fit.status.converged
@@ -73,35 +97,34 @@ def test_a_last_stage_that_does_not_soon_converge_is_left_for_the_stages_between
 def test_a_budget_that_ends_in_refinement_leaves_coarse_runs_only(monkeypatch: pytest.MonkeyPatch) -> None:
     budget, steps, refined = CpuBudget(1e9), steps_of_runs(monkeypatch), list[RolloutResult]()
 
-    def spend(search: Search, status: Status) -> Status:
-        assert status.converged
-        assert search.correction is not None
-        refined.append(search.run(search.output_substeps))
+    def spend(state: SearchState) -> SearchState:
+        assert state.end is SearchEnd.OPTIMUM
+        assert state.correction is not None
+        refined.append(state.run(state.output_substeps))
         budget._end = 0.0
         steps.clear()
-        return refine_steps(search, status)
+        return refine_steps(state)
 
-    monkeypatch.setattr("pneuopt.shooting.search.refine_steps", spend)
-    search = Search(segment(two_logs()), LeastSquares(budget=budget))
-    fit = search.solve()
-    assert fit.status.code is Code.INTERRUPTED
-    assert steps[1:] == [search.substeps]  # the first one has not begun
-    assert search.substeps < search.output_substeps
+    monkeypatch.setattr("pneuopt.shooting.least_squares.refine_steps", spend)
+    state = run_search(start_search(segment(two_logs()), LeastSquares(budget=budget)))
+    fit = end_search(state, 0.0)
+    assert (fit.end, fit.status.code) == (SearchEnd.INTERRUPTED, Code.INTERRUPTED)
+    assert steps[1:] == [state.substeps]  # the first one has not begun
+    assert state.substeps < state.output_substeps
     assert math.isnan(fit.stats["integration_error"])
     assert fit.optimum is not None
-    assert search.largest_change(fit.optimum.run.y - refined[0].y) < 0.1
+    assert state.largest_change(fit.optimum.run.y - refined[0].y) < 0.1
 
 
 def test_an_answer_does_not_overrun_its_budget_for_its_integration_error() -> None:
     """A fit of a minute's log took 8 s more than its 60 s, for the run that halves the steps of the answer."""
     budget = CpuBudget(1e9)
-    search = Search(segment(two_logs()), LeastSquares(budget=budget))
-    status = search._run_stages()
-    assert status.converged
-    search.integration_change = math.nan
-    assert math.isfinite(end_search(search, status, 0.0).stats["integration_error"])
+    state = run_stages(start_search(segment(two_logs()), LeastSquares(budget=budget)))
+    assert state.end is SearchEnd.OPTIMUM
+    assert math.isnan(state.integration_change)
+    assert math.isfinite(end_search(state, 0.0).stats["integration_error"])
     budget._end = 0.0
-    fit = end_search(search, status, 0.0)
+    fit = end_search(state, 0.0)
     assert fit.status.converged
     assert fit.covariance is not None
     assert math.isnan(fit.stats["integration_error"])
@@ -127,49 +150,46 @@ def test_corrected_residuals_have_the_cost_of_a_run_with_the_correction() -> Non
 def test_derivatives_are_computed_anew_only_where_finer_steps_change_much(
     limit: float, runs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    search = Search(segment(two_logs()), LeastSquares())
-    evaluate = Mock(wraps=search.evaluate)
-    monkeypatch.setattr("pneuopt.shooting.search.MAX_GRADIENT_ERROR", limit)
-    monkeypatch.setattr(search, "evaluate", evaluate)
-    search._correct_residuals(4)
+    state, evaluate = start_search(segment(two_logs()), LeastSquares()), Mock(wraps=Objective.evaluate)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_GRADIENT_ERROR", limit)
+    monkeypatch.setattr(Objective, "evaluate", lambda *given: evaluate(*given))  # noqa: PLW0108 - binds the objective
+    corrected = correct_residuals_by(state, 4)
     assert evaluate.call_count == runs
-    assert search.output_substeps == 4
+    assert corrected.output_substeps == 4
 
 
 def test_a_last_stage_that_stays_above_the_noise_is_not_integrated_by_finer_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A log with hysteresis in the valve lost two thirds of its search to that."""
-    monkeypatch.setattr("pneuopt.shooting.search.JUMP_ITERATIONS", 1)
-    is_noise, jumps = Search.is_noise, list[bool]()
+    monkeypatch.setattr("pneuopt.shooting.least_squares.JUMP_ITERATIONS", 1)
+    jumps = list[bool]()
 
-    def only_loose(search: Search, cost: float) -> bool:
-        return search.stage is FIRST and is_noise(search, cost)
-
-    def jumped(search: Search) -> None:
+    def jumped(state: SearchState) -> SearchState:
         with monkeypatch.context() as patch:
-            patch.setattr(Search, "is_noise", only_loose)
-            patch.setattr(Search, "apply_finer_steps", lambda *_: pytest.fail("finer steps"))
-            jumps.append(jump(search) is None)
+            patch.setattr(SearchState, "is_at_noise", property(lambda at: at.stage is FIRST))
+            patch.setattr("pneuopt.shooting.least_squares.apply_finer_steps", lambda *_: pytest.fail("finer steps"))
+            back = jump_to_last_stage(state)
+        jumps.append(back.end is None and back.iterate is state.iterate)
+        return back
 
-    jump = Search._jump_to_last_stage
-    monkeypatch.setattr(Search, "_jump_to_last_stage", jumped)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.jump_to_last_stage", jumped)
     assert solve_least_squares(two_logs(), LeastSquares()).status.converged
     assert jumps == [True]
 
 
 def test_a_wrong_model_is_not_searched_with_tight_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first stage's linearised equations foresee what tight gaps leave; the optimum is that of all stages."""
-    problem, entered, enter = shaken(2e-3), list[float](), Search._enter_stage
+    problem, entered = shaken(2e-3), list[float]()
 
-    def record(search: Search, stage: Stage, nodes: Array, z: Array) -> None:
+    def record(state: SearchState, stage: Stage, nodes: Array, z: Array) -> SearchState:
         entered.append(stage.gap)
-        enter(search, stage, nodes, z)
+        return enter_stage(state, stage, nodes, z)
 
-    monkeypatch.setattr(Search, "_enter_stage", record)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.enter_stage", record)
     fit = solve_least_squares(problem, LeastSquares())
     assert min(entered) == fit.stats["gap_deviation"] > LeastSquares().stages[-1].gap
-    monkeypatch.setattr("pneuopt.shooting.search.MAX_JUMP_MISFIT", math.inf)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_JUMP_MISFIT", math.inf)
     whole = solve_least_squares(problem, LeastSquares())
     assert min(entered) == LeastSquares().stages[-1].gap
     assert fit.covariance is not None
@@ -188,20 +208,17 @@ def test_a_search_without_noise_of_the_states_keeps_its_tight_gaps() -> None:
 
 
 def test_foreseen_squares_are_those_that_tight_gaps_leave() -> None:
-    search = Search(segment(shaken(2e-3)), LeastSquares(stages=(Stage(1e-2, 12), Stage(3e-4, 30))))
-    first, last = search.method.stages
-    search._finish_stage(first.iterations)
-    foreseen = search._promised_squares(last)
-    search._enter_stage(last, search.current.nodes, search.current.z)
-    search._finish_stage(last.iterations)
-    assert foreseen == pytest.approx(2 * search.current.cost, rel=0.05)
+    begun = start_search(segment(shaken(2e-3)), LeastSquares(stages=(Stage(1e-2, 12), Stage(3e-4, 30))))
+    first, last = begun.method.stages
+    loose = run_stage(begun, first)
+    assert loose.promised_squares(last) == pytest.approx(2 * run_stage(loose, last).iterate.cost, rel=0.05)
 
 
 def test_nothing_is_iterated_to_the_end_before_finer_steps_follow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the model misses the log, the coarse steps of the last stage end as soon as the parameters do not move."""
     problem = shaken(2e-3)
     fit = solve_least_squares(problem)
-    monkeypatch.setattr("pneuopt.shooting.stage_end.COARSE_TOLERANCE", FINE_TOLERANCE)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.COARSE_TOLERANCE", FINE_TOLERANCE)
     fine = solve_least_squares(problem)
     assert fit.covariance is not None
     assert np.abs((found(fit) - found(fine)) / np.sqrt(np.diag(fit.covariance))).max() < 1e-2
@@ -213,13 +230,13 @@ def test_a_search_that_is_far_off_takes_no_finer_steps(
     limit: float, is_refined: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The short search of a minute's log went on in finer steps at 160 times the noise, for half of a CPU budget."""
-    steps, refine = list[int](), Search.apply_finer_steps
+    steps = list[int]()
 
-    def record(search: Search, fine: int) -> float:
+    def record(state: SearchState, fine: int) -> SearchState:
         steps.append(fine)
-        return refine(search, fine)
+        return apply_finer_steps(state, fine)
 
-    monkeypatch.setattr(Search, "apply_finer_steps", record)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.apply_finer_steps", record)
     stages = FIRST, OTHERS[-1]
     method = LeastSquares(stages=stages, allows_state_noise=False, max_misfit=limit)
     fit = solve_least_squares(shaken(2e-3), method)
@@ -237,14 +254,12 @@ def test_a_search_that_is_far_off_before_its_last_stage_is_left(share: float, is
     assert ends[1] > 2 * ends[0]
     limit = share * ends[1] / solve_least_squares(two_logs()).count
     fit = solve_least_squares(two_logs(), replace(method, max_misfit=limit, progress=lines.append))
-    assert (fit.status is ABANDONED_START) == is_left
+    assert (fit.end is SearchEnd.ABANDONED) == is_left
     assert any(line.startswith("stage 3/3") for line in lines) != is_left
 
 
-def _stage_ends(method: LeastSquares) -> list[StageEnd]:
-    search = Search(segment(two_logs()), method)
-    search.solve()
-    return search.stage_ends
+def _stage_ends(method: LeastSquares) -> tuple[StageEnd, ...]:
+    return run_search(start_search(segment(two_logs()), method)).stage_ends
 
 
 def test_a_search_that_comes_to_where_another_one_was_ends_there() -> None:
@@ -252,28 +267,28 @@ def test_a_search_that_comes_to_where_another_one_was_ends_there() -> None:
     problem, method = shaken(2e-3), LeastSquares()
     fit = solve_least_squares(problem, method)
     again = solve_least_squares(problem, replace(method, known_costs=fit.stage_costs))
-    assert again.status is JOINED_SEARCH
+    assert again.end is SearchEnd.DUPLICATE
     gap, cost = fit.stage_costs[-1]
     assert (gap, cost) == (fit.stats["gap_deviation"], fit.stats["cost"])
     assert again.stats["gap_deviation"] == gap
     assert again.stats["cost"] == pytest.approx(cost, rel=1e-3)
     other = solve_least_squares(problem, replace(method, known_costs=((gap, 1.01 * cost),)))
-    assert other.status is not JOINED_SEARCH
+    assert other.end is not SearchEnd.DUPLICATE
     tight = solve_least_squares(two_logs(), LeastSquares(known_costs=((FIRST.gap, 0.0),)))
     assert [gap for gap, _ in tight.stage_costs] == [stage.gap for stage in (*OTHERS[1:], OTHERS[-1])]
 
 
 def test_states_are_searched_to_the_end_where_no_parameter_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
     """A prediction starts from them; no parameter's step says that they have settled."""
-    problem, left, is_negligible = two_logs(), dict[float, float](), Search._is_negligible_step
+    problem, left = two_logs(), dict[float, float]()
 
-    def record(search: Search, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
-        found = is_negligible(search, current, reduced, step)
+    def record(state: SearchState, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
+        found = is_negligible_step(state, current, reduced, step)
         if found:
-            left[search.stage.gap] = 0.5 * current.equations.arrow.descent_rate(step)
+            left[state.stage.gap] = 0.5 * current.equations.arrow.descent_rate(step)
         return found
 
-    monkeypatch.setattr(Search, "_is_negligible_step", record)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.is_negligible_step", record)
     fixed = problem.parameters.with_values(TRUTH).fixed("*")
     assert solve_least_squares(replace(problem, parameters=fixed)).status.converged
     assert left[LeastSquares().stages[-1].gap] < 1e-6
@@ -281,16 +296,17 @@ def test_states_are_searched_to_the_end_where_no_parameter_is_free(monkeypatch: 
 
 def test_noise_of_the_states_that_has_not_settled_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twelve seconds of a search went by in the steps that had failed before."""
-    tried, loosen = list[float](), Search._loosen
+    tried = list[float]()
 
-    def never(search: Search, stage: Stage, nodes: Array, z: Array) -> Status:
+    def never(state: SearchState, stage: Stage, nodes: Array, z: Array) -> SearchState:
         tried.append(stage.gap)
         with monkeypatch.context() as patch:
-            patch.setattr(Search, "_finish_stage", lambda *_: False)
-            patch.setattr("pneuopt.shooting.search.repeat_last_stage", lambda _: Status(Code.NOT_CONVERGED, ("no",)))
-            return loosen(search, stage, nodes, z)
+            patch.setattr("pneuopt.shooting.least_squares.finish_stage", lambda at, _: at)
+            end = SearchEnd.UNSETTLED
+            patch.setattr("pneuopt.shooting.least_squares.repeat_last_stage", lambda at: replace(at, end=end))
+            return loosen(state, stage, nodes, z)
 
-    monkeypatch.setattr(Search, "_loosen", never)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.loosen", never)
     fit = solve_least_squares(shaken(2e-3), LeastSquares())
     assert fit.jumps is None
     assert len(tried) == len(set(tried)) > 0
@@ -306,13 +322,13 @@ def test_a_search_that_is_cut_names_the_parameter_that_would_still_move() -> Non
 
 def test_log_parameters_are_drawn_to_their_start_by_wide_gaps_alone() -> None:
     """Where gaps hide a parameter it drifted to its bound, and tight gaps could not tell it any more."""
-    search = Search(segment(two_logs()), LeastSquares())
-    z, drawn = search.current.z + 0.3, []
+    state = start_search(segment(two_logs()), LeastSquares())
+    z, drawn = state.iterate.z + 0.3, []
     for stage in LeastSquares().stages:
-        search._enter_stage(stage, search.current.nodes.copy(), z)
-        alone = weigh_gaps(search.segments, search.current.equations.linearisation, stage.gap * search.gap_scales)
-        assert search.cost == pytest.approx(alone.cost)
-        drawn.append(search.current.cost > alone.cost)
+        state = enter_stage(state, stage, state.iterate.nodes.copy(), z)
+        alone = weigh_gaps(state.segments, state.iterate.equations.linearisation, state.gap_deviations)
+        assert state.cost == pytest.approx(alone.cost)
+        drawn.append(state.iterate.cost > alone.cost)
     assert drawn == [True, True, True, True, False, False]
     assert not replace(FIRST, refine=2).has_prior  # as noise of the states, whose stage decides
 
@@ -345,3 +361,118 @@ def test_a_refit_keeps_steps_that_were_tried_before(monkeypatch: pytest.MonkeyPa
     assert kept.status.converged
     assert math.isnan(kept.stats["integration_error"])
     assert kept.stats["cost"] == pytest.approx(checked.stats["cost"], rel=1e-6)
+
+
+def begun(stages: tuple[Stage, ...] = LeastSquares().stages, **options: Any) -> SearchState:
+    """The state in which a search of the two logs begins."""
+    return start_search(segment(two_logs()), LeastSquares(stages=stages, **options))
+
+
+def with_cost(state: SearchState, share: float) -> SearchState:
+    """The state at so many times the largest cost of the noise alone."""
+    cost = 0.5 * share * MAX_CHI_SQUARE_RATIO * state.iterate.equations.count
+    return replace(state, iterate=replace(state.iterate, equations=replace(state.iterate.equations, cost=cost)))
+
+
+@pytest.mark.parametrize(
+    ("squares", "allows", "shortcut", "gap"),
+    [
+        ({1e-5: 9.0}, True, Shortcut.LAST_STAGE, 1e-5),
+        ({1e-5: 11.0}, False, Shortcut.NONE, 1e-2),
+        ({1e-5: 11.0, 3e-3: 1.0, 1e-3: 1.1, 3e-4: 5.0, 1e-4: 8.0}, True, Shortcut.STATE_NOISE, 1e-3),
+        ({1e-5: 11.0, 3e-3: 2.0, 1e-3: 3.0, 3e-4: 5.0, 1e-4: 8.0}, True, Shortcut.STATE_NOISE, 1e-2),
+    ],
+)
+def test_the_shortcut_after_a_first_stage_is_chosen_by_what_other_gaps_promise(
+    squares: dict[float, float], allows: bool, shortcut: Shortcut, gap: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Squares by gap, over their number: tight gaps where they promise little, else the tightest at the noise."""
+    state = begun(allows_state_noise=allows)
+    count = state.iterate.equations.count
+    monkeypatch.setattr(SearchState, "promised_squares", lambda _, stage: squares[stage.gap] * count)
+    chosen, stage = choose_shortcut(state)
+    assert (chosen, stage.gap) == (shortcut, gap)
+
+
+@pytest.mark.parametrize(
+    ("cost", "fall", "noisy", "trapped", "repeat"),
+    [
+        (5.0, 0.05, False, False, Repeat.STOP),  # above the noise, and the cost hardly falls
+        (5.0, 0.2, False, False, Repeat.GO_ON),
+        (5.0, 0.2, False, True, Repeat.FREE_NODES),
+        (0.9, 0.0, False, False, Repeat.GO_ON),
+        (0.9, 0.0, False, True, Repeat.FREE_NODES),
+        (5.0, 0.0, True, True, Repeat.GO_ON),  # gaps as noise of the states free no node
+    ],
+)
+def test_a_last_stage_is_repeated_as_its_state_says(
+    cost: float, fall: float, noisy: bool, trapped: bool, repeat: Repeat
+) -> None:
+    state = with_cost(begun(stages=(Stage(1e-5, 30, refine=2),)), cost)
+    damping = np.where(np.arange(state.segments.count) == 2, 5.0 * trapped, 0.0)
+    state = replace(state, last_decrease=fall, noisy_gaps=noisy, node_damping=damping)
+    moving = ConvergenceTest(Status(Code.NOT_CONVERGED))
+    assert choose_repeat(state, moving) is repeat
+    assert choose_repeat(state, ConvergenceTest(Status(Code.CONVERGED))) is Repeat.STOP
+    assert choose_repeat(state, moving._replace(unidentifiable=np.array([0]))) is Repeat.STOP
+
+
+def test_stages_that_explained_the_logs_are_loosened_the_tightest_first() -> None:
+    state, method = begun(), LeastSquares()
+    noise = 0.5 * MAX_CHI_SQUARE_RATIO * state.iterate.equations.count
+    nodes, z = state.iterate.nodes, state.iterate.z
+    ends = tuple(StageEnd(nodes, z, noise * share) for share in (0.5, 0.8, 0.9, 1.1, 4.0))
+    state = replace(state, stage_ends=ends)
+    assert [stage.gap for stage, _ in stages_to_loosen(state)] == [1e-3, 3e-3]
+    assert [end for _, end in stages_to_loosen(state)] == [ends[2], ends[1]]
+    assert [s.gap for s, _ in stages_to_loosen(replace(state, unsettled_gaps=frozenset({1e-3})))] == [3e-3]
+    assert method.stages[2].gap == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("end", "options", "change", "factor"),
+    [
+        (SearchEnd.UNSETTLED, {}, None, 0),
+        (SearchEnd.OPTIMUM, {"checks_steps": False}, None, 0),
+        (SearchEnd.OPTIMUM, {}, None, 2),
+        (SearchEnd.OPTIMUM, {}, 1e-9, 1),  # the finer steps of the last stage have moved no estimate
+        (SearchEnd.OPTIMUM, {}, 1.0, 2),
+        (SearchEnd.OPTIMUM, {"substeps": 3}, None, 1),
+    ],
+)
+def test_finer_steps_are_tried_at_an_optimum_that_they_may_move(
+    end: SearchEnd, options: dict[str, Any], change: float | None, factor: int
+) -> None:
+    state = begun(**options).end_with(end)
+    if change is not None:
+        run = state.run(state.substeps)
+        state = replace(state, correction=IntegrationCorrection(run.y * 0 + change, run.x_end * 0, run))
+    assert choose_finer_steps(state) == factor * state.output_substeps
+
+
+def test_a_move_leaves_the_state_before_it_as_it_was() -> None:
+    state = begun()
+    nodes, z, damping = state.iterate.nodes.copy(), state.iterate.z.copy(), state.node_damping.copy()
+    ended = run_search(state)
+    assert (state.iterations, state.end, state.stage_ends) == (0, None, ())
+    assert ended.end is SearchEnd.OPTIMUM
+    for before, after in zip(
+        (nodes, z, damping), (state.iterate.nodes, state.iterate.z, state.node_damping), strict=True
+    ):
+        assert_allclose(after, before, rtol=0, atol=0)
+
+
+def test_an_interruption_leaves_the_last_iterate() -> None:
+    """Wherever Ctrl-C comes: in a trial of the last stage after the first, it is that trial's iterate."""
+    costs = list[str]()
+
+    def stop(line: str) -> None:
+        costs.append(line)
+        if line.startswith("stage 6/6"):
+            raise KeyboardInterrupt
+
+    state = run_search(begun(progress=stop))
+    assert state.end is SearchEnd.INTERRUPTED
+    assert state.status.code is Code.INTERRUPTED
+    assert state.iterations == len(costs)
+    assert state.stage.gap == LeastSquares().stages[-1].gap

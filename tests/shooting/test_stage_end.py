@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pneuopt.shooting import stage_end
-from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.stage_end import PATIENT_ITERATIONS, is_negligible_step
+from pneuopt.shooting import least_squares as lifted
+from pneuopt.shooting.least_squares import PATIENT_ITERATIONS, LeastSquares, is_negligible_step
 
 
 def negligible(
@@ -20,25 +19,24 @@ def negligible(
     iterations: int = PATIENT_ITERATIONS,
 ) -> bool:
     """Whether a step of a parameter [deviations by the noise] ends the last stage of a search with 1000 residuals."""
-    monkeypatch.setattr(stage_end, "largest_parameter_step", lambda *_: step)
+    monkeypatch.setattr(lifted, "largest_parameter_step", lambda *_: step)
     arrow = SimpleNamespace(descent_rate=lambda _: 2 * promised)
     equations = SimpleNamespace(arrow=arrow, count=1000, chi_square=1000 * misfit)
     method = LeastSquares()
     transcription = SimpleNamespace(parameters=SimpleNamespace(free_names=("a",)))
-    search: Any = SimpleNamespace(
+    state: Any = SimpleNamespace(
         stage=method.stages[-1],
         method=method,
         noisy_gaps=False,
         is_coarse=False,
         iterations=5 + iterations,
         stage_began=5,
-        scaling=SimpleNamespace(movable=lambda *_: None),
+        setup=SimpleNamespace(scaling=SimpleNamespace(movable=lambda *_: None)),
         segments=SimpleNamespace(transcription=transcription),
-        is_noise=lambda _: False,
     )
     current: Any = SimpleNamespace(equations=equations, cost=500 * misfit, z=np.zeros(1))
     nothing: Any = SimpleNamespace(parameters=None)
-    return is_negligible_step(search, current, nothing, nothing)
+    return is_negligible_step(state, current, nothing, nothing)
 
 
 @pytest.mark.parametrize(

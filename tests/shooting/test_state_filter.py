@@ -5,7 +5,7 @@ import pytest
 
 from pneuopt.dynamics.compiled.rollout import Gram, Rollout
 from pneuopt.quantities.arrays import Array
-from pneuopt.shooting import state_filter
+from pneuopt.shooting import filters
 from pneuopt.shooting.segments import Segments, start_nodes
 from tests.shooting.first_order import GAIN, NOISE, ROUGH, SAMPLE, SAMPLES, TIME_CONSTANT, first_order_log, forced
 
@@ -20,22 +20,22 @@ def test_pieces_side_by_side_give_the_filter_of_the_whole(monkeypatch: pytest.Mo
     """The lead forgets where a piece starts, here within four time constants; without one it would show."""
     segments = first_order_log(N).segments
     rough, q = start_nodes(segments), values(segments)
-    whole = state_filter.filter_nodes(segments, rough, q)
-    monkeypatch.setattr(state_filter, "PIECE_SEGMENTS", 4)
-    monkeypatch.setattr(state_filter, "LEAD_SEGMENTS", 8)
-    pieces = state_filter.filter_nodes(segments, rough, q)
+    whole = filters.filter_nodes(segments, rough, q)
+    monkeypatch.setattr(filters, "PIECE_SEGMENTS", 4)
+    monkeypatch.setattr(filters, "LEAD_SEGMENTS", 8)
+    pieces = filters.filter_nodes(segments, rough, q)
     np.testing.assert_allclose(pieces, whole, atol=1e-4)
-    monkeypatch.setattr(state_filter, "LEAD_SEGMENTS", 0)
-    assert np.abs(state_filter.filter_nodes(segments, rough, q) - whole).max() > 1e-3
+    monkeypatch.setattr(filters, "LEAD_SEGMENTS", 0)
+    assert np.abs(filters.filter_nodes(segments, rough, q) - whole).max() > 1e-3
 
 
-@pytest.mark.parametrize("gathered", [state_filter.GATHERED_DEVIATION, 1e-2])
+@pytest.mark.parametrize("gathered", [filters.GATHERED_DEVIATION, 1e-2])
 def test_the_filter_of_a_linear_plant_is_the_kalman_filter(gathered: float) -> None:
     """By hand: sample by sample through each segment, the state's own deviation added from segment to segment."""
     (segments, u, y, scale), a = first_order_log(N), np.exp(-SAMPLE / TIME_CONSTANT)
-    found = state_filter.filter_nodes(segments, start_nodes(segments), values(segments), gathered)
+    found = filters.filter_nodes(segments, start_nodes(segments), values(segments), gathered)
 
-    mean, variance, expected = ROUGH, (state_filter.START_DEVIATION * scale) ** 2, []
+    mean, variance, expected = ROUGH, (filters.START_DEVIATION * scale) ** 2, []
     for begin in range(0, N, SAMPLES):
         decay, own = a ** np.arange(SAMPLES), u[begin : begin + SAMPLES]
         driven = np.array([forced(own, GAIN, k) for k in range(SAMPLES)])
@@ -71,13 +71,13 @@ def test_a_step_over_a_kink_is_cut() -> None:
     """Before, the same step was linearised where it had led to, and a slip was lost: 1300 times the noise in it."""
     before, P = np.array([[-0.01]]), np.array([[[1.0]]])
     given = Kink(), np.zeros(1, dtype=np.intp), before, P, np.zeros((1, 0)), 1
-    found = state_filter.update_states(*given)  # type: ignore[arg-type]
+    found = filters.update_states(*given)  # type: ignore[arg-type]
     first = float(1e6 * (0.1 + 0.05 * 0.01) ** 2)
     assert found.squares[0] < first / 2
     assert found.end == found.state
     far = Kink()
     far.weights = np.full((1, 1, 1), np.nan)
-    lost = state_filter.update_states(far, *given[1:])  # type: ignore[arg-type]
+    lost = filters.update_states(far, *given[1:])  # type: ignore[arg-type]
     assert np.isnan(lost.end).all()
 
 
@@ -92,13 +92,13 @@ def test_updates_end_where_they_move_nothing(monkeypatch: pytest.MonkeyPatch) ->
     at, before = np.arange(4), np.full((4, 1), ROUGH)
     monkeypatch.setattr(Rollout, "gram", count)
     given = before, np.ones((4, 1, 1)), values(segments)[segments.parameter_positions[at]], 1
-    state_filter.update_states(segments, at, *given)
+    filters.update_states(segments, at, *given)
     assert taken == [4, 4, 4]
 
 
 def test_a_singular_system_spoils_no_other() -> None:
     """Rounding left one of forty sets of parameters without a state, and a search ended with a traceback."""
     A, b = np.stack([2 * np.eye(2), np.ones((2, 2)), np.eye(2)]), np.ones((3, 2, 1))
-    found = state_filter.solve_each(A, b)
+    found = filters.solve_each(A, b)
     np.testing.assert_allclose(found[[0, 2], :, 0], [[0.5, 0.5], [1.0, 1.0]])
     assert np.isnan(found[1]).all()

@@ -17,7 +17,7 @@ from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.racing import Racing
-from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.result import Refusal, TuningResult
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
@@ -100,6 +100,7 @@ def test_a_limit_that_breaks_after_the_horizon_is_no_matter_of_rounding() -> Non
         assert "Overshoot is" in found[horizon].status.message
     assert found[0.15].stats["fails_late"] == 1.0
     assert "fails_late" not in found[2.0].stats
+    assert [found[h].refusal for h in (0.15, 2.0)] == [Refusal.LATE, None]
 
 
 def test_a_design_that_meets_an_end_stop_is_followed_by_a_search_for_one_that_rests(
@@ -109,7 +110,8 @@ def test_a_design_that_meets_an_end_stop_is_followed_by_a_search_for_one_that_re
 
     def meet_the_stop(search: Search, found: SearchResult, margin: float) -> TuningResult:
         result = certify(search, found, margin)
-        refused = replace(result, status=Status(Code.NOT_CERTIFIED, ("the stop",)), stats={"contacts": 1.0})
+        status = Status(Code.NOT_CERTIFIED, ("the stop",))
+        refused = replace(result, status=status, stats={}, refusal=Refusal.END_STOP)
         return result if search.rests else refused
 
     monkeypatch.setattr(Search, "certify_roundings", meet_the_stop)

@@ -1,0 +1,458 @@
+"""Extended Kalman filters over the segments, and what each segment of a fit says about the parameters.
+
+`filter_nodes`: the states at the nodes, the parameters known. States that are read off the measurements do not fit
+together where a drive sticks and slips, and a search over all nodes at once frees one such place after the other. The
+Kalman filter follows the model from node to node (Bell and Cathey, IEEE Transactions on Automatic Control 38(2), 1993,
+for its iteration), in pieces of the log side by side.
+
+`PredictionErrors`: how well several sets of parameters predict a part of a log, and where they had better be. Where a
+drive sticks and slips, nodes with wide gaps take over what wrong parameters miss, and tight gaps trap them. A filter
+has no such unknowns: it predicts each segment from those before it, and its errors lead to the parameters (Ljung,
+System Identification, 2nd ed. 1999, chapter 7), though over many side minima. Where the state may gather a wide
+deviation from segment to segment these are few; it then shrinks, as the gaps of a search do.
+
+`fit_scores`: a segment's score is the gradient of half its squared residuals (its data, and the gap behind it) by the
+parameters, with the nodes following them; at an optimum the scores sum to zero. Its information J'J is that of the same
+residuals.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.shooting.equations import NormalEquations, ParameterScaling
+from pneuopt.shooting.least_squares import Optimum
+from pneuopt.shooting.segments import Segments, choose_integration
+
+PIECE_SEGMENTS = 300  # segments a piece: more take more steps one after the other, fewer waste more on the lead
+# segments before a piece from which its states come: fewer leave it the error of its start, more cost time
+LEAD_SEGMENTS = 300
+START_DEVIATION = 0.1  # of the state where a piece or a log begins, in nominal sizes [1]: about that of rough states
+# deviation that a state gathers from one node to the next, in nominal sizes [1], by parameters that are not known well:
+# lower follows wrong ones away from the measurements, higher leaves states that do not fit together
+GATHERED_DEVIATION = 1e-4
+KNOWN_DEVIATION = 1e-6  # of a state that is given, likewise
+UPDATES = 4  # linearisations a segment: fewer miss a slip, more cost time
+SETTLED_SQUARES = 0.01  # change of the squares [1] by which no state counts: lower takes updates that move none
+STEP_CUT = 0.3  # of a step that has not helped [1]: higher tries it again too far, lower hardly moves
+
+
+def filter_nodes(segments: Segments, nodes: Array, q: Array, gathered: float = GATHERED_DEVIATION) -> Array:
+    """Filter the states at the nodes.
+
+    Parameters
+    ----------
+    segments : Segments
+    nodes : ndarray, shape (m, n_states)
+        Rough states, from which the pieces start.
+    q : ndarray, shape (k,)
+        Values of all parameters of the problem.
+    gathered : float
+        Deviation that a state gathers from one node to the next, in nominal sizes.
+
+    Returns
+    -------
+    ndarray, shape (m, n_states)
+        Estimates from the measurements up to each segment's end.
+    """
+    first = np.arange(0, segments.count, PIECE_SEGMENTS)
+    segments, substeps = choose_integration(segments, nodes, q)
+    rough, found = nodes / segments.nominal, nodes / segments.nominal
+    heads = np.append(True, ~segments.linked[:-1])
+    start = np.where(np.isfinite(segments.fixed_start), KNOWN_DEVIATION, START_DEVIATION) ** 2
+    x, P = rough[first], np.zeros((len(first), nodes.shape[1], nodes.shape[1]))
+    for step in range(-LEAD_SEGMENTS, PIECE_SEGMENTS):
+        at = np.clip(first + step, 0, segments.count - 1)
+        begins = (step == -LEAD_SEGMENTS) | heads[at] | ~np.isfinite(x).all(axis=1) | ~np.isfinite(P).all(axis=(1, 2))
+        x = np.where(begins[:, None], rough[at], x)
+        P = np.where(begins[:, None, None], start[at][:, None] * np.eye(nodes.shape[1]), P)
+        updated = update_states(segments, at, x, P, q[segments.parameter_positions[at]], substeps)
+        x, P = updated.end, updated.spread(gathered)
+        own = np.flatnonzero((step >= 0) & (first + step < segments.count) & np.isfinite(updated.state).all(axis=1))
+        found[at[own]] = updated.state[own]
+    return np.asarray(found * segments.nominal)
+
+
+class StateUpdate(NamedTuple):
+    """The states of g segments by what was known of them before and by their data; n of them, of nominal size 1.
+
+    Attributes
+    ----------
+    state, end : ndarray, shape (g, n)
+        At the node, and at the segment's end; NaN there where the model is not finite.
+    squares : ndarray, shape (g,)
+        Those of the residuals, and of the state's change over what was known of it.
+    gram : ndarray, shape (g, n + n_columns + 1, n + n_columns + 1)
+        Of the slopes of what is predicted, in the states and the parameters, and of its errors, in noise deviations.
+    moved : ndarray, shape (g, n, n + n_columns)
+        Slopes of the end.
+    prior, information : ndarray, shape (g, n, n)
+        The inverse covariance of the states, without these data and with them.
+    """
+
+    state: Array
+    end: Array
+    squares: Array
+    gram: Array
+    moved: Array
+    prior: Array
+    information: Array
+
+    @np.errstate(all="ignore")  # as of what it is made from
+    def spread(self, gathered: float) -> Array:
+        """The covariance at the ends, with a deviation that each state gathers along a segment. Shape (g, n, n)."""
+        n = self.state.shape[1]
+        moved = self.moved[..., :n]
+        kept = solve_each(self.information, moved.transpose(0, 2, 1))
+        return np.asarray(moved @ kept + gathered**2 * np.eye(n))
+
+
+@np.errstate(all="ignore")  # a step too far may overflow; it is not kept
+def update_states(
+    segments: Segments, at: Indices, before: Array, P: Array, values: Array, substeps: int
+) -> StateUpdate:
+    """Update the states of some segments by their data: Gauss-Newton, whose steps are cut where they do not help.
+
+    Parameters
+    ----------
+    segments : Segments
+    at : ndarray of int, shape (g,)
+        Positions of the segments, one of which may be there several times.
+    before, P : ndarray, shape (g, n) and (g, n, n)
+        The states and their covariance without these data, of nominal size 1.
+    values : ndarray, shape (g, n_system_parameters)
+        The parameters of each.
+    substeps : int
+        Integration steps a sample.
+
+    Returns
+    -------
+    StateUpdate
+    """
+    n, nominal = before.shape[1], segments.nominal
+    prior = solve_each(P, np.tile(np.eye(n), (len(at), 1, 1)))
+    given = segments.inputs[at], values, segments.t[at], segments.h[at], segments.measured[at], segments.weights[at]
+    scale = np.append(nominal, np.ones(segments.sensitivities.n_columns - n + 1))
+    both = np.outer(scale, scale)
+    x, step, kept = before.copy(), np.zeros_like(before), None
+    for _ in range(UPDATES):
+        run = segments.sensitivities.gram(x * nominal, *given, substeps=substeps)
+        gram, away = run.grams * both, x - before
+        pull = (prior @ away[..., None])[..., 0]
+        squares = gram[:, -1, -1] + np.sum(away * pull, axis=1)
+        moved = run.dx_end * (scale[:-1] / nominal[:, None])
+        trial = StateUpdate(x, run.x_end / nominal, squares, gram, moved, prior, prior + gram[:, :n, :n])
+        if kept is None:
+            better = np.arange(len(at))
+            kept = trial._replace(squares=np.where(np.isfinite(squares), squares, np.inf))
+        else:
+            is_settled = bool((np.abs(squares - kept.squares) < SETTLED_SQUARES).all())
+            better = np.flatnonzero(squares < kept.squares)
+            for old, new in zip(kept, trial, strict=True):
+                old[better] = new[better]
+            if is_settled:
+                break
+        downhill = -gram[:, :n, -1] - pull
+        step *= STEP_CUT
+        step[better] = solve_each(trial.information[better], downhill[better][..., None])[..., 0]
+        x = kept.state + step
+    assert kept is not None
+    kept.end[~np.isfinite(kept.squares)] = np.nan
+    return kept
+
+
+def solve_each(A: Array, b: Array) -> Array:
+    """The solutions of g systems of equations, shapes (g, n, n) and (g, n, k); NaN of those that are singular."""
+    try:
+        return np.asarray(np.linalg.solve(A, b))
+    except np.linalg.LinAlgError:
+        out = np.full(b.shape, np.nan)
+        for i in range(len(A)):
+            with suppress(np.linalg.LinAlgError):
+                out[i] = np.linalg.solve(A[i], b[i])
+        return out
+
+
+# squares of a segment, over its samples, beyond which they count by their logarithm [1]: lower is blind to what wrong
+# parameters miss, higher lets one lost slip outweigh a log
+ROBUST_SQUARES = 4.0
+DAMPINGS = (1e-2, 10**-0.75, 10**0.5, 10**1.75, 1e3)  # over the last one, tried side by side: wider spreads overshoot
+FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-6  # over the diagonal [1]: lower takes wild first steps, higher small ones
+GIVEN_UP_DAMPING = 10.0  # where no damping helps beyond it, a descent has ended; higher takes time
+MAX_STEP = (
+    1.0  # of a parameter as searched, over its size where it is no log parameter: longer leaves the model's range
+)
+SETTLED_DECREASE = 1e-4  # of the cost [1] at which a descent has ended: lower takes time, higher ends too early
+
+
+class Errors(NamedTuple):
+    """The cost of some sets of k parameters with its gradient and curvature: (s,), (s, k), (s, k, k)."""
+
+    costs: Array
+    gradients: Array
+    curvatures: Array
+
+
+class PredictionErrors:
+    """The prediction errors of an extended Kalman filter, for several sets of parameters side by side.
+
+    Parameters
+    ----------
+    segments : Segments
+    nodes : ndarray, shape (m, n_states)
+        Rough states, from which the filter begins where a segment does not continue the one before it.
+    scaling : ParameterScaling
+    part : ndarray of int
+        Positions of the segments, rising.
+    """
+
+    def __init__(self, segments: Segments, nodes: Array, scaling: ParameterScaling, part: Indices) -> None:
+        self.segments, self.scaling, self.part, self._rough = segments, scaling, part, nodes / segments.nominal
+        self._begins = np.append(True, (np.diff(part) > 1) | ~segments.linked[part[:-1]])
+        self._counts = np.isfinite(segments.measured).sum(axis=(1, 2))
+        self.count = int(self._counts[part].sum())
+        self.adapt_steps(scaling.start[None])
+
+    def adapt_steps(self, z: Array) -> None:
+        """Take as many integration steps as the stiffest of some sets asks for, shape (s, k).
+
+        With those of a softer one, slips were lost at the right parameters, which then cost more than wrong ones.
+        """
+        nodes = self._rough * self.segments.nominal
+        found = [choose_integration(self.segments, nodes, self.scaling.values(each)) for each in z]
+        implicit = [segments for segments, _ in found if segments.implicit_state is not None]
+        self.segments, self.substeps = (implicit or [found[0][0]])[0], max(steps for _, steps in found)
+
+    @np.errstate(all="ignore")  # what overflows is lost, and its cost infinite
+    def evaluate(self, z: Array, gathered: float) -> Errors:
+        """The errors of sets of searched parameters.
+
+        The gain of the filter counts as constant in the derivatives.
+
+        Parameters
+        ----------
+        z : ndarray, shape (s, k)
+        gathered : float
+            Deviation that each state gathers along a segment, over its nominal size.
+
+        Returns
+        -------
+        Errors
+        """
+        (count, k), n = z.shape, self._rough.shape[1]
+        q = np.array([self.scaling.values(each) for each in z])
+        chain = np.array([self.scaling.chain(each) for each in z])[:, None]
+        sums = Errors(np.zeros(count), np.zeros((count, k)), np.zeros((count, k, k)))
+        for at, begins in zip(self.part.tolist(), self._begins.tolist(), strict=True):
+            if begins:
+                x, X = np.tile(self._rough[at], (count, 1)), np.zeros((count, n, k))
+                P = np.tile(START_DEVIATION**2 * np.eye(n), (count, 1, 1))
+            values = q[:, self.segments.parameter_positions[at]]
+            found = update_states(self.segments, np.full(count, at), x, P, values, self.substeps)
+            x, X, P = self._add(sums, at, found, (x, X), chain, gathered)
+            lost = ~(np.isfinite(x).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & np.isfinite(X).all(axis=(1, 2)))
+            sums.costs[lost], x[lost], X[lost], P[lost] = np.inf, self._rough[at], 0.0, START_DEVIATION**2 * np.eye(n)
+        return sums
+
+    def _add(
+        self,
+        sums: Errors,
+        at: int,
+        found: StateUpdate,
+        before: tuple[Array, Array],
+        chain: Array,
+        gathered: float,
+    ) -> tuple[Array, Array, Array]:
+        """Add a segment's errors; return the states, their slopes and covariance at its end from those before it."""
+        (x, X), n, prior = before, before[0].shape[1], found.prior
+        gram, errors = found.gram[:, :-1, :-1], found.gram[:, :-1, -1:]
+        direct = self._parameter_moves(at, chain)
+        moved = solve_each(found.information, prior @ X - gram[:, :n, n:] @ direct)
+        moves, away = np.concatenate([moved, direct], axis=1), moved - X
+        turned, pull = moves.transpose(0, 2, 1), prior @ away
+        limit = ROBUST_SQUARES * self._counts[at]
+        weights = 1 / (1 + found.squares / limit)
+        uphill = turned @ errors + pull.transpose(0, 2, 1) @ (found.state - x)[..., None]
+        squares = turned @ (gram @ moves) + away.transpose(0, 2, 1) @ pull
+        sums.costs[:] += limit * np.log1p(found.squares / limit)
+        sums.gradients[:] += weights[:, None] * uphill[..., 0]
+        sums.curvatures[:] += weights[:, None, None] * squares
+        return found.end, found.moved @ moves, found.spread(gathered)
+
+    def _parameter_moves(self, at: int, chain: Array) -> Array:
+        """How a segment's own parameters move with those searched, of sets with these chains. Shape (s, n_own, k)."""
+        unknowns = self.segments.unknowns[at]
+        own = np.flatnonzero(unknowns >= 0)
+        moves = np.zeros((len(chain), len(unknowns), chain.shape[2]))
+        moves[:, own, unknowns[own]] = chain[:, 0, unknowns[own]]
+        return moves
+
+    def descend(self, z: Array, gathered: float, steps: int) -> tuple[Array, Array]:
+        """Levenberg-Marquardt steps from several sets of searched parameters, side by side.
+
+        Parameters
+        ----------
+        z : ndarray, shape (s, k)
+        gathered : float
+            As of `evaluate`.
+        steps : int
+            At most.
+
+        Returns
+        -------
+        z : ndarray, shape (s, k)
+            Where they end.
+        costs : ndarray, shape (s,)
+        """
+        self.adapt_steps(z)
+        z, damping = z.copy(), np.full(len(z), FIRST_DAMPING)
+        costs, gradients, curvatures = (a.copy() for a in self.evaluate(z, gathered))
+        active = np.isfinite(costs)
+        for _ in range(steps):
+            rows = np.flatnonzero(active)
+            if not rows.size:
+                break
+            tries = [(i, each) for i in rows.tolist() for each in (np.array(DAMPINGS) * damping[i]).tolist()]
+            trials = np.array([self._step(z[i], gradients[i], curvatures[i], each) for i, each in tries])
+            found = self.evaluate(trials, gathered)
+            for j, i in enumerate(rows.tolist()):
+                best = j * len(DAMPINGS) + int(np.argmin(found.costs[j * len(DAMPINGS) : (j + 1) * len(DAMPINGS)]))
+                if found.costs[best] < costs[i]:
+                    active[i] = costs[i] - found.costs[best] > SETTLED_DECREASE * costs[i]
+                    z[i], damping[i] = trials[best], max(tries[best][1], LEAST_DAMPING)
+                    costs[i], gradients[i], curvatures[i] = (part[best] for part in found)
+                else:
+                    active[i], damping[i] = damping[i] < GIVEN_UP_DAMPING, 1e3 * damping[i]
+        return z, costs
+
+    def _step(self, z: Array, gradient: Array, curvature: Array, damping: float) -> Array:
+        """Where a damped step of the parameters that are not fixed leads, within the bounds."""
+        free = np.flatnonzero(~self.scaling.fixed & (np.diag(curvature) > 0))
+        own = curvature[np.ix_(free, free)]
+        step = np.zeros(len(z))
+        step[free] = -np.linalg.lstsq(own + damping * np.diag(np.diag(own)), gradient[free], rcond=None)[0]
+        longest = MAX_STEP * np.where(self.scaling.log, 1.0, np.maximum(np.abs(z), 1.0))
+        return self.scaling.project_to_bounds(z + np.clip(step, -longest, longest))
+
+
+MAX_BATCH_NUMBERS = 4_000_000  # numbers of 8 bytes in a batch: more take memory, fewer time
+
+
+@dataclass(frozen=True, eq=False)
+class FitScores:
+    """The scores and the information of m segments about the k parameters that a fit has kept free, in their own units.
+
+    Attributes
+    ----------
+    optimum : Optimum
+    directions : ndarray, shape (m, n_columns, k)
+        How a segment's start state (in nominal sizes) and sensitivity columns move with the parameters.
+    """
+
+    optimum: Optimum
+    directions: Array
+
+    @cached_property
+    def scores(self) -> Array:
+        """Score of each segment, shape (m, k)."""
+        gaps = self._equations.gaps / self.optimum.gap_deviations
+        data = np.einsum("mck,mc->mk", self.directions, self._equations.linearisation.grams[:, :-1, -1])
+        linked = np.einsum("mnk,mn->mk", self._gap_directions, gaps)
+        return np.asarray(data + linked)
+
+    def information(self, groups: Indices) -> Array:
+        """Information of groups of segments, shape (n_groups, k, k); `groups` has each segment's, in any order."""
+        members = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
+        return np.array([self._group_information(rows) for rows in members])
+
+    def simulate_white(self, count: int, groups: Indices) -> Array:
+        """Scores of groups in linear fits to white residuals of unit variance, shape (count, n_groups, k).
+
+        The nodes follow the residuals of a few segments before and behind them, so that the scores of neighbours are
+        not independent even where the residuals are.
+        """
+        rng, grams = np.random.default_rng(0), self._equations.linearisation.grams[:, :-1, :-1]
+        values, vectors = np.linalg.eigh(grams)
+        roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        order, batches = np.argsort(groups, kind="stable"), -(-count * grams[..., 0].size // MAX_BATCH_NUMBERS)
+        first, out = np.searchsorted(groups[order], np.arange(int(groups.max()) + 1)), list[Array]()
+        for draws in np.array_split(np.arange(count), min(count, batches)):
+            found = self._respond(roots @ rng.standard_normal((*grams.shape[:2], len(draws))))
+            out.append(np.add.reduceat(found[order], first))
+        return np.moveaxis(np.concatenate(out, axis=2), 2, 0)
+
+    def residual_sums(self) -> tuple[Array, Array]:
+        """Sum of each segment's residuals by output, shape (m, n_outputs), and its derivatives, (m, n_outputs, k).
+
+        In noise standard deviations; gaps do not count.
+        """
+        segments, run = self._equations.segments, self.optimum.run
+        weights = np.where(np.isfinite(segments.measured), segments.weights, 0.0)
+        sums = np.sum(weights * (run.y - np.nan_to_num(segments.measured)), axis=1)
+        return sums, self._equations.linearisation.sums @ self.directions
+
+    @cached_property
+    def whole_information(self) -> Array:
+        """Information of all segments, shape (k, k)."""
+        return self._group_information(np.arange(len(self.directions)))
+
+    @property
+    def _equations(self) -> NormalEquations:
+        return self.optimum.equations
+
+    @cached_property
+    def _gap_directions(self) -> Array:
+        """How the gap behind each segment moves, in its standard deviations, shape (m, n_states, k)."""
+        linear, n = self._equations.linearisation, self._equations.gaps.shape[1]
+        moved = linear.end_sensitivities @ self.directions
+        moved[:-1] -= self.directions[1:, :n]
+        moved[~self._equations.segments.linked] = 0.0
+        return np.asarray(moved / self.optimum.gap_deviations[:, None])
+
+    def _group_information(self, rows: Indices) -> Array:
+        E, gaps = self.directions[rows], self._gap_directions[rows]
+        data = np.tensordot(E, self._equations.linearisation.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
+        return np.asarray(data + np.tensordot(gaps, gaps, ((0, 1), (0, 1))))
+
+    def _respond(self, noise: Array) -> Array:
+        """Scores, shape (m, k, count), of fits to noise: the gradient of each segment's data, (m, n_columns, count)."""
+        linear, (m, n, count) = self._equations.linearisation, (*self._equations.gaps.shape, noise.shape[2])
+        step = np.zeros_like(noise)
+        step[:, :n] = -self._equations.arrow.solve_nodes(noise[:, :n].reshape(m * n, count), 0.0).reshape(m, n, count)
+        step -= self.directions @ np.linalg.solve(
+            self.whole_information, np.tensordot(self.directions, noise, ((0, 1), (0, 1)))
+        )
+        ends = linear.end_sensitivities @ step
+        ends[:-1] -= step[1:, :n]
+        ends[~self._equations.segments.linked] = 0.0
+        gaps = ends / self.optimum.gap_deviations[:, None]
+        data = np.swapaxes(self.directions, 1, 2) @ (noise + linear.grams[:, :-1, :-1] @ step)
+        return np.asarray(data + np.swapaxes(self._gap_directions, 1, 2) @ gaps)
+
+
+def fit_scores(optimum: Optimum) -> FitScores | None:
+    """The scores of a fit's segments.
+
+    Parameters
+    ----------
+    optimum : Optimum
+
+    Returns
+    -------
+    FitScores or None
+        None where the nodes' equations cannot be eliminated.
+    """
+    equations, keep = optimum.equations, np.flatnonzero(optimum.keep)
+    reduced, linear = equations.arrow.eliminate(0.0), equations.linearisation
+    if reduced is None or not len(keep):
+        return None
+    m, n, columns = *equations.gaps.shape, linear.end_sensitivities.shape[2]
+    directions = np.zeros((m, columns, len(optimum.keep)))
+    directions[:, :n] = -reduced.node_sensitivity
+    for rows, own, unknowns in equations.segments.blocks:
+        directions[rows, n + own, unknowns] = linear.chain[unknowns]
+    return FitScores(optimum, directions[:, :, keep] / linear.chain[keep])
