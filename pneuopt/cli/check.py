@@ -11,8 +11,7 @@ from pneuopt.cli.init import write_files
 from pneuopt.cli.shared import Outputs, file_hashes, finish
 from pneuopt.cli.terminal import make_console, show_output_files, show_report, show_sentence
 from pneuopt.dynamics.system import System
-from pneuopt.files.assumptions import read_option_assumptions
-from pneuopt.files.drive import ambient_pressure, read_drive
+from pneuopt.files.drive import ambient_pressure, read_drive, read_option_assumptions
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check
 from pneuopt.identification.checkup_report import finding_line, headline

@@ -29,8 +29,7 @@ from pneuopt.evaluation.requirements import (
     larger_is_better,
 )
 from pneuopt.files.drive import read_drive
-from pneuopt.files.study import Study, SweptAxis, read_axes, read_study, swept_axes
-from pneuopt.files.study_cases import Cases, read_study_cases
+from pneuopt.files.study import Cases, Study, SweptAxis, read_axes, read_study, read_study_cases, swept_axes
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.plotting import plot_distribution, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require

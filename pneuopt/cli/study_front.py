@@ -27,7 +27,7 @@ from pneuopt.evaluation.requirements import (
     user_limit,
     with_user_limit,
 )
-from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
+from pneuopt.files.loop import REQUIREMENTS_BY_KEY, bound_units
 from pneuopt.files.study import Pareto, Study, read_pareto
 from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning

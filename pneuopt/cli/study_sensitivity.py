@@ -13,8 +13,7 @@ from pneuopt.cli.terminal import progress
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.report import metric_units
 from pneuopt.evaluation.scenarios import axis_labels
-from pneuopt.files.study import Study
-from pneuopt.files.study_cases import read_sensitivity
+from pneuopt.files.study import Study, read_sensitivity
 from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import plot_sensitivity
 from pneuopt.quantities.errors import check_names

@@ -20,12 +20,20 @@ from tomlkit.items import Table
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.files.drive import read_covariance, read_drive, read_estimates, read_status
-from pneuopt.files.reference_keys import REFERENCE_KEYS
-from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
-from pneuopt.files.spreads import read_draw, read_sample_spreads, read_spreads
+from pneuopt.files.loop import (
+    LOOP_KEYS,
+    NO_HUNTING_KEY,
+    REFERENCE_KEYS,
+    REQUIREMENTS_BY_KEY,
+    SCENARIO_KEYS,
+    bound_units,
+    read_draw,
+    read_sample_spreads,
+    read_spreads,
+    signal_units,
+)
 from pneuopt.files.toml import read_toml, toml_table
 from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning_table
-from pneuopt.files.tuning_keys import LOOP_KEYS, NO_HUNTING_KEY, SCENARIO_KEYS, signal_units
 from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code

@@ -13,9 +13,8 @@ from pneuopt.evaluation.report import metric_limits
 from pneuopt.files.certificate import CHECKSUM, checksum_section
 from pneuopt.files.drive import read_drive
 from pneuopt.files.loop import TUNABLE_SECTIONS
-from pneuopt.files.references import move_paths
 from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.files.tuning import TUNED_SECTIONS, read_tuning_table
+from pneuopt.files.tuning import TUNED_SECTIONS, move_paths, read_tuning_table
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet

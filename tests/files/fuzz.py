@@ -21,7 +21,7 @@ from pneuopt.cli.init import run_init
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.files.certificate import check_certificate, checksum_section
 from pneuopt.files.drive import read_covariance, read_drive, read_estimates, read_marks, read_status
-from pneuopt.files.requirements import bound_units
+from pneuopt.files.loop import bound_units
 from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_pareto, read_study
 from pneuopt.files.tuning import Tuning, read_tuning

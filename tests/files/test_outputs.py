@@ -4,7 +4,7 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from pneuopt.files.first_files import first_files
-from pneuopt.files.json_outputs import OUTPUTS, output_schema
+from pneuopt.files.outputs import OUTPUTS, output_schema
 from pneuopt.quantities.parameters import ParameterSet
 
 
