@@ -18,7 +18,7 @@ from pneuopt.dynamics.system import System
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.identification.assumptions import AMBIENT_PRESSURE, DRIVE_FILE, Assumption
 from pneuopt.identification.result import IdentificationResult, Mark
-from pneuopt.models.declaration import Alias, Drive, DriveKind, Sections, Structure
+from pneuopt.models.declaration import Alias, Drive, DriveKind, DriveSections, Sections
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import HardwareError, InputError, ModelError, UnknownNameError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, choice, parameter_key, table
@@ -75,10 +75,10 @@ def drive_keys(name: str) -> Mapping[str, Key]:
 
 def default_parameters(kind: DriveKind, sections: Sections) -> ParameterSet:
     """The parameters of a drive that a file's sections describe."""
-    return kind.build(Structure(sections, kind.sections, lambda *_: "")).system().parameters
+    return kind.build(DriveSections(sections, kind.sections, lambda *_: "")).system().parameters
 
 
-class _Variant(NamedTuple):
+class _DriveOptions(NamedTuple):
     """A drive with a word for each required option, and at most one other option that is not as usual."""
 
     words: Mapping[Option, str]
@@ -96,7 +96,7 @@ def _find_parameters(kind: DriveKind) -> dict[str, tuple[Parameter, str]]:
     return {n: (p, _describe_condition(n, kind, variants)) for n, p in found.items()}
 
 
-def _build_variants(kind: DriveKind) -> Iterator[_Variant]:
+def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
     """Drives that together have every parameter: each law, and of each section one option after the other."""
     known = {(section, key): k for section, keys in kind.sections.items() for key, k in keys.items()}
     needed = {option: tuple(k.choices or ()) for option, k in known.items() if k.required}
@@ -108,7 +108,7 @@ def _build_variants(kind: DriveKind) -> Iterator[_Variant]:
         for base in bases if own_laws else bases[:1]:
             try:
                 options = base if option is None else {**base, option: value}
-                yield _Variant(base, option, value, default_parameters(kind, _as_sections(options)))
+                yield _DriveOptions(base, option, value, default_parameters(kind, _as_sections(options)))
             except ModelError:  # options that exclude each other
                 continue
 
@@ -130,7 +130,7 @@ def _as_sections(options: Mapping[Option, Any]) -> dict[str, dict[str, Any]]:
     return sections
 
 
-def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_Variant]) -> str:
+def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOptions]) -> str:
     """The options under which a drive has a parameter: 'model = "stribeck" or "lugre"'."""
     parts = []
     for section, keys in kind.sections.items():
@@ -145,7 +145,7 @@ def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_Variant]
     return " and ".join(parts)
 
 
-def _has_by_word(name: str, option: Option, variants: Sequence[_Variant]) -> dict[Any, bool]:
+def _has_by_word(name: str, option: Option, variants: Sequence[_DriveOptions]) -> dict[Any, bool]:
     """For each word of a required option whether there is the parameter, the others as it needs them."""
     needs = {(v.changed, v.value) for v in variants if name in v.parameters}
     has: dict[Any, bool] = {}
@@ -155,7 +155,7 @@ def _has_by_word(name: str, option: Option, variants: Sequence[_Variant]) -> dic
     return has
 
 
-def _has_by_value(name: str, option: Option, key: Key, variants: Sequence[_Variant]) -> dict[Any, bool]:
+def _has_by_value(name: str, option: Option, key: Key, variants: Sequence[_DriveOptions]) -> dict[Any, bool]:
     """For each value of an option whether there is the parameter; nothing where the option makes no difference."""
     usual = {tuple(v.words.items()): name in v.parameters for v in variants if v.changed is None}
     changed = [(v, usual.get(tuple(v.words.items()), False)) for v in variants if v.changed == option]
@@ -204,9 +204,9 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
     for name, section in sections.items():
         check_names("section", [name], _KNOWN_SECTIONS, places.location(name))
         require(isinstance(section, dict), f"{places.location(name)}: {name} must be a section, [{name}]")
-    kind: DriveKind = Structure(sections, _DRIVE_SECTION, places.location).option("drive", "kind")
+    kind: DriveKind = DriveSections(sections, _DRIVE_SECTION, places.location).options("drive")["kind"]
     try:
-        drive = kind.build(Structure(sections, kind.sections, places.location))
+        drive = kind.build(DriveSections(sections, kind.sections, places.location))
         system = drive.system()
     except ModelError as error:  # a law that asks for what its base, or this plant, has not
         raise ModelError(f"{places.location('friction')}: [friction]: {error}") from None

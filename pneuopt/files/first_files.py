@@ -23,7 +23,7 @@ from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.plant_channels import plant_channels
 from pneuopt.logs.sidecar_keys import SIDECAR_KEYS
 from pneuopt.models.catalog import CATALOGUE_SOURCE
-from pneuopt.models.declaration import DriveKind, FirstFiles, Structure
+from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.keys import Key
@@ -86,7 +86,7 @@ def first_files(
     kind, first = DRIVE_KINDS[name], first_kinds()[name]
     defaults = default_parameters(kind, first.options)
     values = defaults | defaults.with_values(first.values) | known.select(n for n in known if n in defaults)
-    plant = kind.build(Structure(first.options, kind.sections, lambda *_: "")).system()
+    plant = kind.build(DriveSections(first.options, kind.sections, lambda *_: "")).system()
     loop = ClosedLoop(plant, PID(sample_time))
     templates = {
         "drive": _drive_template(kind, first, values, source),
@@ -116,7 +116,7 @@ def unused_channels(name: str) -> frozenset[str]:
 
 def _first_plant(name: str) -> System:
     kind, first = DRIVE_KINDS[name], first_kinds()[name]
-    return kind.build(Structure(first.options, kind.sections, lambda *_: "")).system()
+    return kind.build(DriveSections(first.options, kind.sections, lambda *_: "")).system()
 
 
 def sidecar_name(log: str) -> str:

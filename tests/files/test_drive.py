@@ -336,7 +336,7 @@ IMPOSSIBLE = "drive.toml:{}: .{}. {} is impossible; {}"
         (
             "[load]",
             "[valve.smoothing]\nzero = 0\n[load]",
-            "smoothing: zero must be positive, got 0; smaller is sharper",
+            "smoothing zero must be positive, got 0",
         ),
         ("[load]", "[valve.smoothing]\nzero_flow = 1\n[load]", "unknown key 'zero_flow'; did you mean 'zero'"),
         ("critical_ratio = 0.3", 'law = "iso"', "unknown law 'iso'; did you mean 'iso6358'"),
