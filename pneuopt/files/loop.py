@@ -27,6 +27,7 @@ from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.distributions import DISTRIBUTIONS, Distribution
 from pneuopt.evaluation.metric import Requirement
@@ -35,9 +36,20 @@ from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.sampling import Sampling
 from pneuopt.evaluation.scenarios import TOGETHER, Spread
 from pneuopt.files.drive import ambient_pressure
-from pneuopt.files.toml import construct_at, read_fixed_value, read_parameter
+from pneuopt.files.toml import construct_at, read_parameter
 from pneuopt.quantities.errors import InputError, UnitError, check_names, require
-from pneuopt.quantities.keys import Key, Takes, argument_meanings, choice, first_sentence, flag, parameter_key, table
+from pneuopt.quantities.keys import (
+    Key,
+    Takes,
+    argument_meanings,
+    choice,
+    first_sentence,
+    flag,
+    parameter_key,
+    read_entry,
+    read_table,
+    table,
+)
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import count_gauge_from, read_value, write_value
@@ -106,8 +118,20 @@ _OF_A_MOVE, _HAS_AN_END = "of a move", "of a move or a path"
 _SHARED_KEYS: Mapping[str, Key] = {
     "initial": Key("value before", unit="{measured}", usual=Step.initial),
     "at": Key("when it begins", unit="s", usual=Step.at),
-    "start": table("what else is known of the plant at time 0", {}, others=_KNOWN, named="output"),
-    "disturbance": table("what changes of the plant at that instant", {}, others=_PUSH, named="parameter or input"),
+    "start": table(
+        "what else is known of the plant at time 0",
+        {},
+        others=_KNOWN,
+        named="output",
+        example='{ position = "250 mm" }',
+    ),
+    "disturbance": table(
+        "what changes of the plant at that instant",
+        {},
+        others=_PUSH,
+        named="parameter or input",
+        example='{ "load.force" = "50 N" }',
+    ),
 }
 STEP_KEYS: Mapping[str, Key] = {
     "step": Key(
@@ -119,21 +143,8 @@ STEP_KEYS: Mapping[str, Key] = {
     ),
     **_SHARED_KEYS,
 }
-MOVE_KEYS: Mapping[str, Key] = {
-    "move": Key(
-        "distance of a move from rest to rest",
-        unit="{difference}",
-        example='"200 mm"',
-        condition="in place of step and horizon",
-    ),
-    "moves": Key(
-        "distances of moves one after the other, or tables { distance, speed, dwell, ... } with limits of their own; "
-        "metrics are of the last",
-        Takes.LIST,
-        "{difference}",
-        example='["200 mm", "-200 mm"]',
-        condition="in place of move",
-    ),
+_DISTANCE = Key("distance of a move from rest to rest", unit="{difference}", example='"200 mm"', required=True)
+_MOTION_KEYS: Mapping[str, Key] = {
     "speed": Key("its largest speed", unit="{measured}/s", example='"0.5 m/s"', condition="required of a move"),
     "acceleration": Key(
         "its largest acceleration", unit="{measured}/s^2", example='"5 m/s^2"', condition="required of a move"
@@ -143,6 +154,22 @@ MOVE_KEYS: Mapping[str, Key] = {
         choice("its shape", {kind.value: kind for kind in MoveProfile}, Move.profile.value), condition=_OF_A_MOVE
     ),
     "dwell": Key("from its end to the end of the experiment", unit="s", usual=Move.dwell, condition=_HAS_AN_END),
+}
+OWN_MOVE_KEYS: Mapping[str, Key] = {"distance": _DISTANCE, **_MOTION_KEYS}
+"""Those of one of several moves."""
+MOVE_KEYS: Mapping[str, Key] = {
+    "move": replace(_DISTANCE, required=False, condition="in place of step and horizon"),
+    "moves": Key(
+        "distances of moves one after the other, or tables { distance, speed, dwell, ... } with limits of their own; "
+        "metrics are of the last",
+        Takes.LIST,
+        "{difference}",
+        example='["200 mm", "-200 mm"]',
+        condition="in place of move",
+        of=Key("a distance, or a table with it", Takes.PARAMETER, "{difference}", keys=OWN_MOVE_KEYS),
+        counts=(1, float("inf")),
+    ),
+    **_MOTION_KEYS,
     **_SHARED_KEYS,
 }
 PATH_KEYS: Mapping[str, Key] = {
@@ -154,11 +181,6 @@ PATH_KEYS: Mapping[str, Key] = {
     ),
     **{n: MOVE_KEYS[n] for n in ("dwell", "start", "disturbance")},
 }
-OWN_MOVE_KEYS: Mapping[str, Key] = {
-    "distance": replace(MOVE_KEYS["move"], condition="of one of several moves"),
-    **{n: MOVE_KEYS[n] for n in ("speed", "acceleration", "jerk", "profile", "dwell")},
-}
-"""Those of one of several moves."""
 REFERENCE_KEYS: Mapping[str, Key] = {**STEP_KEYS, **MOVE_KEYS, **PATH_KEYS}
 """All of them."""
 
@@ -177,8 +199,8 @@ SPREAD_KEYS: Mapping[str, Key] = {
     ),
 }
 SAMPLE_KEYS: Mapping[str, Key] = {
-    "count": Key("how many", Takes.COUNT, usual=20),
-    "seed": Key("of the random numbers", Takes.COUNT, usual=0),
+    "count": Key("how many", Takes.COUNT, usual=20, least=1, most=MAX_CASES),
+    "seed": Key("of the random numbers", Takes.COUNT, usual=0, least=0),
     "sampling": choice("how they fill the box", {s.value: s for s in Sampling}, Sampling.RANDOM.value),
 }
 SAMPLED_KEY = Key(
@@ -205,13 +227,7 @@ class Draw:
 
 def read_draw(given: Mapping[str, Any], where: str) -> Draw:
     """Read how plants are drawn; what is left out is as usual."""
-    count, seed, word = (given.get(key, known.usual) for key, known in SAMPLE_KEYS.items())
-    whole = all(isinstance(n, int) and not isinstance(n, bool) for n in (count, seed))
-    require(whole, f"{where} count and seed are whole numbers")
-    require(count <= MAX_CASES and seed >= 0, f"{where} count may be {MAX_CASES} at most, seed not below 0")
-    known = SAMPLE_KEYS["sampling"].choices or {}
-    check_names("sampling", [word], known, where)
-    return Draw(count, seed, known[word])
+    return Draw(**read_table(SAMPLE_KEYS, given, where))
 
 
 def read_spreads(entries: Mapping[str, Any], where: str, parameters: ParameterSet) -> dict[str, Spread]:
@@ -247,12 +263,10 @@ def read_sample_spreads(
             found[pattern] = _read_spread(given, pattern, where, parameters)
             continue
         spot = f"{where} {pattern}"
-        check_names("key", given, SPREAD_KEYS, spot)
-        require("spread" in given, f'{spot} has no spread; write {{ distribution = "normal", spread = "5 %" }}')
+        said = read_table(SPREAD_KEYS, given, spot)
         word = given.get("distribution", SPREAD_KEYS["distribution"].usual)
-        check_names("distribution", [word], DISTRIBUTIONS, spot)
-        spread = _read_spread(given["spread"], pattern, where, parameters, word)
-        found[pattern] = construct_at(partial(DISTRIBUTIONS[word], spread), spot)
+        spread = _read_spread(said["spread"], pattern, where, parameters, word)
+        found[pattern] = construct_at(partial(said["distribution"], spread), spot)
     return found
 
 
@@ -291,14 +305,17 @@ REPLACED_METHODS = {
 
 def _option_keys(name: str) -> dict[str, Key]:
     """The options of a method that a file can state: numbers, and lists of them."""
-    kind, forms = METHODS[name], {int: Takes.COUNT, float: Takes.NUMBER, tuple: Takes.LIST}
-    meanings, own = argument_meanings(kind), (f for f in fields(kind) if isinstance(f.default, int | float | tuple))
-    return {
-        f.name: Key(
-            meanings.get(f.name, ""), forms[type(f.default)], usual=f.default, condition=f'with kind = "{name}"'
-        )
-        for f in own
-    }
+    meanings, condition = argument_meanings(METHODS[name]), f'with kind = "{name}"'
+    own = [f for f in fields(METHODS[name]) if isinstance(f.default, int | float | tuple)]
+    return {f.name: _option_key(f.default, meanings.get(f.name, ""), condition) for f in own}
+
+
+def _option_key(usual: Any, meaning: str = "", condition: str = "") -> Key:
+    if isinstance(usual, tuple):
+        return Key(meaning, Takes.LIST, usual=usual, condition=condition, of=_option_key(usual[0]))
+    if isinstance(usual, float):
+        return Key(meaning, usual=usual, condition=condition)
+    return Key(meaning, Takes.COUNT, usual=usual, condition=condition, least=-MAX_OPTION, most=MAX_OPTION)
 
 
 METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {name: _option_keys(name) for name in METHODS}
@@ -345,29 +362,15 @@ def read_method(entries: Mapping[str, Any], where: str) -> Method | None:
     """
     if not entries:
         return None
-    require("kind" in entries, f"{where} has no kind; write kind = {' or '.join(map(repr, METHODS))}")
-    name = str(entries["kind"])
+    name = str(entries.get("kind"))
     if name in REPLACED_METHODS:
         successor = REPLACED_METHODS[name]
         known = ", ".join(METHOD_KEYS[successor])
         raise InputError(f"{where}: {name!r} is gone; write kind = {successor!r}, whose options are {known}")
-    check_names("kind", [name], METHODS, where)
-    kind, options = METHODS[name], METHOD_KEYS[name]
-    check_names("option", entries, ("kind", *options), where)
-    given = {n: _read_option(value, options[n].usual, f"{where} {n}") for n, value in entries.items() if n != "kind"}
-    return construct_at(lambda: kind(**given), where)
-
-
-def _read_option(given: Any, default: Any, where: str) -> Any:
-    """As a number of the default's type, or several."""
-    if isinstance(default, tuple):
-        require(isinstance(given, list), f"{where} must be a list, {list(default)} say, got {given!r}")
-        return tuple(_read_option(v, default[0], where) for v in given)
-    if isinstance(default, float):
-        return read_value(given, "1", where=where)
-    require(isinstance(given, int) and not isinstance(given, bool), f"{where} must be a whole number, got {given!r}")
-    require(abs(given) <= MAX_OPTION, f"{where} may be {MAX_OPTION} at most, got {given!r}")
-    return int(given)
+    chosen = {"kind": METHOD_SECTION.keys["kind"]}
+    kind: type[Method] = read_table(chosen, entries, where, partial=True)["kind"]
+    values = read_table(chosen | METHOD_KEYS[name], entries, where)
+    return construct_at(lambda: kind(**{n: values[n] for n in entries if n != "kind"}), where)
 
 
 ACCEPT_KEY = "accept"
@@ -390,7 +393,14 @@ LOOP_KEYS: Mapping[str, Mapping[str, Key]] = {
         "anti_windup": choice(
             "what keeps the integral at bay at a limit", _words(AntiWindup), AntiWindup.BACK_CALCULATION.value
         ),
-        "limits": Key("least and largest command", Takes.LIST, "{command}", example='["-5 V", "5 V"]'),
+        "limits": Key(
+            "least and largest command",
+            Takes.LIST,
+            "{command}",
+            example='["-5 V", "5 V"]',
+            of=Key("a command", unit="{command}"),
+            counts=(2, 2),
+        ),
     },
     PositionLoop.section: {},
     "dither": {
@@ -425,12 +435,45 @@ LOOP_MEANINGS: Mapping[str, str] = {
     GainSchedule.section: "gains that change with the position and the load",
 }
 
-OBJECTIVE_KEYS: Mapping[str, Key] = {"weight": Key("its share of the objective", usual=1.0)}
-_ENVELOPE = Key("rows of instant, lower and upper bound", Takes.LIST, example='[["0 s", "-10 %", "110 %"]]')
+
+def _read_band(entry: Any, where: str, units: Mapping[str, str]) -> Band:
+    """A fraction of the step, or a half width in the measured unit."""
+    try:
+        return read_value(entry, "1", where=where)
+    except UnitError:
+        width = units["measured"].partition("(")[0]
+    try:
+        return construct_at(lambda: Tolerance(read_value(entry, width, where=where)), where)
+    except UnitError as error:
+        raise UnitError(f'{error}, or as a fraction of the step, band = "2 %"') from None
+
+
+_ENVELOPE_ROW = Key(
+    "an instant, its lower and its upper bound",
+    Takes.LIST,
+    read=lambda row, where, _: _read_envelope_row(row, where),
+)
+
+
+def _read_envelope_row(row: Any, where: str) -> tuple[float, float, float]:
+    proper = isinstance(row, list) and len(row) == 3
+    require(proper, f'{where}: write instants with a lower and an upper bound, [["0 s", "-10 %", "110 %"], ...]')
+    instant, low, up = (read_value(v, unit, where=where) for v, unit in zip(row, ("s", "1", "1"), strict=True))
+    return instant, low, up
+
+
+OBJECTIVE_KEYS: Mapping[str, Key] = {"weight": Key("its share of the objective", usual=1.0, least=0.0, is_open=True)}
+_ENVELOPE = Key(
+    "rows of instant, lower and upper bound",
+    Takes.LIST,
+    example='[["0 s", "-10 %", "110 %"]]',
+    required=True,
+    of=_ENVELOPE_ROW,
+    counts=(1, float("inf")),
+)
+_BAND_MEANING = 'half width of the band, a fraction of the step or as "0.1 mm"'
 EXTRA_KEYS: Mapping[str, Mapping[str, Key]] = {
-    "settling_time": {
-        "band": Key('half width of the band, a fraction of the step or as "0.1 mm"', usual=SettlingTime.band)
-    },
+    "settling_time": {"band": Key(_BAND_MEANING, usual=SettlingTime.band, read=_read_band)},
     "step_envelope": {"bounds": _ENVELOPE},
 }
 """The keys of some requirements beside their limit and weight."""
@@ -443,13 +486,13 @@ SCENARIO_KEYS: Mapping[str, Key] = {
 }
 
 BUDGET_KEYS: Mapping[str, Key] = {
-    "steps": Key("steps of the simulations that are refused as too many", usual=MAX_STEPS),
+    "steps": Key("steps of the simulations that are refused as too many", usual=MAX_STEPS, least=0.0, is_open=True),
 }
 
 
 NO_HUNTING_KEY = "no_hunting"
 """Key under [limits] of `NoHunting`, which has no metric."""
-_REPEATABILITY = Key("largest range of its errors at rest over the references", unit="{measured}", example='"0.1 mm"')
+_REPEATABILITY = Key("largest range of its errors at rest over the references", unit="{difference}", example='"0.1 mm"')
 NO_HUNTING_KEYS: Mapping[str, Key] = {
     "duration": Key("for how long it is watched", unit="s", usual=NoHunting.duration),
     "repeatability": _REPEATABILITY,
@@ -475,7 +518,14 @@ def limit_key(name: str) -> Key:
     bound, unit = kind.metric.sense.value, kind.metric.unit
     usual = StepEnvelope.max if name == "step_envelope" else None
     example = '"5 %"' if kind.metric.percent else "1.5" if unit == "1" else f'"1 {unit}"'
-    keys = {bound: Key("the bound", unit=unit, usual=usual, example=example), **EXTRA_KEYS.get(name, {})}
+    read = None
+    if unit.endswith(NORMAL_VOLUME):
+
+        def read(entry: Any, where: str, _: Mapping[str, str]) -> float:
+            return read_bound(name, entry, unit.removesuffix(NORMAL_VOLUME), where)
+
+    own = Key("the bound", unit=unit, usual=usual, example=example, required=usual is None, read=read)
+    keys = {bound: own, **EXTRA_KEYS.get(name, {})}
     return Key(first_sentence(kind), Takes.PARAMETER, unit, keys=keys, example="" if "{" in unit else example)
 
 
@@ -490,16 +540,21 @@ def signal_units(command: str, measured: str, position: str = "m") -> dict[str, 
     }
 
 
+LIMIT_KEYS: Mapping[str, Key] = {n: limit_key(n) for n in REQUIREMENTS_BY_KEY} | {NO_HUNTING_KEY: _NO_HUNTING}
+"""What [limits] may hold."""
 TUNING_KEYS: Mapping[str, Key] = {
     ACCEPT_KEY: Key(
-        "defects with which a design is certified all the same", Takes.LIST, choices=_words(Defect), usual=[]
+        "defects with which a design is certified all the same",
+        Takes.LIST,
+        choices=_words(Defect),
+        usual=[],
+        example='["hunts"]',
+        named="defect",
     ),
     **{n: table(LOOP_MEANINGS[n], keys, required=n == "pid") for n, keys in LOOP_KEYS.items()},
     "reference": table("a step or a move to follow; one or more", REFERENCE_KEYS, takes=Takes.TABLES, required=True),
     "minimise": table("what shall be small, weighted", {n: objective_key(n) for n in REQUIREMENTS_BY_KEY}),
-    "limits": table(
-        "what shall be kept", {n: limit_key(n) for n in REQUIREMENTS_BY_KEY} | {NO_HUNTING_KEY: _NO_HUNTING}
-    ),
+    "limits": table("what shall be kept", LIMIT_KEYS),
     "scenarios": table("other plants and gains for which it shall hold, too", SCENARIO_KEYS),
     "method": METHOD_SECTION,
     "budget": table("what a search may take", BUDGET_KEYS),
@@ -519,6 +574,16 @@ _SAMPLED = "with sample_time; never free"
 _LIMITS = ("lower", "upper")  # parameters that a file states as a pair, limits
 
 
+FIRST_PARAMETERS: Mapping[str, str] = {
+    PositionLoop.section: "Kp",
+    "dither": "frequency",
+    "feedforward": "gain",
+    **{section: part.size for section, part in COMPENSATORS.items()},
+    GainSchedule.section: "low",
+}
+"""The parameter that a file must state of each part beside the PID."""
+
+
 def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping[str, Key]:
     """All sections of a tuning.toml with all their keys.
 
@@ -534,14 +599,14 @@ def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping
     signal = SensedSignal(Quantity("measured", measured), {}, SAMPLE_TIME)
     parts = {
         "pid": _pid_keys(command, measured),
-        PositionLoop.section: _parameter_keys(PositionLoop().parameters(measured, f"{measured}/s"), "Kp"),
-        "dither": _parameter_keys(Dither().parameters(command), "frequency"),
-        "feedforward": _parameter_keys(Feedforward().parameters(measured, command), "gain"),
-        **{name: _parameter_keys(part().parameters(signal, command), part.size) for name, part in COMPENSATORS.items()},
-        GainSchedule.section: _parameter_keys(
-            GainSchedule(SCHEDULED_GAINS, 0.0, 1.0, 1.0).parameters("m", "kg"), "low"
-        ),
+        PositionLoop.section: _parameter_keys(PositionLoop().parameters(measured, f"{measured}/s")),
+        "dither": _parameter_keys(Dither().parameters(command)),
+        "feedforward": _parameter_keys(Feedforward().parameters(measured, command)),
+        **{name: _parameter_keys(part().parameters(signal, command)) for name, part in COMPENSATORS.items()},
+        GainSchedule.section: _parameter_keys(GainSchedule(SCHEDULED_GAINS, 0.0, 1.0, 1.0).parameters("m", "kg")),
     }
+    for section, first in FIRST_PARAMETERS.items():
+        parts[section][first] = replace(parts[section][first], required=True)
     for section, condition in _SECTION_CONDITIONS.items():
         parts[section] = {n: replace(key, condition=condition) for n, key in parts[section].items()}
     return {n: replace(key, keys={**key.keys, **parts.get(n, {})}) for n, key in TUNING_KEYS.items()}
@@ -562,9 +627,8 @@ def _pid_keys(command: str, measured: str) -> dict[str, Key]:
     return found | fixed
 
 
-def _parameter_keys(parameters: ParameterSet, required: str) -> dict[str, Key]:
-    """The parameters of a part, one of which a file must state."""
-    return {n: replace(parameter_key(p), required=n == required) for n, p in parameters.items()}
+def _parameter_keys(parameters: ParameterSet) -> dict[str, Key]:
+    return {n: parameter_key(p) for n, p in parameters.items()}
 
 
 TuningSections = Mapping[str, Any]
@@ -612,61 +676,33 @@ def read_loop_sections(
 
 
 def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
-    wiring = table.get("loop", {})
-    check_names("key", wiring, LOOP_KEYS["loop"], f"{path}: [loop]")
-    for key, signal in wiring.items():
-        require(isinstance(signal, str), f"{path}: [loop] {key} must be a signal's name, got {signal!r}")
+    wiring = {n: s for n, s in read_table(LOOP_KEYS["loop"], table.get("loop", {}), f"{path}: [loop]").items() if s}
+    for section, first in FIRST_PARAMETERS.items():
+        told = f"{path}: [{section}] has no {first}, without which it does nothing; write {first}"
+        require(section not in table or first in table[section], told)
     pid = _pid(table["pid"], f"{path}: [pid]")
     dither = _dither(table["dither"], f"{path}: [dither]") if "dither" in table else None
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
     lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
     parts = tuple(_compensator(n, table[n], f"{path}: [{n}]") for n in COMPENSATORS if n in table)
-    outer = (
-        _position_loop(table[PositionLoop.section], f"{path}: [{PositionLoop.section}]")
-        if PositionLoop.section in table
-        else None
-    )
+    outer = PositionLoop() if PositionLoop.section in table else None
     schedule = _schedule(table["schedule"], plant, f"{path}: [schedule]") if "schedule" in table else None
     loop = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
     return construct_at(lambda: loop(feedforward=lead, compensators=parts, outer=outer), str(path))
 
 
 def _pid(table: Mapping[str, Any], where: str) -> PID:
-    keys = LOOP_KEYS["pid"]
-    form = _read_choice(table, "form", keys, where)
-    _check_gains(table, form, where)
-    sample_time = _read_value(table, "sample_time", keys, where)
-    delay = _sample_count(table.get("delay", keys["delay"].usual), f"{where} delay")
+    keys = {n: key for n, key in LOOP_KEYS["pid"].items() if n != "limits"}  # their unit is the loop's
+    read = read_table(keys, table, where, partial=True)
+    _check_gains(table, read["form"], where)
     banded, resets = "dead_band" in table, "reset_ratio" in table
     told = "reset_band is that of resets; write reset_ratio, too, 1 for the whole integral"
     require(resets or "reset_band" not in table, f"{where} {told}")
-    unwinds = _read_choice(table, "anti_windup", keys, where)
+    unwinds = read["anti_windup"]
     told = "Tt is back-calculation's; clamping has none; leave it out"
     require("Tt" not in table or unwinds is AntiWindup.BACK_CALCULATION, f"{where} {told}")
-    return construct_at(lambda: PID(sample_time, "limits" in table, form, delay, banded, unwinds, resets), where)
-
-
-def _read_choice(table: Mapping[str, Any], key: str, keys: Mapping[str, Key], where: str) -> Any:
-    """What the word of a key stands for, of the usual one where the section leaves it out."""
-    word, words = str(table.get(key, keys[key].usual)), keys[key].choices or {}
-    check_names(key, [word], words, where)
-    return words[word]
-
-
-def _read_value(
-    table: Mapping[str, Any], key: str, keys: Mapping[str, Key], where: str, units: Mapping[str, str] | None = None
-) -> Any:
-    """A value that cannot be free, in its declared unit; the usual one where the section leaves it out."""
-    if key not in table:
-        return keys[key].usual
-    return read_fixed_value(table, key, keys[key].unit.format_map(units or {}), where)
-
-
-def _sample_count(table: Any, where: str) -> int:
-    match = re.fullmatch(r"\s*(\d+)\s*samples?\s*", table) if isinstance(table, str) else None
-    plainly = isinstance(table, int) and not isinstance(table, bool)
-    require(match is not None or plainly, f'{where}: {table!r} is no number of samples; write delay = "1 sample"')
-    return int(match[1]) if match else int(table)
+    made = partial(PID, read["sample_time"], "limits" in table, read["form"], read["delay"], banded, unwinds, resets)
+    return construct_at(made, where)
 
 
 def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
@@ -680,47 +716,34 @@ def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
 
 
 def _dither(table: Mapping[str, Any], where: str) -> Dither:
-    keys, analogue = LOOP_KEYS["dither"], table.get("analogue", LOOP_KEYS["dither"]["analogue"].usual)
-    shape = _read_choice(table, "waveform", keys, where)
-    require(isinstance(analogue, bool), f"{where} analogue must be true or false")
-    require("frequency" in table, f'{where} has no frequency; write frequency = "160 Hz"')
+    read = read_table(LOOP_KEYS["dither"], table, where, partial=True)
     given = read_parameter(table["frequency"], Parameter(1.0, "Hz"), f"{where} frequency")
-    return construct_at(lambda: Dither(given.value, analogue, shape), where)
+    return construct_at(lambda: Dither(given.value, read["analogue"], read["waveform"]), where)
 
 
 def _sensor(table: Mapping[str, Any], plant: System, where: str) -> SensorLag | Encoder:
-    keys = LOOP_KEYS["sensor"]
-    check_names("key", table, keys, where)
+    usual = Encoder() if plant.axis is None else Encoder(position=plant.axis.position)
+    units = {"position": {q.name: q.unit for q in plant.outputs}.get(usual.position, "m")}
+    read = read_table(LOOP_KEYS["sensor"], table, where, units=units)
     message = 'write lag = "5 ms", or of an encoder resolution = "10 um" and filter = "5 ms"'
     require(bool(table), f"{where} has no lag; {message}")
     require("lag" not in table or len(table) == 1, f"{where} has a lag or an encoder, not both; {message}")
     if "lag" in table:
-        lag = _read_value(table, "lag", keys, where)
-        return construct_at(lambda: SensorLag(lag), where)
-    usual = Encoder() if plant.axis is None else Encoder(position=plant.axis.position)
-    units = {"position": {q.name: q.unit for q in plant.outputs}.get(usual.position, "m")}
-    read = {key: _read_value(table, key, keys, where, units) for key in table}
-    return construct_at(lambda: replace(usual, **read), where)
+        return construct_at(lambda: SensorLag(read["lag"]), where)
+    return construct_at(lambda: replace(usual, **{key: read[key] for key in table}), where)
 
 
 def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
-    require("gain" in table, f"{where} has no gain; write gain and time")
     if "time" not in table:
         return Feedforward()
     time = read_parameter(table["time"], Parameter(1.0, "s"), f"{where} time").value
     return construct_at(lambda: Feedforward(time), where)
 
 
-def _position_loop(table: Mapping[str, Any], where: str) -> PositionLoop:
-    require("Kp" in table, f'{where} has no gain; write Kp = "10 1/s"')
-    return PositionLoop()
-
-
 def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedule:
     """A schedule of the gains whose coefficients are stated."""
-    told = 'has no {}, an end of the stroke; write low = "0 mm" and high = "200 mm", say'
-    for key in ("low", "high"):
-        require(key in table, f"{where} {told.format(key)}")
+    told = f'{where} has no high, the other end of the stroke; write low = "0 mm" and high = "200 mm", say'
+    require("high" in table, told)
     axis, units = plant.axis or Axis(), {q.name: q.unit for q in plant.outputs}
     unit = units.get(axis.position, "m")
     low, high = (read_parameter(table[key], Parameter(0.0, unit), f"{where} {key}").value for key in ("low", "high"))
@@ -736,10 +759,8 @@ def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedu
 
 def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensator:
     """A compensator, whose fields are choices of an enum."""
-    kind, keys = COMPENSATORS[section], LOOP_KEYS[section]
-    require(kind.size in table, f"{where} has no {kind.size}, without which it adds nothing; write {kind.size}")
-    chosen = {key: _read_choice(table, key, keys, where) for key in keys}
-    return construct_at(lambda: kind(**chosen), where)
+    chosen = read_table(LOOP_KEYS[section], table, where, partial=True)
+    return construct_at(lambda: COMPENSATORS[section](**chosen), where)
 
 
 def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centre: float) -> ParameterSet:
@@ -785,11 +806,7 @@ def _read_limits(entries: Mapping[str, Any], own: ParameterSet, centre: float, w
     if "limits" not in entries:
         return {}
     ends, unit = entries["limits"], own["pid.lower"].unit
-    require(
-        isinstance(ends, list) and len(ends) == 2,
-        f'{where} must be a pair: ["{write_value(-5.0, unit)}", "{write_value(5.0, unit)}"]',
-    )
-    low, high = (read_value(end, unit, where=where) for end in ends)
+    low, high = read_entry(LOOP_KEYS["pid"]["limits"], ends, where, {"command": unit})
     require(low < high, f"{where}: {ends[0]} is not below {ends[1]}")
     wire = [write_value(v, unit, 2) for v in (0.0, 2 * centre)]
     remedy = f'write what the wire may carry, limits = ["{wire[0]}", "{wire[1]}"] for instance'

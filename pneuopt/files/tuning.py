@@ -15,11 +15,9 @@ from pneuopt.control.reference import Reference, Step
 from pneuopt.dynamics.centre import command_centre
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
-from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.sampling import further
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, samples, tolerances
@@ -27,11 +25,9 @@ from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.loop import (
     ACCEPT_KEY,
     BUDGET_KEYS,
+    LIMIT_KEYS,
     MAX_CASES,
     MOVE_KEYS,
-    NO_HUNTING_KEY,
-    NO_HUNTING_KEYS,
-    OWN_MOVE_KEYS,
     PATH_KEYS,
     REFERENCE_KEYS,
     REQUIREMENTS_BY_KEY,
@@ -39,10 +35,7 @@ from pneuopt.files.loop import (
     STEP_KEYS,
     TUNING_KEYS,
     TuningSections,
-    bound_units,
-    limit_key,
     objective_key,
-    read_bound,
     read_draw,
     read_loop_sections,
     read_method,
@@ -50,14 +43,13 @@ from pneuopt.files.loop import (
     read_spreads,
     signal_units,
 )
-from pneuopt.files.toml import construct_at, read_fixed_value, read_toml
+from pneuopt.files.toml import construct_at, read_toml
 from pneuopt.logs.read_log import read_log
-from pneuopt.quantities.errors import InputError, UnitError, check_names, require
-from pneuopt.quantities.keys import Key, Takes
+from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.keys import Key, Takes, check_sections, read_entry, read_named, read_table
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import read_value, write_value
+from pneuopt.quantities.units import write_value
 from pneuopt.tuning.method import Method
 
 TUNED_SECTIONS = ("certified", "wire", "status", "provenance", "checksum")
@@ -135,10 +127,7 @@ def read_tuning_table(
 ) -> Tuning:
     """Read a tuning from the table that its file holds; parameters and errors as for `read_tuning`."""
     table = {name: entry for name, entry in document.items() if name not in TUNED_SECTIONS}
-    check_names("section", table, TUNING_KEYS, str(path))
-    for name in (n for n, key in TUNING_KEYS.items() if key.takes is Takes.TABLE):
-        require(isinstance(table.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
-    require("pid" in table, f"{path}: no controller; add a section [pid]")
+    check_sections(TUNING_KEYS, table, path)
     centre = command_centre(plant, parameters or plant.parameters)
     loop, own = read_loop_sections(table, plant, path, centre)
     weights, limits = _read_objective(table, loop, path), _read_requirements(table, loop, path)
@@ -147,8 +136,8 @@ def read_tuning_table(
     scenarios, validation = (partial(read, *section) for read in (read_scenarios, read_validation_scenarios))
     method = read_method(table.get("method", {}), f"{path}: [method]")
     references = read_references(table.get("reference", []), loop, path)
-    max_steps = _read_budget(table.get("budget", {}), f"{path}: [budget]")
-    accept = _read_accept(table.get(ACCEPT_KEY, TUNING_KEYS[ACCEPT_KEY].usual), f"{path}: {ACCEPT_KEY}")
+    max_steps = read_table(BUDGET_KEYS, table.get("budget", {}), f"{path}: [budget]")["steps"]
+    accept = read_entry(TUNING_KEYS[ACCEPT_KEY], table.get(ACCEPT_KEY, []), f"{path}: {ACCEPT_KEY}")
     return Tuning(loop, references, own, spec, scenarios, validation, method, max_steps, accept, centre)
 
 
@@ -186,38 +175,17 @@ def _merge_scenarios(parts: Sequence[Mapping[str, float | Factor]]) -> dict[str,
     return {n: value for part in parts for n, value in part.items()}
 
 
-def _read_budget(table: Mapping[str, Any], where: str) -> float:
-    """Read how many steps a simulation may take."""
-    check_names("key", table, BUDGET_KEYS, where)
-    known = BUDGET_KEYS["steps"]
-    steps = read_fixed_value(table, "steps", known.unit, where) if "steps" in table else known.usual
-    require(steps > 0, f"{where} steps must be positive, got {steps:g}; {MAX_STEPS:g} is usual")
-    return steps
-
-
-def _read_accept(words: Any, where: str) -> tuple[Defect, ...]:
-    """Read the defects that the user accepts by name."""
-    proper = isinstance(words, list) and all(isinstance(word, str) for word in words)
-    require(proper, f'{where}: write defects in a list before the first section, {ACCEPT_KEY} = ["hunts"]')
-    known = TUNING_KEYS[ACCEPT_KEY].choices or {}
-    check_names("defect", words, known, where)
-    return tuple(known[word] for word in words)
-
-
 def _read_objective(table: TuningSections, loop: ClosedLoop, path: str | Path) -> dict[Requirement, float]:
     """Read [minimise]: requirements and their weights."""
     where = f"{path}: [minimise]"
     check_names("requirement", table.get("minimise", {}), REQUIREMENTS_BY_KEY, where)
-    weights = {}
+    weights, units = {}, _bare_units(loop)
     for key, entry in table.get("minimise", {}).items():
         spot = f"{where} {key}"
         require(isinstance(entry, dict), f"{spot}: write {key} = {{ weight = 1.0 }}; a limit belongs under [limits]")
-        keys = objective_key(key).keys
-        check_names("key", entry, keys, spot)
-        weight = read_fixed_value(entry, "weight", "1", spot) if "weight" in entry else keys["weight"].usual
-        require(0 < weight < float("inf"), f"{spot}: weight must be positive, got {weight:g}")
-        limit = {"max": None} if key == "step_envelope" else {}
-        weights[_make_requirement(key, entry, limit, loop.feedback.unit, spot)] = weight
+        own = read_table(objective_key(key).keys, entry, spot, units=units)
+        weight, limit = own.pop("weight"), {"max": None} if key == "step_envelope" else {}
+        weights[construct_at(partial(REQUIREMENTS_BY_KEY[key], **limit, **own), spot)] = weight
     return weights
 
 
@@ -226,66 +194,20 @@ def _read_requirements(
 ) -> tuple[Requirement | NoHunting, ...]:
     """Read [limits]: requirements with their bounds."""
     where = f"{path}: [limits]"
-    check_names("requirement", table.get("limits", {}), (*REQUIREMENTS_BY_KEY, NO_HUNTING_KEY), where)
-    units, found = bound_units(loop), list[Requirement | NoHunting]()
+    check_names("requirement", table.get("limits", {}), LIMIT_KEYS, where)
+    units, found = _bare_units(loop), list[Requirement | NoHunting]()
     for key, given in table.get("limits", {}).items():
         spot = f"{where} {key}"
-        if key == NO_HUNTING_KEY:
-            found.append(_read_no_hunting(given, loop.feedback.unit, spot))
-            continue
-        bound = REQUIREMENTS_BY_KEY[key].metric.sense.value
-        entry = given if isinstance(given, dict) else {bound: given}
-        check_names("key", entry, limit_key(key).keys, spot)
-        require(bound in entry or key == "step_envelope", f"{spot} has no {bound}")
-        at = f"{spot} {bound}" if entry is given else spot
-        limit = {bound: read_bound(key, entry[bound], units[key], at)} if bound in entry else {}
-        found.append(_make_requirement(key, entry, limit, loop.feedback.unit, spot))
+        known = LIMIT_KEYS[key]
+        kind: Callable[..., Requirement | NoHunting] = REQUIREMENTS_BY_KEY.get(key, NoHunting)
+        stated = {n: value for n, value in read_entry(known, given, spot, units).items() if value is not None}
+        found.append(construct_at(partial(kind, **stated), spot))
     return tuple(found)
 
 
-def _read_no_hunting(given: Any, measured: str, where: str) -> NoHunting:
-    """Read no_hunting: a duration, or a table with it and the repeatability."""
-    entry = given if isinstance(given, dict) else {"duration": given}
-    check_names("key", entry, NO_HUNTING_KEYS, where)
-    units = {"duration": "s", "repeatability": difference_unit(measured)}
-    at = {n: f"{where} {n}" if entry is given else where for n in entry}
-    values = {n: read_value(entry[n], units[n], where=at[n]) for n in entry}
-    return construct_at(lambda: NoHunting(**values), where)
-
-
-def _make_requirement(
-    key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], measured: str, where: str
-) -> Requirement:
-    """Make the requirement of a key, with its limit, and with its band or bounds where it has them."""
-    own: dict[str, Any] = dict(limit)
-    if key == "step_envelope":
-        own["bounds"] = _read_envelope(entry.get("bounds"), f"{where} bounds")
-    elif "band" in entry:
-        own["band"] = _read_band(entry, measured, where)
-    return construct_at(lambda: REQUIREMENTS_BY_KEY[key](**own), where)
-
-
-def _read_band(entry: Mapping[str, Any], measured: str, where: str) -> Band:
-    """Read a settling band: a fraction of the step, or a half width in the measured unit."""
-    try:
-        return read_fixed_value(entry, "band", "1", where)
-    except UnitError:
-        width = measured.partition("(")[0]
-    try:
-        return construct_at(lambda: Tolerance(read_fixed_value(entry, "band", width, where)), where)
-    except UnitError as error:
-        raise UnitError(f'{error}, or as a fraction of the step, band = "2 %"') from None
-
-
-def _read_envelope(table: Any, where: str) -> EnvelopeBounds:
-    """Read the rows of a StepEnvelope: an instant, a lower and an upper bound each."""
-    rows = table if isinstance(table, list) else []
-    proper = len(rows) > 0 and all(isinstance(row, list) and len(row) == 3 for row in rows)
-    require(proper, f'{where}: write instants with a lower and an upper bound, [["0 s", "-10 %", "110 %"], ...]')
-    return tuple(
-        (read_value(t, "s", where=where), read_value(low, "1", where=where), read_value(up, "1", where=where))
-        for t, low, up in rows
-    )
+def _bare_units(loop: ClosedLoop) -> dict[str, str]:
+    """The units of the loop's signals without (a) or (g): those of bounds and bands, which are differences."""
+    return signal_units(loop.command.unit, loop.feedback.unit.partition("(")[0])
 
 
 def _read_kinds(
@@ -392,33 +314,26 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: i
         require(key in kind.keys, message)
     for key in ("horizon",) if "disturbance" in entry and kind is _STEP else kind.needed:
         require(key in entry, f"{where} has no {key}")
-    known = _numbers(entry, kind.keys, loop, where) | _circumstances(entry, loop, where)
+    known = _read_stated(kind.keys, entry, loop, where) | _circumstances(entry, loop, where)
     if kind is _PATH:
-        require(isinstance(entry["path"], str), f'{where} path must name a file, path = "path.csv"')
-        table = file.parent / entry["path"]
+        table = file.parent / known.pop("path")
         known = {"dwell": Move.dwell, **known}
         return construct_at(lambda: read_path_of(loop.feedback.name, table, **known), f"{where} path")
     if kind is _MOVE:
-        known |= _profile(entry, where)
-        each = _each_move(entry, loop, where) if "moves" in entry else [{"distance": known.pop("move")}]
+        each = known.pop("moves", None) or [{"distance": known.pop("move")}]
         return construct_at(lambda: _chain_moves(each, known), where)
     return construct_at(lambda: Step(known.pop("step", 0.0), **known), where)
 
 
-def _each_move(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> list[dict[str, Any]]:
-    """Read several moves: the distance of each, and the settings that it has for itself."""
-    given, unit = entry["moves"], difference_unit(loop.feedback.unit)
-    require(isinstance(given, list) and len(given) > 0, f'{where} moves must be a list, ["200 mm", "-200 mm"]')
-    found = []
-    for k, move in enumerate(given, 1):
-        if not isinstance(move, dict):
-            found.append({"distance": read_value(move, unit, where=f"{where} moves")})
-            continue
-        spot = f"{where} moves {k}"
-        check_names("key", move, OWN_MOVE_KEYS, spot)
-        require("distance" in move, f'{spot} has no distance; write {{ distance = "200 mm", speed = "0.1 m/s" }}')
-        found.append(_numbers(move, OWN_MOVE_KEYS, loop, spot) | _profile(move, spot))
-    return found
+def _read_stated(keys: Mapping[str, Key], entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Any]:
+    """What a reference states; of each of several moves, too, only what it states, for the rest is shared."""
+    units = signal_units(loop.command.unit, loop.feedback.unit)
+    plain = {n: key for n, key in keys.items() if key.takes is not Takes.TABLE}
+    values = read_table(plain, entry, where, units=units, partial=True)
+    if "moves" in entry:
+        own = [move if isinstance(move, dict) else {"distance": move} for move in entry["moves"]]
+        values["moves"] = [{n: all_[n] for n in said} for all_, said in zip(values["moves"], own, strict=True)]
+    return {n: values[n] for n in plain if n in entry}
 
 
 def _chain_moves(each: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) -> Reference:
@@ -433,38 +348,22 @@ def _chain_moves(each: Sequence[Mapping[str, Any]], settings: Mapping[str, Any])
     return MoveSequence([Move(**{**begins, **shared, **first}), *moves])
 
 
-def _profile(entry: Mapping[str, Any], where: str) -> dict[str, Any]:
-    words = MOVE_KEYS["profile"].choices or {}
-    if "profile" not in entry:
-        return {}
-    check_names("profile", [str(entry["profile"])], words, where)
-    return {"profile": words[str(entry["profile"])]}
-
-
-def _numbers(entry: Mapping[str, Any], keys: Mapping[str, Key], loop: ClosedLoop, where: str) -> dict[str, Any]:
-    """Read the values, each in the unit of its key."""
-    signals = signal_units(loop.command.unit, loop.feedback.unit)
-    units = {n: key.unit.format_map(signals) for n, key in keys.items() if key.takes is Takes.NUMBER}
-    return {n: read_fixed_value(entry, n, units[n], where) for n in units if n in entry}
-
-
 def _circumstances(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Any]:
     """Read how the plant starts, and its disturbance."""
-    outputs, start = {q.name: q.unit for q in loop.plant.outputs}, entry.get("start", {})
-    require(isinstance(start, dict), f'{where} start: write start = {{ position = "250 mm" }}')
-    check_names("output", start, outputs, f"{where} start")
-    begun = {n: read_fixed_value(start, n, outputs[n], f"{where} start") for n in start}
+    outputs = {q.name: q.unit for q in loop.plant.outputs}
+    begun = read_named(REFERENCE_KEYS["start"], entry.get("start", {}), outputs, f"{where} start")
     return {"start": begun, "disturbance": _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")}
 
 
 def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
     """Read a disturbance: the changes of parameters and inputs of the plant."""
-    require(isinstance(table, dict), f'{where}: write disturbance = {{ "load.force" = "50 N" }}')
+    if not isinstance(table, dict):
+        return read_named(REFERENCE_KEYS["disturbance"], table, {}, where)
     flat = {f"{n}.{m}": v for n, e in table.items() if isinstance(e, dict) for m, v in e.items()}
     flat |= {n: v for n, v in table.items() if not isinstance(v, dict)}
     units = {q.name: q.unit for q in loop.plant.inputs} | {n: p.unit for n, p in loop.plant.parameters.items()}
-    check_names("parameter or input of the plant", flat, units, where)
-    return {n: read_fixed_value(flat, n, units[n].partition("(")[0], where) for n in flat}
+    changes = {n: unit.partition("(")[0] for n, unit in units.items()}
+    return read_named(REFERENCE_KEYS["disturbance"], flat, changes, where)
 
 
 PATH_CHANNELS = ("position_reference", "position", "speed_reference", "speed")

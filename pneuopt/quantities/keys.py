@@ -80,7 +80,7 @@ class Key:
     others : Key, optional
         What the further keys of a table take: names that come from the user, each a `named`.
     named : str
-        What such a name is: "parameter".
+        What such a name, or a word of a list, is: "parameter".
     example : str
         As a file may write it; needed where nothing is usual.
     source : str
@@ -218,7 +218,7 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
     if key.takes is Takes.SAMPLES:
         return _read_samples(entry, where)
     proper = type(entry) in key.takes.types
-    require(proper, f"{where} must be {key.takes.value}{_example_of(key)}, got {repr(entry)[:MAX_SHOWN_ENTRY]}")
+    require(proper, f"{where} must be {key.takes.value}, got {repr(entry)[:MAX_SHOWN_ENTRY]}{_remedy(key, where)}")
     if key.takes is Takes.COUNT:
         return _in_bounds(key, entry, entry, where)
     if key.takes is Takes.LIST:
@@ -227,7 +227,7 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
         return read_table(key.keys, entry, where, units=units)
     if key.choices is not None:
         section, _, name = where.rpartition(" ")
-        check_names(name, [entry], key.choices, section)
+        check_names(key.named or name, [entry], key.choices, where if key.named else section.rstrip(":"))
         return key.choices[entry]
     return entry
 
@@ -246,7 +246,7 @@ def read_named(key: Key, toml: Any, units: Mapping[str, str], where: str) -> dic
     where : str
         File, section and key.
     """
-    require(isinstance(toml, dict), f"{where} must be {Takes.TABLE.value}{_example_of(key)}, got {toml!r}")
+    require(isinstance(toml, dict), f"{where} must be {Takes.TABLE.value}, got {toml!r}{_remedy(key, where)}")
     check_names(key.named, toml, units, where)
     assert key.others is not None
     return {n: read_entry(key.others, entry, f"{where} {n}", {"own": units[n]}) for n, entry in toml.items()}
@@ -271,22 +271,29 @@ def _in_bounds(key: Key, value: Any, entry: Any, where: str) -> Any:
 def _read_list(key: Key, entries: list[Any], where: str, units: Mapping[str, str]) -> tuple[Any, ...]:
     least, most = key.counts
     count = f"{least}" if least == most else f"{least} at least" if most == inf else f"{least} to {most:g}"
-    told = f"{where} must be a list of {count}{_example_of(key)}, got {entries}"
+    told = f"{where} must be a list of {count}, got {entries}{_remedy(key, where)}"
     require(least <= len(entries) <= most, told)
-    item = key.of or (Key("", Takes.TEXT, choices=key.choices) if key.choices else None)
-    return tuple(entries if item is None else (read_entry(item, entry, where, units) for entry in entries))
+    item = key.of or (Key("", Takes.TEXT, choices=key.choices, named=key.named) if key.choices else None)
+    spots = [f"{where} {k}" if isinstance(entry, dict) else where for k, entry in enumerate(entries, 1)]
+    return tuple(
+        entry if item is None else read_entry(item, entry, spot, units)
+        for spot, entry in zip(spots, entries, strict=True)
+    )
 
 
 def _read_samples(entry: Any, where: str) -> int:
     """A number of samples, "1 sample" or 1."""
     match = re.fullmatch(r"\s*(\d+)\s*samples?\s*", entry) if isinstance(entry, str) else None
     whole = type(entry) is int
-    require(match is not None or whole, f'{where}: {entry!r} is no number of samples; write "1 sample"')
+    require(
+        match is not None or whole,
+        f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"',
+    )
     return int(match[1]) if match else int(entry)
 
 
-def _example_of(key: Key) -> str:
-    return f", {key.example} say" if key.example else ""
+def _remedy(key: Key, where: str) -> str:
+    return f"; write {where.rpartition(' ')[2]} = {key.example}" if key.example else ""
 
 
 def flag(meaning: str, usual: bool = False) -> Key:
