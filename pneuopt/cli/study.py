@@ -78,8 +78,8 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     file, count = study.path, len(study.axes)
     many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
     require(outputs.plot is None or count <= MAX_MAP_AXES, many)
-    task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning, "tuning")
+    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
+    warn_of_status(study.tuning)
     (cases, axes), units = _read_cases(study, task, parameters), metric_units(task.loop)
     if any(SAMPLE_TIME_AXIS in values for values in cases.values()):
         parameters = with_sample_time(task.loop, parameters)

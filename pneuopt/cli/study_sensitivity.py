@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
     """Tell which tolerances matter for a design; returns the exit status."""
-    task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning, "tuning")
+    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
+    warn_of_status(study.tuning)
     asked, units = read_sensitivity(study, parameters), metric_units(task.loop)
     check_names("metric", study.show, units, f"{study.path}: [metrics] show")
     band, slopes = study.band or task.specification.band, None

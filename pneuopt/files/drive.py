@@ -5,6 +5,7 @@ Which kinds of drive there are, and which sections and keys each has, is declare
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from math import isfinite, nan
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import tomlkit
+from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import System
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
@@ -174,6 +176,9 @@ def _word(value: bool | str) -> str:
 FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
+ROUNDING = 1e-8
+"""Asymmetry of a covariance, over the deviations of its row and column [1]: a file that was rounded by hand; more
+is another matrix."""
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
 _DRIVE_SECTION = {"drive": {"kind": KIND_KEY}}
 
@@ -198,6 +203,109 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
     InputError
         UnitError, UnknownNameError or other; the message names file, section and key.
     """
+    fit = read_fit(path)
+    return fit.drive, fit.parameters
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFit:
+    """A fit.toml, or the drive.toml that it was made from, parsed once for all that a command needs of it.
+
+    Attributes
+    ----------
+    path : Path
+    drive : Drive
+    parameters : ParameterSet
+        All of `drive.system().parameters`.
+    toml : mapping
+        The whole file as parsed; the properties read what a fit has written into it, and raise `InputError` for what
+        pneuopt does not write so.
+    """
+
+    path: Path
+    drive: Drive
+    parameters: ParameterSet
+    toml: Mapping[str, Any]
+
+    @property
+    def status(self) -> Status | None:
+        """How the fit ended; None for a file that no fit has written."""
+        return stored_status(self.toml, self.path)
+
+    @property
+    def marks(self) -> dict[str, Mark]:
+        """How far each estimate can be trusted, by parameter; empty for a file that no fit has written."""
+        marks = {n: str(entry["mark"]) for n, entry in self._estimates.items() if "mark" in entry}
+        for name, mark in marks.items():
+            check_names("mark", [mark], [m.value for m in Mark], f"{self.path}: [estimates] {name}")
+        return {n: Mark(mark) for n, mark in marks.items()}
+
+    @property
+    def covariance(self) -> "pd.DataFrame | None":
+        """Covariance of the estimates, as `IdentificationResult.covariance`, without what the logs do not identify.
+
+        From a file without [covariance] come the variances of its [estimates] alone; None where there are none.
+        """
+        import pandas as pd
+
+        rows = self.toml.get("covariance")
+        if rows is None:
+            deviations = {n: e.get("stderr", nan) for n, e in self._estimates.items()}
+            known = {n: float(v) for n, v in deviations.items() if isinstance(v, int | float) and isfinite(v)}
+            return pd.DataFrame(np.diag(np.square(list(known.values()))), list(known), list(known)) if known else None
+        message = f"{self.path}: [covariance] must hold a row of numbers for each of its parameters; run identify again"
+        require(isinstance(rows, dict) and all(isinstance(row, list) for row in rows.values()), message)
+        try:
+            matrix = np.array(list(rows.values()), dtype=float).reshape(len(rows), len(rows))
+        except ValueError:
+            raise InputError(message) from None
+        require(_is_covariance(matrix), message)
+        return pd.DataFrame(matrix, list(rows), list(rows))
+
+    @property
+    def estimates(self) -> "pd.DataFrame | None":
+        """The estimates with what is uncertain about them; None for a file that no fit has written.
+
+        A row a parameter with stderr, dof, range_low and range_high as in `IdentificationResult.estimates`; NaN where
+        the file has none.
+        """
+        import pandas as pd
+
+        columns = ("stderr", "dof", "range_low", "range_high")
+        table = pd.DataFrame.from_dict(self._estimates, orient="index").reindex(columns=columns)
+        return table.apply(pd.to_numeric, errors="coerce") if self._estimates else None
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Of each channel of the logs the larger of noise and residuals, the median over the logs [SI]."""
+        levels: dict[str, list[float]] = {}
+        for channels in self.toml.get("agreement", {}).values():
+            for name, row in channels.items() if isinstance(channels, dict) else ():
+                fields = row if isinstance(row, dict) else {}
+                own = [fields[k] for k in ("noise", "rmse") if isinstance(fields.get(k), int | float)]
+                levels.setdefault(str(name), []).extend([max(own)] if own else [])
+        return {n: float(np.median(own)) for n, own in levels.items() if own}
+
+    @property
+    def assumed_options(self) -> tuple[Assumption, ...]:
+        """The options of the drive that the file leaves out; those of parameters: `list_assumptions`."""
+        return tuple(
+            Assumption(f"{section}.{name}", key.usual, "", f"[{section}] {name}", DRIVE_FILE, key.meaning)
+            for section, keys in DRIVE_KINDS[self.drive.kind].sections.items()
+            if section in self.toml or not any(key.required for key in keys.values())
+            for name, key in keys.items()
+            if name not in self.toml.get(section, {}) and isinstance(key.usual, str | bool)
+        )
+
+    @property
+    def _estimates(self) -> dict[str, Mapping[str, Any]]:
+        rows = self.toml.get("estimates", {})
+        require(isinstance(rows, dict), f"{self.path}: estimates must be a section, [estimates]")
+        return {str(n): row for n, row in rows.items() if isinstance(row, dict)}
+
+
+def read_fit(path: str | Path) -> StoredFit:
+    """Read a fit.toml or a drive.toml; errors as for `read_drive`."""
     document = read_toml(path)
     places = FileLocations(path, document.as_string())
     sections = {name: section for name, section in document.unwrap().items() if name not in FIT_SECTIONS}
@@ -210,7 +318,16 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
         system = drive.system()
     except ModelError as error:  # a law that asks for what its base, or this plant, has not
         raise ModelError(f"{places.location('friction')}: [friction]: {error}") from None
-    return drive, _read_parameters(system, kind, sections, places)
+    return StoredFit(Path(path), drive, _read_parameters(system, kind, sections, places), document.unwrap())
+
+
+def _is_covariance(matrix: NDArray[np.float64]) -> bool:
+    """Whether a matrix is finite and symmetric, with no negative variance and no correlation beyond 1."""
+    variances = np.diag(matrix)
+    if not np.isfinite(matrix).all() or (variances < 0).any():
+        return False
+    scale = np.sqrt(np.outer(variances, variances))
+    return bool((abs(matrix - matrix.T) <= ROUNDING * scale).all() and (abs(matrix) <= (1 + ROUNDING) * scale).all())
 
 
 def ambient_pressure(parameters: ParameterSet) -> float:
@@ -219,122 +336,25 @@ def ambient_pressure(parameters: ParameterSet) -> float:
 
 
 def read_status(path: str | Path) -> Status | None:
-    """How the fit in a file ended; None for a file that no fit has written.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Status or None
+    """How the fit or the tuning in a file ended; None for a file that no result has written.
 
     Raises
     ------
     InputError
         If the status is none that pneuopt writes.
     """
-    said = read_toml(path).unwrap().get("status")
+    return stored_status(read_toml(path).unwrap(), path)
+
+
+def stored_status(toml: Mapping[str, Any], path: str | Path) -> Status | None:
+    """The status in a parsed file; see `read_status`."""
+    said = toml.get("status")
     if said is None:
         return None
     codes = [code.value for code in Code]
     require(isinstance(said, dict), f"{path}: status must be a section, [status]")
     check_names("status", [str(said.get("code"))], codes, f"{path}: [status] code")
     return Status(Code(said["code"]), tuple(filter(None, [str(said.get("message", ""))])))
-
-
-def read_marks(path: str | Path) -> dict[str, Mark]:
-    """How far each estimate in a file can be trusted, by parameter; empty for a file that no fit has written.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    dict of str to Mark
-
-    Raises
-    ------
-    InputError
-        If a mark is none that pneuopt writes.
-    """
-    estimates = read_toml(path).unwrap().get("estimates", {})
-    require(isinstance(estimates, dict), f"{path}: estimates must be a section, [estimates]")
-    marks = {n: str(entry["mark"]) for n, entry in estimates.items() if isinstance(entry, dict) and "mark" in entry}
-    for name, mark in marks.items():
-        check_names("mark", [mark], [m.value for m in Mark], f"{path}: [estimates] {name}")
-    return {n: Mark(mark) for n, mark in marks.items()}
-
-
-def read_covariance(path: str | Path) -> "pd.DataFrame | None":
-    """The covariance of a fit's estimates; None for a file that no fit has written.
-
-    Parameters
-    ----------
-    path : str or Path
-        A fit.toml; from one without [covariance] come the variances of its [estimates] alone.
-
-    Returns
-    -------
-    DataFrame or None
-        As `IdentificationResult.covariance`, without what the logs do not identify.
-
-    Raises
-    ------
-    InputError
-        If it is no symmetric table of numbers.
-    """
-    import pandas as pd
-
-    table = read_toml(path).unwrap()
-    rows, estimates = table.get("covariance"), table.get("estimates", {})
-    if rows is None:
-        deviations = {n: e.get("stderr", nan) for n, e in estimates.items() if isinstance(e, dict)}
-        known = {n: float(v) for n, v in deviations.items() if isinstance(v, int | float) and isfinite(v)}
-        return pd.DataFrame(np.diag(np.square(list(known.values()))), list(known), list(known)) if known else None
-    message = f"{path}: [covariance] must hold a row of numbers for each of its parameters; run identify again"
-    require(isinstance(rows, dict) and all(isinstance(row, list) for row in rows.values()), message)
-    try:
-        matrix = np.array(list(rows.values()), dtype=float).reshape(len(rows), len(rows))
-    except ValueError:
-        raise InputError(message) from None
-    require(bool(np.isfinite(matrix).all() and np.allclose(matrix, matrix.T)), message)
-    return pd.DataFrame(matrix, list(rows), list(rows))
-
-
-def read_noise(path: str | Path) -> dict[str, float]:
-    """Of each channel of a fit.toml's logs the larger of noise and residuals, the median over the logs [SI]."""
-    found: dict[str, list[float]] = {}
-    for channels in read_toml(path).unwrap().get("agreement", {}).values():
-        for name, row in channels.items() if isinstance(channels, dict) else ():
-            levels = [
-                row[k] for k in ("noise", "rmse") if isinstance(row, dict) and isinstance(row.get(k), int | float)
-            ]
-            found.setdefault(str(name), []).extend([max(levels)] if levels else [])
-    return {n: float(np.median(levels)) for n, levels in found.items() if levels}
-
-
-def read_estimates(path: str | Path) -> "pd.DataFrame | None":
-    """The estimates of a fit with what is uncertain about them; None for a file that no fit has written.
-
-    Parameters
-    ----------
-    path : str or Path
-        A fit.toml.
-
-    Returns
-    -------
-    DataFrame or None
-        A row a parameter with stderr, dof, range_low and range_high as in `IdentificationResult.estimates`; NaN where
-        the file has none.
-    """
-    import pandas as pd
-
-    rows = {n: e for n, e in read_toml(path).unwrap().get("estimates", {}).items() if isinstance(e, dict)}
-    columns = ("stderr", "dof", "range_low", "range_high")
-    table = pd.DataFrame.from_dict(rows, orient="index").reindex(columns=columns)
-    return table.apply(pd.to_numeric, errors="coerce") if rows else None
 
 
 def write_fit(path: str | Path, source: str | Path, result: IdentificationResult) -> None:
@@ -500,30 +520,3 @@ def _parameter_place(name: str, places: FileLocations) -> str:
     """Of a parameter: file, line, section and key."""
     section, _, key = name.partition(".")
     return f"{places.location(section, key)}: [{section}] {key}"
-
-
-def read_option_assumptions(path: str | Path) -> tuple[Assumption, ...]:
-    """The options that a drive's file leaves out.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file that `read_drive` reads.
-
-    Returns
-    -------
-    tuple of Assumption
-        The parameters that it leaves out are `list_assumptions`'.
-    """
-    sections = read_toml(path).unwrap()
-    kind = DRIVE_KINDS[sections["drive"]["kind"]]
-    return tuple(a for section, keys in kind.sections.items() for a in _options(section, keys, sections.get(section)))
-
-
-def _options(section: str, keys: Mapping[str, Key], written: Mapping[str, object] | None) -> Iterator[Assumption]:
-    """What holds of a section; nothing where the drive lacks it."""
-    if written is None and any(key.required for key in keys.values()):
-        return
-    for name, key in keys.items():
-        if name not in (written or {}) and isinstance(key.usual, str | bool):
-            yield Assumption(f"{section}.{name}", key.usual, "", f"[{section}] {name}", DRIVE_FILE, key.meaning)

@@ -369,7 +369,7 @@ def read_method(entries: Mapping[str, Any], where: str) -> Method | None:
         raise InputError(f"{where}: {name!r} is gone; write kind = {successor!r}, whose options are {known}")
     chosen = {"kind": METHOD_SECTION.keys["kind"]}
     kind: type[Method] = read_table(chosen, entries, where, partial=True)["kind"]
-    values = read_table(chosen | METHOD_KEYS[name], entries, where)
+    values = read_table({**chosen, **METHOD_KEYS[name]}, entries, where)
     return construct_at(lambda: kind(**{n: values[n] for n in entries if n != "kind"}), where)
 
 
@@ -540,7 +540,7 @@ def signal_units(command: str, measured: str, position: str = "m") -> dict[str, 
     }
 
 
-LIMIT_KEYS: Mapping[str, Key] = {n: limit_key(n) for n in REQUIREMENTS_BY_KEY} | {NO_HUNTING_KEY: _NO_HUNTING}
+LIMIT_KEYS: Mapping[str, Key] = {**{n: limit_key(n) for n in REQUIREMENTS_BY_KEY}, NO_HUNTING_KEY: _NO_HUNTING}
 """What [limits] may hold."""
 TUNING_KEYS: Mapping[str, Key] = {
     ACCEPT_KEY: Key(

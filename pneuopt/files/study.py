@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.evaluation.monte_carlo import monte_carlo
 from pneuopt.evaluation.scenarios import SampleSpreads, corners
-from pneuopt.files.drive import ambient_pressure, read_covariance, read_estimates
+from pneuopt.files.drive import ambient_pressure, read_fit
 from pneuopt.files.loop import (
     CORNERS_KEY,
     MAX_CASES,
@@ -166,14 +166,15 @@ def read_sensitivity(study: "Study", parameters: ParameterSet) -> SensitivityTas
 def _read_samples(given: Mapping[str, Any], source: CaseSource) -> Cases:
     where, draw = source.where, read_table(CASE_KEYS["samples"].keys, given, source.where, partial=True)
     entries, from_fit = {n: entry for n, entry in given.items() if n not in draw}, draw["fit"]
-    covariance = read_covariance(source.drive) if from_fit else None
+    fit = read_fit(source.drive) if from_fit else None
+    covariance = None if fit is None else fit.covariance
     needed = f"{where} fit = true needs a fit.toml, which identify writes; {source.drive} has no estimates"
     require(not from_fit or covariance is not None, needed)
     return monte_carlo(
         source.parameters,
         draw["count"],
         covariance=covariance,
-        estimates=read_estimates(source.drive) if from_fit else None,
+        estimates=None if fit is None else fit.estimates,
         spreads=read_sample_spreads(entries, where, source.parameters),
         seed=draw["seed"],
         sampling=draw["sampling"],

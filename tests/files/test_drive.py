@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.files.drive import read_covariance, read_drive, read_estimates, read_status, write_fit
+from pneuopt.files.drive import read_drive, read_fit, read_status, write_fit
 from pneuopt.files.study import read_axes, read_study
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_scenarios
@@ -407,34 +407,52 @@ def test_the_covariance_of_a_fit_is_in_its_file_without_what_the_logs_do_not_ide
     matrix = np.array([[4.0, -1.5, np.nan], [-1.5, 1.0, np.nan], [np.nan, np.nan, np.nan]])
     result = fit_with(rig, pd.DataFrame(matrix, names, names))
     write_fit(tmp_path / "fit.toml", source, result)
-    found = read_covariance(tmp_path / "fit.toml")
+    found = read_fit(tmp_path / "fit.toml").covariance
     assert found is not None
     assert list(found.index) == list(found.columns) == names[:2]
     assert found.to_numpy().tolist() == matrix[:2, :2].tolist()
     assert read_drive(tmp_path / "fit.toml")[1] == rig
-    assert read_covariance(source) is None
+    assert read_fit(source).covariance is None
 
 
 def test_a_fit_without_a_covariance_gives_the_variances_of_its_estimates(tmp_path: Path) -> None:
     rows = '[estimates]\n"load.mass" = {value = 5.0, stderr = 0.2}\n"load.force" = {value = 1.0, stderr = nan}\n'
-    found = read_covariance(written(tmp_path, FORCE_AXIS + rows))
+    found = read_fit(written(tmp_path, FORCE_AXIS + rows)).covariance
     assert found is not None
     assert found.to_dict() == {"load.mass": {"load.mass": pytest.approx(0.04)}}
 
 
 def test_degrees_of_freedom_and_ranges_are_read_with_the_estimates(tmp_path: Path) -> None:
     rows = '"load.mass" = {value = 5.0, stderr = nan, dof = 3.5, range_low = 4.0, range_high = 6.0, mark = "exact"}\n'
-    found = read_estimates(written(tmp_path, f'{AXIS}[estimates]\n{rows}"load.force" = {{value = 1.0}}\n'))
+    found = read_fit(written(tmp_path, f'{AXIS}[estimates]\n{rows}"load.force" = {{value = 1.0}}\n')).estimates
     assert found is not None
     assert found.loc["load.mass"].dropna().to_dict() == {"dof": 3.5, "range_low": 4.0, "range_high": 6.0}
     assert found.loc["load.force"].isna().all()
-    assert read_estimates(written(tmp_path, FORCE_AXIS)) is None
+    assert read_fit(written(tmp_path, FORCE_AXIS)).estimates is None
 
 
 @pytest.mark.parametrize("rows", ['"load.mass" = 3', '"load.mass" = [1, 2]', '"a" = [1, 2]\n"b" = [3, 1]', "a = ['x']"])
 def test_a_covariance_that_is_none_is_refused(tmp_path: Path, rows: str) -> None:
     with pytest.raises(InputError, match=r"fit.toml: \[covariance\] must hold a row of numbers .*run identify again"):
-        read_covariance(written(tmp_path, f"{AXIS}[covariance]\n{rows}\n", "fit.toml"))
+        assert read_fit(written(tmp_path, f"{AXIS}[covariance]\n{rows}\n", "fit.toml")).covariance is None
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        '"a" = [4e-20, 1e-20]\n"b" = [-1e-20, 1e-20]',  # far below any absolute tolerance, and not symmetric
+        '"a" = [-4.0, 0.0]\n"b" = [0.0, 1.0]',
+        '"a" = [4e-20, 3e-20]\n"b" = [3e-20, 1e-20]',  # a correlation of 1.5
+    ],
+)
+def test_a_covariance_is_checked_on_the_scale_of_its_variances(tmp_path: Path, rows: str) -> None:
+    with pytest.raises(InputError, match=r"fit.toml: \[covariance\] must "):
+        assert read_fit(written(tmp_path, f"{AXIS}[covariance]\n{rows}\n", "fit.toml")).covariance is None
+
+
+def test_a_covariance_may_be_rounded(tmp_path: Path) -> None:
+    rows = '"a" = [4e-20, 1.9999999999e-20]\n"b" = [2e-20, 1e-20]'
+    assert read_fit(written(tmp_path, f"{AXIS}[covariance]\n{rows}\n", "fit.toml")).covariance is not None
 
 
 HIGH_PLACE = ParameterSet({"supply.pressure": Parameter(6.84e5, "Pa(a)"), "ambient.pressure": Parameter(84e3, "Pa(a)")})

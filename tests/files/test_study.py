@@ -215,6 +215,8 @@ load.mass = "10 %"
 FIT = """
 [drive]
 kind = "force"
+[friction]
+model = "coulomb"
 [estimates]
 "friction.coulomb" = { value = 40.0, stderr = 2.0, dof = 5.0 }
 [covariance]
