@@ -5,6 +5,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from math import inf
 from typing import Any
 
 from pneuopt.files.drive import drive_keys
@@ -66,6 +67,7 @@ class KeyRow:
         parts = [
             self.key.meaning,
             words and f"one of {words}",
+            self.key.limits,
             example,
             self.key.condition,
             kinds,
@@ -187,7 +189,8 @@ def json_schema(title: str, sections: Mapping[str, Key], results: Iterable[str] 
 def _describe_entry(key: Key) -> dict[str, Any]:
     """What a key takes, with its meaning and what is usual."""
     unit, usual = describe_unit(key), describe_usual(key)
-    remarks = [key.meaning + (f" [{unit}]" if unit else ""), usual and f"default {usual}", key.condition, key.source]
+    head = key.meaning + (f" [{unit}]" if unit else "")
+    remarks = [head, key.limits, usual and f"default {usual}", key.condition, key.source]
     return {"description": "; ".join(filter(None, remarks)), **_FORMS[key.takes](key)}
 
 
@@ -209,7 +212,20 @@ def _describe_text(key: Key) -> dict[str, Any]:
 
 
 def _describe_list(key: Key) -> dict[str, Any]:
-    return {"type": "array"} if key.choices is None else {"type": "array", "items": {"enum": list(key.choices)}}
+    items = {"enum": list(key.choices)} if key.choices is not None else _describe_entry(key.of) if key.of else {}
+    least, most = key.counts
+    counts = {"minItems": least} if least else {}
+    return {
+        "type": "array",
+        **({"items": items} if items else {}),
+        **counts,
+        **({"maxItems": most} if most < inf else {}),
+    }
+
+
+def _describe_count(key: Key) -> dict[str, Any]:
+    bounds = {"minimum": key.least, "maximum": key.most}
+    return {"type": "integer", **{n: bound for n, bound in bounds.items() if abs(bound) < inf}}
 
 
 def _value_or_table(key: Key) -> dict[str, Any]:
@@ -224,7 +240,7 @@ def _spread_or_table(key: Key) -> dict[str, Any]:
 _FORMS: Mapping[Takes, Callable[[Key], dict[str, Any]]] = {
     Takes.FLAG: lambda _: {"type": "boolean"},
     Takes.TEXT: _describe_text,
-    Takes.COUNT: lambda _: {"type": "integer"},
+    Takes.COUNT: _describe_count,
     Takes.SAMPLES: lambda _: {"type": ["integer", "string"]},
     Takes.NUMBER: lambda _: _VALUE,
     Takes.PARAMETER: _value_or_table,

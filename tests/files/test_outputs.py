@@ -1,10 +1,14 @@
 """The declaration of what --json writes: a right schema. tests/cli holds each output to it."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from pneuopt.files.first_files import first_files
-from pneuopt.files.outputs import OUTPUTS, output_schema
+from pneuopt.files.outputs import OUTPUTS, Holds, Member, members_of, output_schema
 from pneuopt.quantities.parameters import ParameterSet
 
 
@@ -35,3 +39,50 @@ def test_a_wrong_output_is_refused(document: object, right: bool) -> None:
 
 def test_init_writes_it() -> None:
     assert "schemas/output.json" in first_files("force", ParameterSet({}), {})
+
+
+class Ending(Enum):
+    GOOD = "good"
+    BAD = "bad"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search has found.
+
+    Attributes
+    ----------
+    value : float
+        Of the cost [1]. The least one.
+    ending : Ending
+        How it ended.
+    steps, tries : int
+        How many.
+    why : mapping of str to str, optional
+    places : dict
+        What no output holds.
+    """
+
+    value: float
+    ending: Ending
+    steps: int
+    tries: int
+    why: Mapping[str, str] | None
+    places: dict[str, object]
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it ended well."""
+        return self.ending is Ending.GOOD
+
+
+def test_the_members_of_an_output_are_those_that_a_results_type_declares() -> None:
+    assert members_of(Found, ("is_good", "value", "ending", "tries", "why")) == {
+        "is_good": Member("whether it ended well", Holds.FLAG),
+        "value": Member("of the cost", Holds.NUMBER),
+        "ending": Member("how it ended; one of good, bad", Holds.TEXT),
+        "tries": Member("how many", Holds.COUNT),
+        "why": Member("why", Holds.WORDS, is_optional=True),
+    }
+    with pytest.raises(TypeError, match=r"Found\.places: no output holds"):
+        members_of(Found)
