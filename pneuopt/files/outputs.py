@@ -5,7 +5,7 @@ list of records, one a row. Members may be added from version to version; none i
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from types import NoneType
 from typing import Any, get_args
@@ -13,11 +13,19 @@ from typing import Any, get_args
 from pneuopt.evaluation.dither_verdict import DitherVerdict
 from pneuopt.files.certificate import CertificateCheck
 from pneuopt.identification.assumptions import Assumption
-from pneuopt.identification.result import ChosenWidth, ChosenWindow, Verdict
+from pneuopt.identification.result import (
+    AgreementRow,
+    ChosenWidth,
+    ChosenWindow,
+    EstimateRow,
+    IdentifiableRow,
+    Verdict,
+)
 from pneuopt.logs.checks.findings import LogFinding
 from pneuopt.quantities.keys import argument_meanings, first_sentence
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.quantities.status import Status
+from pneuopt.tuning.result import RequirementRow
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _NUMBER: dict[str, Any] = {"type": ["number", "null"]}
@@ -167,7 +175,7 @@ def members_of(kind: type, only: Sequence[str] = (), *, are_optional: bool = Fal
     Parameters
     ----------
     kind : type
-        A dataclass.
+        A dataclass, or a TypedDict that declares the rows of a table.
     only : sequence of str
         Names of fields and properties, where not every field is written, in the order in which they are.
     are_optional : bool
@@ -179,7 +187,8 @@ def members_of(kind: type, only: Sequence[str] = (), *, are_optional: bool = Fal
         If a field is of a type that no output holds.
     """
     meanings = argument_meanings(kind)
-    return {n: _member_of(kind, n, meanings.get(n, ""), are_optional) for n in only or [f.name for f in fields(kind)]}
+    names = only or tuple(kind.__annotations__)
+    return {n: _member_of(kind, n, meanings.get(n, ""), are_optional) for n in names}
 
 
 def _member_of(kind: type, name: str, meaning: str, is_optional: bool) -> Member:
@@ -187,7 +196,7 @@ def _member_of(kind: type, name: str, meaning: str, is_optional: bool) -> Member
     if isinstance(own, property):
         annotation, meaning = own.fget.__annotations__["return"], first_sentence(own.fget)
     else:
-        annotation = next(f.type for f in fields(kind) if f.name == name)
+        annotation = kind.__annotations__[name]
     parts = [part for part in get_args(annotation) if part is not NoneType]
     if NoneType in get_args(annotation):
         annotation, is_optional = parts[0], True
@@ -202,23 +211,13 @@ def _member_of(kind: type, name: str, meaning: str, is_optional: bool) -> Member
 _STATUS = Member("how it ended", Holds.RECORD, members_of(Status, ("code", "message")))
 _PROVENANCE = Member("versions, options, SHA-256 of what was read", Holds.WORDS)
 _STATS = Member("figures of the search, as the result's docstring says", Holds.NUMBERS)
+_NAMED = {"name": _text("what the row is of")}
 _FIT = _rows(
     "agreement, a row a log and channel",
-    {
-        "log": _text("name"),
-        "channel": _text("name"),
-        **_numbers(rmse="[unit]", nrmse="over the channel's variation [1]", fit_percent="[%]", samples="compared"),
-        **_numbers(free_run_rmse="simulated to the end [unit]", free_run_nrmse="likewise [1]", noise="[unit]"),
-        "unit": _text("of the channel"),
-    },
+    {"log": _text("name"), "channel": _text("name"), **members_of(AgreementRow)},
     is_open=True,
 )
-_IDENTIFIABLE = {
-    "name": _text("parameter"),
-    **_numbers(value="[its unit]", stderr="expected", relative="over the value", alone="if others were known"),
-    **_numbers(inflation="their ratio"),
-    "identifiable": _flag("whether the logs identify it"),
-}
+_IDENTIFIABLE = {"name": _text("parameter"), **members_of(IdentifiableRow)}
 _VERDICT = Member(
     "what the logs identify; empty where nothing was tried",
     Holds.RECORD,
@@ -231,33 +230,17 @@ _VERDICT = Member(
         "table": _optional(_rows("a row a free parameter", _IDENTIFIABLE)),
     },
 )
-_ESTIMATES = {
-    "name": _text('parameter, "name[log]" for one of a log'),
-    **_numbers(value="null where it is unidentifiable [unit]", ci_low="95 % [unit]", ci_high="95 % [unit]"),
-    "unit": _text("SI"),
-    "mark": _text("what to think of it"),
-    **_numbers(stderr="[unit]", dof="degrees of freedom", range_low="[unit]", range_high="[unit]"),
-    **_numbers(lower="bound [unit]", upper="bound [unit]"),
-    "at_bound": _flag("whether it is at a bound"),
-    "source": _text("of the given value"),
-    "note": _text("why it has no interval"),
-}
+_ESTIMATES = {"name": _text('parameter, "name[log]" for one of a log'), **members_of(EstimateRow)}
 _METRICS = "a row a reference or case, a column a metric, in the metric's unit"
 _GAINS = {
     "name": _text("parameter"),
     **members_of(Parameter, ("value", "unit", "lower", "upper", "log", "free", "per_log", "source")),
 }
-_REQUIREMENTS = {
-    "name": _text("metric"),
-    **_numbers(claimed="by the search", certified="by the independent simulation", allowed="limit", room="left [1]"),
-    "case": _text("where it is worst"),
-    "active": _flag("whether it holds the objective back"),
-}
+_REQUIREMENTS = {"name": _text("metric"), **members_of(RequirementRow)}
 _DITHER = {
     **members_of(DitherVerdict, ("usefulness", "reasons")),
     "rival": Member("gains tuned without it", Holds.NUMBERS, is_optional=True),
 }
-_NAMED = {"name": _text("what the row is of")}
 _READ = {
     **{n: _text(m) for n, m in {"log": "name", "file": "path", "sidecar": "path, or empty"}.items()},
     **{n: Member(n.replace("_", " "), Holds.COUNT) for n in ("rows", "first_row")},
