@@ -311,8 +311,8 @@ def table(meaning: str, keys: Mapping[str, Key], **options: Any) -> Key:
     return replace(Key(meaning, Takes.TABLE, keys=keys), **options)
 
 
-def first_sentence(kind: type) -> str:
-    """What a class is, by its docstring; empty where Python was told to leave docstrings out."""
+def first_sentence(kind: object) -> str:
+    """What a class or a function is, by its docstring; empty where Python was told to leave docstrings out."""
     first = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
     return _plain(re.split(r"[.;] ", first)[0])
 

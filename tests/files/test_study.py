@@ -325,7 +325,7 @@ def test_bad_cases_are_refused_in_one_line(case_file: Path, text: str, said: str
 
 
 def test_a_drive_that_no_fit_has_written_has_nothing_to_draw_from(case_file: Path) -> None:
-    (case_file.parent / "fit.toml").write_text('[drive]\nkind = "force"\n', encoding="utf-8")
+    (case_file.parent / "fit.toml").write_text(FIT.partition("[estimates]")[0], encoding="utf-8")
     with pytest.raises(InputError, match=r"fit = true needs a fit\.toml, which identify writes; .* has no estimates"):
         cases(case_file, '[samples]\nfit = true\n"load.mass" = 0.1')
 
