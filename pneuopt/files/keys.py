@@ -326,7 +326,7 @@ class Template:
         words = f"one of {', '.join(key.choices)}" if key.choices is not None else ""
         standing = f"default {usual}" if text is not None and usual and usual != text else "default" if usual else ""
         standing = "" if key.takes is Takes.TABLE or key.source.startswith(standing) else standing
-        remarks = [key.meaning + (f" [{unit}]" if unit else ""), words, key.condition, standing, key.source]
+        remarks = [key.meaning + (f" [{unit}]" if unit else ""), words, key.limits, key.condition, standing, key.source]
         yield from _line(f"{'' if text is not None else '# '}{name} = {shown}", "; ".join(filter(None, remarks)))
 
     def _fill(self, key: Key) -> str:

@@ -149,6 +149,11 @@ def test_the_best_of_a_refused_tuning_has_its_own_gains_and_no_certificate(place
 def test_a_fit_is_parsed_once_a_command(place: Path, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("rig.toml").write_text("[actuator]\n", "utf-8")
     parsed, parse = list[str](), tomlkit.parse
-    monkeypatch.setattr(tomlkit, "parse", lambda text: [parsed.append(str(text)), parse(text)][1])
+
+    def counted(text: str) -> tomlkit.TOMLDocument:
+        parsed.append(text)
+        return parse(text)
+
+    monkeypatch.setattr(tomlkit, "parse", counted)
     assert run(command).exit_code in (0, 1)
     assert parsed.count(Path("fit.toml").read_text("utf-8")) == 1
