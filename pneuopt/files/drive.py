@@ -176,7 +176,7 @@ def _word(value: bool | str) -> str:
 FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
-ROUNDING = 1e-8
+COVARIANCE_ROUNDING = 1e-8
 """Asymmetry of a covariance, over the deviations of its row and column [1]: a file that was rounded by hand; more
 is another matrix."""
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
@@ -327,7 +327,10 @@ def _is_covariance(matrix: NDArray[np.float64]) -> bool:
     if not np.isfinite(matrix).all() or (variances < 0).any():
         return False
     scale = np.sqrt(np.outer(variances, variances))
-    return bool((abs(matrix - matrix.T) <= ROUNDING * scale).all() and (abs(matrix) <= (1 + ROUNDING) * scale).all())
+    return bool(
+        (abs(matrix - matrix.T) <= COVARIANCE_ROUNDING * scale).all()
+        and (abs(matrix) <= (1 + COVARIANCE_ROUNDING) * scale).all()
+    )
 
 
 def ambient_pressure(parameters: ParameterSet) -> float:
