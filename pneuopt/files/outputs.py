@@ -140,10 +140,6 @@ def _text(meaning: str) -> Member:
     return Member(meaning, Holds.TEXT)
 
 
-def _flag(meaning: str) -> Member:
-    return Member(meaning, Holds.FLAG)
-
-
 def _rows(meaning: str, members: Mapping[str, Member], *, is_open: bool = False) -> Member:
     return Member(meaning, Holds.ROWS, members, is_open)
 
