@@ -21,8 +21,8 @@ from PIL import Image
 
 import pneuopt
 from pneuopt.cli.keys import format_markdown
-from pneuopt.files.json_outputs import describe_outputs
-from pneuopt.files.key_list import list_keys
+from pneuopt.files.keys import list_keys
+from pneuopt.files.outputs import describe_outputs
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")

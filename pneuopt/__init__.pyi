@@ -84,10 +84,9 @@ from .export.fmu import export_fmu
 from .export.languages import Language, export_controller
 from .export.makers import Block
 from .files.drive import read_drive, write_fit
-from .files.path import read_path
 from .files.results import load_result
 from .files.tuned import write_tuned
-from .files.tuning import read_tuning
+from .files.tuning import read_path, read_tuning
 from .identification.assumptions import Assumption
 from .identification.checkup import Checkup, check
 from .identification.compare_logs import LogComparison, compare_logs

@@ -11,8 +11,7 @@ from pneuopt.cli.init import write_files
 from pneuopt.cli.shared import Outputs, file_hashes, finish
 from pneuopt.cli.terminal import make_console, show_output_files, show_report, show_sentence
 from pneuopt.dynamics.system import System
-from pneuopt.files.assumptions import read_option_assumptions
-from pneuopt.files.drive import ambient_pressure, read_drive
+from pneuopt.files.drive import ambient_pressure, read_fit
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check, finding_line
 from pneuopt.identification.mending import mend_findings
@@ -39,15 +38,15 @@ def run_check(
     """Check a drive's file and its logs, and mend the logs if there is a folder for it; returns the exit status."""
     outputs.check([drive, *logs, *(log.with_suffix(".toml") for log in logs)], *CHECKS, *OTHER_CHECKS)
     places = {} if fix is None else _new_places(fix, logs)
-    model, parameters = read_drive(drive)
-    system = model.system()
+    stored = read_fit(drive)
+    system, parameters = stored.drive.system(), stored.parameters
     experiments, errors = _read_all(logs, system, parameters, accept)
     for error in errors:
         show_sentence(make_console(error=True), f"error: {error}")
     status = EXIT_BAD_INPUT if errors else EXIT_SUCCESS
     if experiments:
         found = check(system, experiments, parameters)
-        found = replace(found, assumptions=(*found.assumptions, *read_option_assumptions(drive)))
+        found = replace(found, assumptions=(*found.assumptions, *stored.assumed_options))
         show_report(make_console(), found.summary())
         page = partial(_page, drive, logs, found, errors)
         finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found), page=page)

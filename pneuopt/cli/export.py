@@ -16,6 +16,7 @@ from pneuopt.export.fmu import export_fmu
 from pneuopt.export.languages import Language, export_controller
 from pneuopt.export.makers import Block
 from pneuopt.files.certificate import CertificateCheck, check_certificate
+from pneuopt.files.drive import StoredFit
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import write_bytes
@@ -55,10 +56,10 @@ def run_export(
     _check_form(to, [*languages, *blocks, FMU])
     scaled = Block.ROCKWELL.value
     require(not span or to == scaled, f"--pv-span: of --to {scaled} only, whose gains are for errors in percent of it")
-    task, parameters = read_fit_and_tuning(fit, tuned)
+    stored, task, parameters = read_fit_and_tuning(fit, tuned)
     unit = task.loop.feedback.unit
     measured_span = read_value(span, difference_unit(unit), where="--pv-span") if span else None
-    origin = [*_certificate_lines(fit, tuned, uncertified), *_source_lines(fit, tuned)]
+    origin = [*_certificate_lines(stored, tuned, uncertified), *_source_lines(fit, tuned)]
     given = (task.loop, parameters)
     if to == FMU:
         return _write_fmu(folder / f"{name}.fmu", export_fmu(task.loop.plant, parameters, name=name), force)
@@ -102,7 +103,7 @@ def _write_fmu(path: Path, content: bytes, force: bool) -> int:
     return EXIT_SUCCESS
 
 
-def _certificate_lines(fit: Path, tuned: Path, uncertified: bool) -> list[str]:
+def _certificate_lines(fit: StoredFit, tuned: Path, uncertified: bool) -> list[str]:
     """What a file says of its certificate; refused where none holds, unless that is accepted."""
     found = check_certificate(fit, tuned) or NO_CERTIFICATE
     if found.holds:

@@ -22,7 +22,7 @@ from pneuopt.cli.shared import (
 )
 from pneuopt.cli.terminal import progress
 from pneuopt.dynamics.system import System
-from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
+from pneuopt.files.drive import ambient_pressure, read_drive, read_fit, write_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.marks import Mark
@@ -173,10 +173,10 @@ def run_select(
 def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, quiet: bool = False) -> int:
     """Predict a log in open loop, in windows if asked for; returns the exit status."""
     outputs.check([fit, log, log.with_suffix(".toml")])
-    model, parameters = read_drive(fit)
-    system = model.system()
+    stored = read_fit(fit)
+    system, parameters = stored.drive.system(), stored.parameters
     experiment = read_log(log, plant=system, ambient_pressure=ambient_pressure(parameters))
-    warn_of_status(fit)
+    warn_of_status(stored)
     with progress("predicting", quiet=quiet) as report_progress:
         table = validate(system, [experiment], parameters, window=window, progress=report_progress)
     runs = list[Trajectory]()
@@ -191,7 +191,7 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
     hashes = file_hashes(fit) | {f"sha256[{log.name}]": experiment.sha256}
     tables = {"fit": records(table), "provenance": hashes}
     figures = partial(_prediction_figures, runs, experiment)
-    source = Source(f"Prediction of {log.name} by {fit.name}", file_hashes(fit), describe_status(fit))
+    source = Source(f"Prediction of {log.name} by {fit.name}", file_hashes(fit), describe_status(stored))
     page = partial(prediction_page, source, table, runs, [experiment])
     return finish(outputs, writers, tables, None, figures=figures, report=report_agreement(table), page=page)
 

@@ -11,7 +11,7 @@ import typer
 
 from pneuopt.cli.exit_status import EXIT_SUCCESS
 from pneuopt.files.first_files import first_channels, first_files, first_kinds, sidecar_name, unused_channels
-from pneuopt.files.loop_parameters import SAMPLE_TIME
+from pneuopt.files.loop import SAMPLE_TIME
 from pneuopt.logs.budget import read_bytes
 from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.readers import read_table

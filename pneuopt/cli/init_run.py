@@ -11,7 +11,7 @@ from pneuopt.cli.exit_status import EXIT_SUCCESS
 from pneuopt.cli.init import say, write_files
 from pneuopt.evaluation.excitation_run import excitation_run
 from pneuopt.files.drive import read_drive
-from pneuopt.files.run_files import PLAYED_FILE, RUN_FILE, logged_channels, run_files
+from pneuopt.files.first_files import PLAYED_FILE, RUN_FILE, logged_channels, run_files
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.units import read_value, write_value
 

@@ -9,8 +9,8 @@ import typer
 
 from pneuopt.cli.exit_status import EXIT_SUCCESS
 from pneuopt.cli.terminal import make_console
-from pneuopt.files.json_outputs import OUTPUTS, describe_member, describe_outputs
-from pneuopt.files.key_list import FILE_MEANINGS, KeyRow, list_keys
+from pneuopt.files.keys import FILE_MEANINGS, KeyRow, list_keys
+from pneuopt.files.outputs import OUTPUTS, describe_member, describe_outputs
 from pneuopt.quantities.errors import InputError
 
 _MARGIN = "    "

@@ -9,7 +9,7 @@ from pneuopt.cli.shared import Outputs, Writers, add_to_stem, file_hashes, finis
 from pneuopt.cli.terminal import progress
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
-from pneuopt.files.drive import read_covariance, read_drive, read_noise
+from pneuopt.files.drive import read_fit
 from pneuopt.files.tuning import read_tuning
 from pneuopt.identification.criteria import AOptimal, DOptimal
 from pneuopt.identification.experiment_design import ExperimentDesign
@@ -61,15 +61,16 @@ def run_next_experiment(
     """Plan the next run for a fit, in open loop or by a tuning file's loop; returns the exit status."""
     files = [fit, *([tuning] if tuning else [])]
     outputs.check(files)
-    model, parameters = read_drive(fit)
+    stored = read_fit(fit)
+    parameters = stored.parameters
     require(len(parameters.free_names) > 0, f"{fit}: no parameter is free; mark what the next run is to tell")
-    system: System | ClosedLoop = model.system()
+    system: System | ClosedLoop = stored.drive.system()
     plant = system.plant
     if tuning is not None:
         task = read_tuning(tuning, plant, parameters)
         system = task.loop
         parameters = parameters | task.parameters.fixed(*task.parameters.free_names)
-    warn_of_status(fit)
+    warn_of_status(stored)
     units = _signal_units(plant, system if isinstance(system, ClosedLoop) else None)
     stated = _read_pairs("--noise", options.noise, units)
     with progress("planning", quiet=quiet) as report_progress:
@@ -80,8 +81,8 @@ def run_next_experiment(
             sample_time=read_value(options.sample_time, "s", where="--sample-time") if options.sample_time else None,
             limits=_read_limits(options.limits, units),
             criterion=(AOptimal if options.mean else DOptimal)(*options.targets),
-            covariance=read_covariance(fit),
-            noise=stated or read_noise(fit),
+            covariance=stored.covariance,
+            noise=stated or stored.noise,
             start=_read_pairs("--start", options.start, units),
             runs=options.runs,
             cpu_seconds=options.budget,

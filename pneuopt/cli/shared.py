@@ -13,7 +13,7 @@ import numpy as np
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.interruption import interruption_status, without_interruption
 from pneuopt.cli.terminal import make_console, show_hints, show_output_files, show_report, show_sentence
-from pneuopt.files.drive import read_drive, read_marks, read_status
+from pneuopt.files.drive import StoredFit, read_fit, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.plotting import check_figure_path, save_figure
@@ -160,28 +160,32 @@ def _draw(path: Path, figures: Figures) -> tuple[list[Path], list[InputError]]:
         return [], []
 
 
-def read_fit_and_tuning(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
-    """Read the loop and its parameters; those of the plant are fixed."""
-    model, plant = read_drive(fit)
-    task = read_tuning(tuning, model.system(), plant)
+def read_fit_and_tuning(path: Path, tuning: Path) -> tuple[StoredFit, Tuning, ParameterSet]:
+    """Read a fit, the loop and its parameters; those of the plant are fixed."""
+    fit = read_fit(path)
+    plant = fit.parameters
+    task = read_tuning(tuning, fit.drive.system(), plant)
     warn_of_status(fit)
-    return task, plant.fixed(*plant.free_names) | task.parameters
+    return fit, task, plant.fixed(*plant.free_names) | task.parameters
 
 
-def warn_of_status(path: Path, what: str = "fit") -> None:
+def warn_of_status(file: StoredFit | Path) -> None:
     """Say on standard error what `describe_status` finds."""
-    for sentence in describe_status(path, what):
+    for sentence in describe_status(file):
         warn(sentence)
 
 
-def describe_status(path: Path, what: str = "fit") -> tuple[str, ...]:
-    """Whether what wrote a file did not converge, and which of its estimates may be biased, a sentence each."""
-    status, said = read_status(path), list[str]()
+def describe_status(file: StoredFit | Path) -> tuple[str, ...]:
+    """Whether a fit, or the tuning in a file, did not converge, and which estimates may be biased, a sentence each."""
+    if isinstance(file, Path):
+        status = read_status(file)
+        return () if status is None or status.code is Code.CONVERGED else (f"{file}: its tuning is {status}",)
+    status, said = file.status, list[str]()
     if status is not None and status.code is not Code.CONVERGED:
-        said.append(f"{path}: its {what} is {status}")
-    biased = [n for n, mark in read_marks(path).items() if mark is Mark.BIAS_POSSIBLE]
+        said.append(f"{file.path}: its fit is {status}")
+    biased = [n for n, mark in file.marks.items() if mark is Mark.BIAS_POSSIBLE]
     if biased and (status is None or status.converged):
-        said.append(f"{path}: estimates that may be biased by a model error: {', '.join(biased)}")
+        said.append(f"{file.path}: estimates that may be biased by a model error: {', '.join(biased)}")
     return tuple(said)
 
 

@@ -18,6 +18,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.evaluate import evaluate, metric_limits, relevant_units, report_metrics
 from pneuopt.files.certificate import CertificateCheck, check_certificate
+from pneuopt.files.drive import StoredFit
 from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import Response
 from pneuopt.quantities.output import check_output_paths, records
@@ -33,8 +34,8 @@ from pneuopt.report.tuning_page import LoopView, simulation_page
 def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     """Simulate the closed loop of a tuning's file; returns the exit status."""
     outputs.check([fit, tuning], "bode")
-    task, parameters = read_fit_and_tuning(fit, tuning)
-    found = check_certificate(fit, tuning)
+    stored, task, parameters = read_fit_and_tuning(fit, tuning)
+    found = check_certificate(stored, tuning)
     standing = Report() if found is None else _report_standing(found, tuning)
     scenarios = task.scenarios(parameters)
     metrics = evaluate(
@@ -57,7 +58,7 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     tables |= {} if found is None else {"certificate": {"holds": found.holds, "reasons": list(found.reasons)}}
     view, limits = loop_view(task, parameters), metric_limits(task.specification.limits)
     report = standing + report_metrics(metrics, relevant_units(task.loop), title="simulated", limits=limits)
-    page = partial(_simulation_page, fit, tuning, task, view, parameters, standing)
+    page = partial(_simulation_page, stored, tuning, task, view, parameters, standing)
     return finish(outputs, writers, tables, None, figures=view.figures, report=report, page=page)
 
 
@@ -78,7 +79,7 @@ def loop_view(task: Tuning, parameters: ParameterSet, before: ParameterSet | Non
 
 
 def _simulation_page(
-    fit: Path, tuning: Path, task: Tuning, view: LoopView, parameters: ParameterSet, standing: Report
+    fit: StoredFit, tuning: Path, task: Tuning, view: LoopView, parameters: ParameterSet, standing: Report
 ) -> Page:
     """The page of a simulated loop, which looks for defects beyond the horizon, too."""
     found = certificate(
@@ -89,7 +90,9 @@ def _simulation_page(
         band=task.specification.band,
         envelope=task.specification.envelope,
     )
-    source = Source(f"Simulation of {fit.name} with {tuning.name}", file_hashes(fit, tuning), describe_status(fit))
+    source = Source(
+        f"Simulation of {fit.path.name} with {tuning.name}", file_hashes(fit.path, tuning), describe_status(fit)
+    )
     return simulation_page(source, found, view, metric_limits(task.specification.limits), standing=standing)
 
 

@@ -29,8 +29,7 @@ from pneuopt.evaluation.requirements import (
     larger_is_better,
 )
 from pneuopt.files.drive import read_drive
-from pneuopt.files.study import Study, SweptAxis, read_axes, read_study, swept_axes
-from pneuopt.files.study_cases import Cases, read_study_cases
+from pneuopt.files.study import Cases, Study, SweptAxis, read_axes, read_study, read_study_cases, swept_axes
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.plotting import plot_distribution, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
@@ -79,8 +78,8 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     file, count = study.path, len(study.axes)
     many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
     require(outputs.plot is None or count <= MAX_MAP_AXES, many)
-    task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning, "tuning")
+    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
+    warn_of_status(study.tuning)
     (cases, axes), units = _read_cases(study, task, parameters), metric_units(task.loop)
     if any(SAMPLE_TIME_AXIS in values for values in cases.values()):
         parameters = with_sample_time(task.loop, parameters)

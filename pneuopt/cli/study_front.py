@@ -27,7 +27,7 @@ from pneuopt.evaluation.requirements import (
     user_limit,
     with_user_limit,
 )
-from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
+from pneuopt.files.loop import REQUIREMENTS_BY_KEY, bound_units
 from pneuopt.files.study import Pareto, Study, read_pareto
 from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
     """Tune a loop along a front between two requirements; returns the exit status."""
-    task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning, "tuning")
+    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
+    warn_of_status(study.tuning)
     front_spec = read_pareto(study, bound_units(task.loop))
     first, second, until = _front_requirements(study, front_spec, task)
     free = task.parameters.free_names

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from pneuopt.cli.shared import describe_status, file_hashes
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.files.drive import read_fit
 from pneuopt.files.study import Study
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
@@ -54,6 +55,6 @@ def sensitivity_page(study: Study, report: Report, draw: Callable[[], "Figure"],
 def _page_source(study: Study) -> Source:
     """The title of a study's page, its hashes and warnings."""
     files = (study.path, study.drive, study.tuning)
-    warnings = (*describe_status(study.drive), *describe_status(study.tuning, "tuning"))
+    warnings = (*describe_status(read_fit(study.drive)), *describe_status(study.tuning))
     title = f"Study of {study.drive.name} with {study.tuning.name}"
     return Source(title, file_hashes(*files), warnings)

@@ -12,8 +12,7 @@ from pneuopt.cli.study_pages import Design, sensitivity_page
 from pneuopt.cli.terminal import progress
 from pneuopt.evaluation.evaluate import evaluate, metric_units
 from pneuopt.evaluation.scenarios import axis_labels
-from pneuopt.files.study import Study
-from pneuopt.files.study_cases import read_sensitivity
+from pneuopt.files.study import Study, read_sensitivity
 from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import plot_sensitivity
 from pneuopt.quantities.errors import check_names
@@ -29,8 +28,8 @@ if TYPE_CHECKING:
 
 def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
     """Tell which tolerances matter for a design; returns the exit status."""
-    task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning, "tuning")
+    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
+    warn_of_status(study.tuning)
     asked, units = read_sensitivity(study, parameters), metric_units(task.loop)
     check_names("metric", study.show, units, f"{study.path}: [metrics] show")
     band, slopes = study.band or task.specification.band, None

@@ -25,7 +25,7 @@ from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.expected_plants import expected_plants
-from pneuopt.files.drive import read_covariance, read_drive, read_estimates
+from pneuopt.files.drive import StoredFit
 from pneuopt.files.rig import read_rig
 from pneuopt.files.tuned import write_tuned
 from pneuopt.files.tuning import Tuning
@@ -89,6 +89,8 @@ class _Job:
 
     Attributes
     ----------
+    stored : StoredFit
+        The plant's file as read.
     task : Tuning
     parameters : ParameterSet
         Of plant and controller, as given.
@@ -97,6 +99,7 @@ class _Job:
     outputs : Outputs
     """
 
+    stored: StoredFit
     task: Tuning
     parameters: ParameterSet
     fit: Path
@@ -111,18 +114,18 @@ class _Job:
 
     def proof_options(self) -> dict[str, Any]:
         """What `tune` and `certify` prove a design by: limits, scenarios, the plants to be expected, the rig."""
-        task, parameters, fit = self.task, self.parameters, self.fit
+        task, parameters, stored = self.task, self.parameters, self.stored
         plants = expected_plants(
             task.loop.complete(parameters),
-            read_covariance(fit),
-            estimates=read_estimates(fit),
+            stored.covariance,
+            estimates=stored.estimates,
             scenarios=task.validation_scenarios(parameters),
         )
         return {
             "minimise": task.specification,
             "scenarios": task.scenarios(parameters),
             "plants": plants,
-            "rig": None if self.rig is None else read_rig(self.rig, read_drive(fit)[0], task.loop),
+            "rig": None if self.rig is None else read_rig(self.rig, stored.drive, task.loop),
             "max_steps": task.max_steps,
             "accept": task.accept,
             "throw": False,
@@ -141,7 +144,7 @@ class _Job:
         """Write the design, or the best candidate; an interrupted command replaces no file."""
         stopped, place = result.status.code is Code.INTERRUPTED or interruption_status() is not None, self.place(result)
         write = partial(
-            write_tuned, source=self.tuning, result=self._with_files(result), wire=self.task.wire, fit=self.fit
+            write_tuned, source=self.tuning, result=self._with_files(result), wire=self.task.wire, fit=self.stored
         )
         return write_files({place: write} if place is not None else {}, beside=stopped)
 
@@ -192,7 +195,7 @@ def _read_job(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs) -> _J
 
 def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, Any]) -> Page:
     """The page of a design, or of what was refused."""
-    source = Source(title, file_hashes(*job.inputs), warnings=describe_status(job.fit))
+    source = Source(title, file_hashes(*job.inputs), warnings=describe_status(job.stored))
     place = job.outputs.output if result.status.converged else None
     task = job.task
     design = (task.loop.controller, result.parameters, task.references, task.centre)

@@ -19,13 +19,21 @@ import numpy as np
 from tomlkit.items import Table
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.files.drive import read_covariance, read_drive, read_estimates, read_status
-from pneuopt.files.reference_keys import REFERENCE_KEYS
-from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
-from pneuopt.files.spreads import read_draw, read_sample_spreads, read_spreads
+from pneuopt.files.drive import StoredFit, stored_status
+from pneuopt.files.loop import (
+    LOOP_KEYS,
+    NO_HUNTING_KEY,
+    REFERENCE_KEYS,
+    REQUIREMENTS_BY_KEY,
+    SCENARIO_KEYS,
+    bound_units,
+    read_draw,
+    read_sample_spreads,
+    read_spreads,
+    signal_units,
+)
 from pneuopt.files.toml import read_toml, toml_table
 from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning_table
-from pneuopt.files.tuning_keys import LOOP_KEYS, NO_HUNTING_KEY, SCENARIO_KEYS, signal_units
 from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
@@ -33,7 +41,7 @@ from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import is_unit, read_unit, read_value, si_conversion, write_value
 
 if TYPE_CHECKING:
-    from pneuopt.models.declaration import Drive
+    pass
 
 Entries = dict[str, str]
 Parts = dict[str, Entries]
@@ -66,13 +74,13 @@ class CertificateCheck:
         return tuple(f"NOT CERTIFIED: {reason}" for reason in self.reasons)
 
 
-def check_certificate(fit: str | Path, tuned: str | Path) -> CertificateCheck | None:
+def check_certificate(fit: StoredFit, tuned: str | Path) -> CertificateCheck | None:
     """Whether the certificate in a tuned.toml holds, and if not, what was changed.
 
     Parameters
     ----------
-    fit : str or Path
-        The plant's file: a fit.toml or a drive.toml.
+    fit : StoredFit
+        The plant's file.
     tuned : str or Path
         A tuned.toml; or a tuning.toml, which has no certificate.
 
@@ -84,12 +92,12 @@ def check_certificate(fit: str | Path, tuned: str | Path) -> CertificateCheck | 
     Raises
     ------
     InputError
-        If one of the files cannot be read.
+        If the file cannot be read.
     """
     table = read_toml(tuned).unwrap()
     if not any(name in table for name in TUNED_SECTIONS):
         return None
-    status, stored = read_status(tuned), table.get(CHECKSUM)
+    status, stored = stored_status(table, tuned), table.get(CHECKSUM)
     if status is None:
         return CertificateCheck(False, ("its gains were not written by pneuopt tune",))
     ended = () if status.code is Code.CONVERGED else (f"its tuning ended so: {status.code.value}",)
@@ -99,14 +107,14 @@ def check_certificate(fit: str | Path, tuned: str | Path) -> CertificateCheck | 
     parts = _describe(table, tuned, fit)
     if _digest(parts) == stored.get("hash"):
         return CertificateCheck(not ended, ended)
-    changes = list(_find_changes(stored, parts, _Writer(table, read_toml(fit).unwrap())))
+    changes = list(_find_changes(stored, parts, _Writer(table, fit.toml)))
     changes = changes or [f"its {part} was changed, and its [checksum] with it" for part in _other_parts(stored, parts)]
     more = f"and {len(changes) - MAX_CHANGES} more changes"
     told_changes = changes[:MAX_CHANGES] + ([more] if len(changes) > MAX_CHANGES else [])
     return CertificateCheck(False, (*ended, *(told_changes or ["its [checksum] was edited, or is damaged"])))
 
 
-def checksum_section(table: Mapping[str, Any], path: str | Path, fit: str | Path) -> Table:
+def checksum_section(table: Mapping[str, Any], path: str | Path, fit: StoredFit) -> Table:
     """The section of the checksum for a tuned.toml's table.
 
     Parameters
@@ -115,7 +123,7 @@ def checksum_section(table: Mapping[str, Any], path: str | Path, fit: str | Path
         The file with its figures and its status.
     path : str or Path
         Where it is to stand.
-    fit : str or Path
+    fit : StoredFit
         The plant's file.
     """
     parts = _describe(table, path, fit)
@@ -125,14 +133,14 @@ def checksum_section(table: Mapping[str, Any], path: str | Path, fit: str | Path
     return section
 
 
-def _describe(table: Mapping[str, Any], path: str | Path, fit: str | Path) -> Parts:
+def _describe(table: Mapping[str, Any], path: str | Path, fit: StoredFit) -> Parts:
     """All that a certificate is about, by part and name, as text that depends on the meaning alone."""
-    drive, plant = read_drive(fit)
-    task = read_tuning_table(table, path, drive.system(), plant)
+    plant = fit.parameters
+    task = read_tuning_table(table, path, fit.drive.system(), plant)
     task.scenarios(plant | task.parameters)  # refuses what is no table of scenarios, and says where
     return {
         "loop": _describe_loop(task),
-        "plant": _describe_plant(drive, plant, fit),
+        "plant": _describe_plant(fit),
         "references": _describe_references(task),
         "limits": _describe_limits(task),
         "scenarios": dict(_describe_scenarios(table.get("scenarios", {}), str(path), plant | task.parameters)),
@@ -158,14 +166,14 @@ def _describe_loop(task: Tuning) -> Entries:
     return found
 
 
-def _describe_plant(drive: "Drive", plant: ParameterSet, fit: str | Path) -> Entries:
+def _describe_plant(fit: StoredFit) -> Entries:
     """The drive's structure and values, and what its fit leaves uncertain, of which the plants were drawn."""
-    found = {"structure": _digest(dict(_flatten(drive, drive.kind, {})))[:16]}
-    for name, frame in (("covariance", read_covariance(fit)), ("table of estimates", read_estimates(fit))):
+    found = {"structure": _digest(dict(_flatten(fit.drive, fit.drive.kind, {})))[:16]}
+    for name, frame in (("covariance", fit.covariance), ("table of estimates", fit.estimates)):
         if frame is not None:
             rows = {str(k): {str(n): _number(v) for n, v in row.items()} for k, row in frame.to_dict("index").items()}
             found[name] = _digest(rows)[:16]
-    return found | {n: _number(p.value, p.unit) for n, p in plant.items()}
+    return found | {n: _number(p.value, p.unit) for n, p in fit.parameters.items()}
 
 
 def _describe_references(task: Tuning) -> Entries:

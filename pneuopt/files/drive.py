@@ -1,25 +1,29 @@
-"""Files that people edit: drive.toml, and fit.toml made from it; whole or not at all, comments kept.
+"""drive.toml, and fit.toml made from it: its keys by the kinds of drive, its reader and its writer; comments kept.
 
 A value is "32 mm", or a table where it may be free: { value = "40 N", lower = "5 N", upper = "90 N", free = true }.
 Which kinds of drive there are, and which sections and keys each has, is declared beside the drives.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
 from math import isfinite, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import tomlkit
+from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import System
-from pneuopt.files.drive_keys import KIND_KEY
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.identification.assumptions import AMBIENT_PRESSURE
+from pneuopt.identification.assumptions import AMBIENT_PRESSURE, DRIVE_FILE, Assumption
 from pneuopt.identification.result import IdentificationResult, Mark
-from pneuopt.models.declaration import Alias, Drive, DriveKind, Sections, Structure
+from pneuopt.models.declaration import Alias, Drive, DriveKind, DriveSections, Sections
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import HardwareError, InputError, ModelError, UnknownNameError, check_names, require
+from pneuopt.quantities.keys import Key, Takes, choice, parameter_key, table
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
@@ -29,9 +33,152 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+KIND_KEY = choice("what drives the load", DRIVE_KINDS)
+SECTION_MEANINGS: Mapping[str, str] = {
+    "cylinder": "the cylinder; positions count from the end at which chamber a is smallest",
+    "valve": "the proportional valve: positive voltage opens supply to chamber a",
+    "supply": "the air before the valve",
+    "gas": "the air itself",
+    "chamber": "how the air in the chambers changes its state",
+    "ambient": "the surroundings",
+    "load": "what is moved",
+    "friction": "friction of seals and guides",
+    "rig": "the friction rig",
+    "plant": "the transfer function",
+}
+Option = tuple[str, str]
+"""Section and key of an option."""
+
+
+@cache
+def drive_keys(name: str) -> Mapping[str, Key]:
+    """The sections of a drive's file with all keys that any drive of the kind may have.
+
+    Parameters
+    ----------
+    name : str
+        Of `DRIVE_KINDS`.
+
+    Returns
+    -------
+    mapping of str to Key
+        The condition of a key says under which options there is such a parameter.
+    """
+    kind = DRIVE_KINDS[name]
+    sections: dict[str, dict[str, Key]] = {section: dict(keys) for section, keys in kind.sections.items()}
+    for alias in kind.aliases:
+        sections[alias.section][alias.key] = alias.as_key()
+    for whole, (parameter, condition) in _find_parameters(kind).items():
+        section, _, key = whole.partition(".")
+        sections.setdefault(section, {})[key] = parameter_key(parameter, condition)
+    tables = {section: table(SECTION_MEANINGS.get(section, ""), keys) for section, keys in sections.items()}
+    return {"drive": table("the kind of drive", {"kind": KIND_KEY}, required=True), **tables}
+
+
+def default_parameters(kind: DriveKind, sections: Sections) -> ParameterSet:
+    """The parameters of a drive that a file's sections describe."""
+    return kind.build(DriveSections(sections, kind.sections, lambda *_: "")).system().parameters
+
+
+class _DriveOptions(NamedTuple):
+    """A drive with a word for each required option, and at most one other option that is not as usual."""
+
+    words: Mapping[Option, str]
+    changed: Option | None
+    value: Any
+    parameters: ParameterSet
+
+
+def _find_parameters(kind: DriveKind) -> dict[str, tuple[Parameter, str]]:
+    """Each parameter of any drive of the kind, and under which options the drive has it."""
+    variants = list(_build_variants(kind))
+    found: dict[str, Parameter] = {}
+    for variant in variants:
+        found = {**variant.parameters, **found}
+    return {n: (p, _describe_condition(n, kind, variants)) for n, p in found.items()}
+
+
+def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
+    """Drives that together have every parameter: each law, and of each section one option after the other."""
+    known = {(section, key): k for section, keys in kind.sections.items() for key, k in keys.items()}
+    needed = {option: tuple(k.choices or ()) for option, k in known.items() if k.required}
+    bases = [dict(zip(needed, words, strict=True)) for words in product(*needed.values())]
+    changes: list[tuple[Option | None, Any]] = [(None, None)]
+    changes += [(option, value) for option, key in known.items() for value in _other_values(key)]
+    for option, value in changes:
+        own_laws = option is None or option[0] in (section for section, _ in needed)
+        for base in bases if own_laws else bases[:1]:
+            try:
+                options = base if option is None else {**base, option: value}
+                yield _DriveOptions(base, option, value, default_parameters(kind, _as_sections(options)))
+            except ModelError:  # options that exclude each other
+                continue
+
+
+def _other_values(key: Key) -> Sequence[Any]:
+    if key.required or key.takes in (Takes.TABLE, Takes.TABLES):
+        return ()
+    if key.choices is not None:
+        return [word for word in key.choices if word != key.usual]
+    if key.takes in (Takes.FLAG, Takes.FLAG_OR_LIST):
+        return [not key.usual]
+    return [1] if key.takes is Takes.COUNT else ()
+
+
+def _as_sections(options: Mapping[Option, Any]) -> dict[str, dict[str, Any]]:
+    sections: dict[str, dict[str, Any]] = {}
+    for (section, key), value in options.items():
+        sections.setdefault(section, {})[key] = value
+    return sections
+
+
+def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOptions]) -> str:
+    """The options under which a drive has a parameter: 'model = "stribeck" or "lugre"'."""
+    parts = []
+    for section, keys in kind.sections.items():
+        for key, known in keys.items():
+            option = (section, key)
+            has = (
+                _has_by_word(name, option, variants) if known.required else _has_by_value(name, option, known, variants)
+            )
+            if not all(has.values()):
+                own = "" if name.startswith(f"{section}.") else f"[{section}] "
+                parts.append(f"{own}{key} = {' or '.join(_word(value) for value, there in has.items() if there)}")
+    return " and ".join(parts)
+
+
+def _has_by_word(name: str, option: Option, variants: Sequence[_DriveOptions]) -> dict[Any, bool]:
+    """For each word of a required option whether there is the parameter, the others as it needs them."""
+    needs = {(v.changed, v.value) for v in variants if name in v.parameters}
+    has: dict[Any, bool] = {}
+    for variant in (v for v in variants if (v.changed, v.value) in needs):
+        word = variant.words[option]
+        has[word] = has.get(word, False) or name in variant.parameters
+    return has
+
+
+def _has_by_value(name: str, option: Option, key: Key, variants: Sequence[_DriveOptions]) -> dict[Any, bool]:
+    """For each value of an option whether there is the parameter; nothing where the option makes no difference."""
+    usual = {tuple(v.words.items()): name in v.parameters for v in variants if v.changed is None}
+    changed = [(v, usual.get(tuple(v.words.items()), False)) for v in variants if v.changed == option]
+    if key.takes is Takes.COUNT or all((name in v.parameters) == before for v, before in changed):
+        return {}
+    has = {key.usual: any(before for _, before in changed)}
+    for variant, _ in changed:
+        has[variant.value] = has.get(variant.value, False) or name in variant.parameters
+    return has
+
+
+def _word(value: bool | str) -> str:
+    return f'"{value}"' if isinstance(value, str) else str(value).lower()
+
+
 FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
+COVARIANCE_ROUNDING = 1e-8
+"""Asymmetry of a covariance, over the deviations of its row and column [1]: a file that was rounded by hand; more
+is another matrix."""
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
 _DRIVE_SECTION = {"drive": {"kind": KIND_KEY}}
 
@@ -56,19 +203,134 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
     InputError
         UnitError, UnknownNameError or other; the message names file, section and key.
     """
+    fit = read_fit(path)
+    return fit.drive, fit.parameters
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFit:
+    """A fit.toml, or the drive.toml that it was made from, parsed once for all that a command needs of it.
+
+    Attributes
+    ----------
+    path : Path
+    drive : Drive
+    parameters : ParameterSet
+        All of `drive.system().parameters`.
+    toml : mapping
+        The whole file as parsed; the properties read what a fit has written into it, and raise `InputError` for what
+        pneuopt does not write so.
+    """
+
+    path: Path
+    drive: Drive
+    parameters: ParameterSet
+    toml: Mapping[str, Any]
+
+    @property
+    def status(self) -> Status | None:
+        """How the fit ended; None for a file that no fit has written."""
+        return stored_status(self.toml, self.path)
+
+    @property
+    def marks(self) -> dict[str, Mark]:
+        """How far each estimate can be trusted, by parameter; empty for a file that no fit has written."""
+        marks = {n: str(entry["mark"]) for n, entry in self._estimates.items() if "mark" in entry}
+        for name, mark in marks.items():
+            check_names("mark", [mark], [m.value for m in Mark], f"{self.path}: [estimates] {name}")
+        return {n: Mark(mark) for n, mark in marks.items()}
+
+    @property
+    def covariance(self) -> "pd.DataFrame | None":
+        """Covariance of the estimates, as `IdentificationResult.covariance`, without what the logs do not identify.
+
+        From a file without [covariance] come the variances of its [estimates] alone; None where there are none.
+        """
+        import pandas as pd
+
+        rows = self.toml.get("covariance")
+        if rows is None:
+            deviations = {n: e.get("stderr", nan) for n, e in self._estimates.items()}
+            known = {n: float(v) for n, v in deviations.items() if isinstance(v, int | float) and isfinite(v)}
+            return pd.DataFrame(np.diag(np.square(list(known.values()))), list(known), list(known)) if known else None
+        message = f"{self.path}: [covariance] must hold a row of numbers for each of its parameters; run identify again"
+        require(isinstance(rows, dict) and all(isinstance(row, list) for row in rows.values()), message)
+        try:
+            matrix = np.array(list(rows.values()), dtype=float).reshape(len(rows), len(rows))
+        except ValueError:
+            raise InputError(message) from None
+        require(_is_covariance(matrix), message)
+        return pd.DataFrame(matrix, list(rows), list(rows))
+
+    @property
+    def estimates(self) -> "pd.DataFrame | None":
+        """The estimates with what is uncertain about them; None for a file that no fit has written.
+
+        A row a parameter with stderr, dof, range_low and range_high as in `IdentificationResult.estimates`; NaN where
+        the file has none.
+        """
+        import pandas as pd
+
+        columns = ("stderr", "dof", "range_low", "range_high")
+        table = pd.DataFrame.from_dict(self._estimates, orient="index").reindex(columns=columns)
+        return table.apply(pd.to_numeric, errors="coerce") if self._estimates else None
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Of each channel of the logs the larger of noise and residuals, the median over the logs [SI]."""
+        levels: dict[str, list[float]] = {}
+        for channels in self.toml.get("agreement", {}).values():
+            for name, row in channels.items() if isinstance(channels, dict) else ():
+                fields = row if isinstance(row, dict) else {}
+                own = [fields[k] for k in ("noise", "rmse") if isinstance(fields.get(k), int | float)]
+                levels.setdefault(str(name), []).extend([max(own)] if own else [])
+        return {n: float(np.median(own)) for n, own in levels.items() if own}
+
+    @property
+    def assumed_options(self) -> tuple[Assumption, ...]:
+        """The options of the drive that the file leaves out; those of parameters: `list_assumptions`."""
+        return tuple(
+            Assumption(f"{section}.{name}", key.usual, "", f"[{section}] {name}", DRIVE_FILE, key.meaning)
+            for section, keys in DRIVE_KINDS[self.drive.kind].sections.items()
+            if section in self.toml or not any(key.required for key in keys.values())
+            for name, key in keys.items()
+            if name not in self.toml.get(section, {}) and isinstance(key.usual, str | bool)
+        )
+
+    @property
+    def _estimates(self) -> dict[str, Mapping[str, Any]]:
+        rows = self.toml.get("estimates", {})
+        require(isinstance(rows, dict), f"{self.path}: estimates must be a section, [estimates]")
+        return {str(n): row for n, row in rows.items() if isinstance(row, dict)}
+
+
+def read_fit(path: str | Path) -> StoredFit:
+    """Read a fit.toml or a drive.toml; errors as for `read_drive`."""
     document = read_toml(path)
     places = FileLocations(path, document.as_string())
     sections = {name: section for name, section in document.unwrap().items() if name not in FIT_SECTIONS}
     for name, section in sections.items():
         check_names("section", [name], _KNOWN_SECTIONS, places.location(name))
         require(isinstance(section, dict), f"{places.location(name)}: {name} must be a section, [{name}]")
-    kind: DriveKind = Structure(sections, _DRIVE_SECTION, places.location).option("drive", "kind")
+    kind: DriveKind = DriveSections(sections, _DRIVE_SECTION, places.location).options("drive")["kind"]
     try:
-        drive = kind.build(Structure(sections, kind.sections, places.location))
+        drive = kind.build(DriveSections(sections, kind.sections, places.location))
         system = drive.system()
     except ModelError as error:  # a law that asks for what its base, or this plant, has not
         raise ModelError(f"{places.location('friction')}: [friction]: {error}") from None
-    return drive, _read_parameters(system, kind, sections, places)
+    return StoredFit(Path(path), drive, _read_parameters(system, kind, sections, places), document.unwrap())
+
+
+def _is_covariance(matrix: NDArray[np.float64]) -> bool:
+    """Whether a matrix is finite and symmetric, with no negative variance and no correlation beyond 1."""
+    variances = np.diag(matrix)
+    if not np.isfinite(matrix).all() or (variances < 0).any():
+        return False
+    scale = np.sqrt(np.outer(variances, variances))
+    return bool(
+        (abs(matrix - matrix.T) <= COVARIANCE_ROUNDING * scale).all()
+        and (abs(matrix) <= (1 + COVARIANCE_ROUNDING) * scale).all()
+    )
 
 
 def ambient_pressure(parameters: ParameterSet) -> float:
@@ -77,122 +339,25 @@ def ambient_pressure(parameters: ParameterSet) -> float:
 
 
 def read_status(path: str | Path) -> Status | None:
-    """How the fit in a file ended; None for a file that no fit has written.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Status or None
+    """How the fit or the tuning in a file ended; None for a file that no result has written.
 
     Raises
     ------
     InputError
         If the status is none that pneuopt writes.
     """
-    said = read_toml(path).unwrap().get("status")
+    return stored_status(read_toml(path).unwrap(), path)
+
+
+def stored_status(toml: Mapping[str, Any], path: str | Path) -> Status | None:
+    """The status in a parsed file; see `read_status`."""
+    said = toml.get("status")
     if said is None:
         return None
     codes = [code.value for code in Code]
     require(isinstance(said, dict), f"{path}: status must be a section, [status]")
     check_names("status", [str(said.get("code"))], codes, f"{path}: [status] code")
     return Status(Code(said["code"]), tuple(filter(None, [str(said.get("message", ""))])))
-
-
-def read_marks(path: str | Path) -> dict[str, Mark]:
-    """How far each estimate in a file can be trusted, by parameter; empty for a file that no fit has written.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    dict of str to Mark
-
-    Raises
-    ------
-    InputError
-        If a mark is none that pneuopt writes.
-    """
-    estimates = read_toml(path).unwrap().get("estimates", {})
-    require(isinstance(estimates, dict), f"{path}: estimates must be a section, [estimates]")
-    marks = {n: str(entry["mark"]) for n, entry in estimates.items() if isinstance(entry, dict) and "mark" in entry}
-    for name, mark in marks.items():
-        check_names("mark", [mark], [m.value for m in Mark], f"{path}: [estimates] {name}")
-    return {n: Mark(mark) for n, mark in marks.items()}
-
-
-def read_covariance(path: str | Path) -> "pd.DataFrame | None":
-    """The covariance of a fit's estimates; None for a file that no fit has written.
-
-    Parameters
-    ----------
-    path : str or Path
-        A fit.toml; from one without [covariance] come the variances of its [estimates] alone.
-
-    Returns
-    -------
-    DataFrame or None
-        As `IdentificationResult.covariance`, without what the logs do not identify.
-
-    Raises
-    ------
-    InputError
-        If it is no symmetric table of numbers.
-    """
-    import pandas as pd
-
-    table = read_toml(path).unwrap()
-    rows, estimates = table.get("covariance"), table.get("estimates", {})
-    if rows is None:
-        deviations = {n: e.get("stderr", nan) for n, e in estimates.items() if isinstance(e, dict)}
-        known = {n: float(v) for n, v in deviations.items() if isinstance(v, int | float) and isfinite(v)}
-        return pd.DataFrame(np.diag(np.square(list(known.values()))), list(known), list(known)) if known else None
-    message = f"{path}: [covariance] must hold a row of numbers for each of its parameters; run identify again"
-    require(isinstance(rows, dict) and all(isinstance(row, list) for row in rows.values()), message)
-    try:
-        matrix = np.array(list(rows.values()), dtype=float).reshape(len(rows), len(rows))
-    except ValueError:
-        raise InputError(message) from None
-    require(bool(np.isfinite(matrix).all() and np.allclose(matrix, matrix.T)), message)
-    return pd.DataFrame(matrix, list(rows), list(rows))
-
-
-def read_noise(path: str | Path) -> dict[str, float]:
-    """Of each channel of a fit.toml's logs the larger of noise and residuals, the median over the logs [SI]."""
-    found: dict[str, list[float]] = {}
-    for channels in read_toml(path).unwrap().get("agreement", {}).values():
-        for name, row in channels.items() if isinstance(channels, dict) else ():
-            levels = [
-                row[k] for k in ("noise", "rmse") if isinstance(row, dict) and isinstance(row.get(k), int | float)
-            ]
-            found.setdefault(str(name), []).extend([max(levels)] if levels else [])
-    return {n: float(np.median(levels)) for n, levels in found.items() if levels}
-
-
-def read_estimates(path: str | Path) -> "pd.DataFrame | None":
-    """The estimates of a fit with what is uncertain about them; None for a file that no fit has written.
-
-    Parameters
-    ----------
-    path : str or Path
-        A fit.toml.
-
-    Returns
-    -------
-    DataFrame or None
-        A row a parameter with stderr, dof, range_low and range_high as in `IdentificationResult.estimates`; NaN where
-        the file has none.
-    """
-    import pandas as pd
-
-    rows = {n: e for n, e in read_toml(path).unwrap().get("estimates", {}).items() if isinstance(e, dict)}
-    columns = ("stderr", "dof", "range_low", "range_high")
-    table = pd.DataFrame.from_dict(rows, orient="index").reindex(columns=columns)
-    return table.apply(pd.to_numeric, errors="coerce") if rows else None
 
 
 def write_fit(path: str | Path, source: str | Path, result: IdentificationResult) -> None:

@@ -1,29 +1,29 @@
-"""The first files of a new user: a drive, a tuning, a study, a rig and a log's sidecar, every key in them."""
+"""The first files of a new user: drive, tuning, study, rig and a log's sidecar; and those of an excitation run."""
 
 import json
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.excitation import DEFAULT_WIDTH
 from pneuopt.dynamics.system import System
-from pneuopt.files.drive import FIT_SECTIONS
-from pneuopt.files.drive_keys import default_parameters, drive_keys
-from pneuopt.files.json_outputs import output_schema
-from pneuopt.files.loop_parameters import SAMPLE_TIME, tuning_keys
+from pneuopt.evaluation.excitation_run import ExcitationRun
+from pneuopt.files.drive import FIT_SECTIONS, default_parameters, drive_keys
+from pneuopt.files.keys import Template, json_schema
+from pneuopt.files.loop import SAMPLE_TIME, signal_units, tuning_keys
+from pneuopt.files.outputs import output_schema
 from pneuopt.files.rig import RIG_KEYS
-from pneuopt.files.schema import json_schema
 from pneuopt.files.study import STUDY_KEYS
-from pneuopt.files.template import Template
 from pneuopt.files.tuning import TUNED_SECTIONS
-from pneuopt.files.tuning_keys import signal_units
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.plant_channels import plant_channels
 from pneuopt.logs.sidecar_keys import SIDECAR_KEYS
 from pneuopt.models.catalog import CATALOGUE_SOURCE
-from pneuopt.models.declaration import DriveKind, FirstFiles, Structure
+from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.keys import Key
@@ -86,7 +86,7 @@ def first_files(
     kind, first = DRIVE_KINDS[name], first_kinds()[name]
     defaults = default_parameters(kind, first.options)
     values = defaults | defaults.with_values(first.values) | known.select(n for n in known if n in defaults)
-    plant = kind.build(Structure(first.options, kind.sections, lambda *_: "")).system()
+    plant = kind.build(DriveSections(first.options, kind.sections, lambda *_: "")).system()
     loop = ClosedLoop(plant, PID(sample_time))
     templates = {
         "drive": _drive_template(kind, first, values, source),
@@ -116,7 +116,7 @@ def unused_channels(name: str) -> frozenset[str]:
 
 def _first_plant(name: str) -> System:
     kind, first = DRIVE_KINDS[name], first_kinds()[name]
-    return kind.build(Structure(first.options, kind.sections, lambda *_: "")).system()
+    return kind.build(DriveSections(first.options, kind.sections, lambda *_: "")).system()
 
 
 def sidecar_name(log: str) -> str:
@@ -284,3 +284,72 @@ def _number_text(value: float, unit: str) -> str:
 
 def _quote(text: str) -> str:
     return f'"{text}"'
+
+
+PLAYED_FILE, RUN_FILE = "moves.csv", "run.toml"  # not one name: run.toml would be taken for the sidecar of run.csv
+_COMMENT_WIDTH = 108  # characters of a line of comment
+
+
+def run_files(run: ExcitationRun, drive: str = "drive.toml") -> dict[str, str]:
+    """The texts of both files, by their names; `drive` is the name of the drive's file."""
+    return {PLAYED_FILE: _play_file(run), RUN_FILE: "\n".join([*_head(run, drive), *_loop(run), *_moves(run)]) + "\n"}
+
+
+def logged_channels(run: ExcitationRun) -> tuple[str, ...]:
+    """What the run's log has to hold: the command, the position, and what pushes."""
+    axis = run.loop.plant.axis
+    assert axis is not None
+    assert axis.final_element is not None
+    return run.loop.command.name, run.loop.feedback.name, *axis.final_element.pushing
+
+
+def _play_file(run: ExcitationRun) -> str:
+    """Time, position and speed of the reference at each sample."""
+    columns = run.moves.trajectory(run.loop.pid.sample_time or 0.0)
+    rows = zip(columns.t.tolist(), columns["reference"].tolist(), columns["reference_speed"].tolist(), strict=True)
+    header = "time [s],position_reference [mm],speed_reference [m/s]"
+    return "\n".join([header, *(f"{t:.9g},{1e3 * r:.9g},{v:.6g}" for t, r, v in rows)]) + "\n"
+
+
+def _head(run: ExcitationRun, drive: str) -> list[str]:
+    low, high = (write_value(x, "m", 3) for x in run.between)
+    fast = write_value(run.fastest, "m/s", 3)
+    trail = write_value(run.following_error, "m", 2)
+    text = (
+        f"An excitation run of {run.duration:.3g} s for the drive of {drive}, between {low} and {high}, at {fast} at "
+        "most, made by pneuopt init --run. From its log alone friction (static, Coulomb, Stribeck, viscous), the "
+        "valve's conductance and dead zone, and the mass are identified.",
+        f"Play it: a plain position controller (below: proportional, no integral, which would hunt) follows "
+        f"{PLAYED_FILE} from rest at its first position. Begin with a tenth of the gain, raise it while the axis does "
+        f"not swing, and keep the end stops free. The axis trails by up to {trail}: that does no harm.",
+        f"Log {', '.join(logged_channels(run))} at the controller's samples, from before the first move on.",
+        f"Then: pneuopt identify {drive} LOG -o fit.toml",
+        f"Simulated on the drive as guessed: pneuopt simulate {drive} {RUN_FILE} -o predicted.csv",
+    )
+    return [f"# {line}" for part in text for line in textwrap.wrap(part, _COMMENT_WIDTH, subsequent_indent="  ")]
+
+
+def _loop(run: ExcitationRun) -> Iterator[str]:
+    p, unit, loop = run.parameters, run.loop.command.unit, run.loop
+    limits = (write_value(p.value(f"pid.{end}") + run.centre, unit) for end in ("lower", "upper"))
+    gain = write_value(p.value("pid.Kp"), p["pid.Kp"].unit)
+    yield from ["", "[loop]", f'measured = "{loop.feedback.name}"', "", "[pid]", 'form = "parallel"']
+    yield f'sample_time = "{write_value(loop.pid.sample_time or 0.0, "s")}"'
+    yield f'Kp = "{gain}"'
+    yield "limits = [" + ", ".join(f'"{end}"' for end in limits) + "]"
+
+
+def _moves(run: ExcitationRun) -> Iterator[str]:
+    moves: Sequence[Move] = run.moves.moves
+    first = moves[0]
+    shared = {"speed": ("m/s", run.fastest), "acceleration": ("m/s^2", first.acceleration), "at": ("s", first.at)}
+    yield from ["", "[[reference]]"]
+    for name, (unit, value) in shared.items():
+        yield f'{name} = "{write_value(value, unit)}"'
+    yield f'initial = "{write_value(first.initial, "m")}"'
+    yield "moves = ["
+    for move in moves:
+        own = {"distance": (move.distance, "m"), "speed": (move.speed, "m/s"), "dwell": (move.dwell, "s")}
+        cells = ", ".join(f'{n} = "{write_value(value, unit)}"' for n, (value, unit) in own.items())
+        yield f"  {{ {cells} }},"
+    yield "]"

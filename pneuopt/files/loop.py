@@ -1,27 +1,632 @@
-"""The loop in a tuning.toml: [loop], its controller and sensor, and what is added to the command."""
+"""The keys of a tuning.toml, and the readers of its parts: requirements, spreads, [method], and the loop itself.
+
+The values of a loop's parts are parameters ("pid.Kp" is the key Kp of [pid]), which the parts declare themselves.
+Words in braces in a unit stand for the units of the loop's signals (`signal_units`).
+"""
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pneuopt.control.compensators import COMPENSATORS, Compensator
 from pneuopt.control.controller import Feedforward, PositionLoop
-from pneuopt.control.dither import Dither
-from pneuopt.control.gain_schedule import GainSchedule
+from pneuopt.control.dither import Dither, Waveform
+from pneuopt.control.gain_schedule import SCHEDULED_GAINS, GainSchedule
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.moves import Move, MoveProfile
 from pneuopt.control.pid import FAULT_SAMPLES, PID, AntiWindup, Form
-from pneuopt.control.sensor import Encoder, SensorLag
+from pneuopt.control.reference import Step
+from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.dynamics.hooks import Axis
+from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
-from pneuopt.files.toml import construct_at, read_fixed_value, read_parameter
-from pneuopt.files.tuning_keys import LOOP_KEYS
-from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.keys import Key
-from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.units import read_value, write_value
+from pneuopt.evaluation.band import Band, Tolerance
+from pneuopt.evaluation.certificate import Defect
+from pneuopt.evaluation.distributions import DISTRIBUTIONS, Distribution
+from pneuopt.evaluation.metric import Requirement
+from pneuopt.evaluation.requirements import REQUIREMENT_KINDS, SettlingTime, StepEnvelope
+from pneuopt.evaluation.rest_check import NoHunting
+from pneuopt.evaluation.sampling import Sampling
+from pneuopt.evaluation.scenarios import TOGETHER, Spread
+from pneuopt.files.drive import ambient_pressure
+from pneuopt.files.toml import construct_at, read_parameter
+from pneuopt.quantities.errors import InputError, UnitError, check_names, require
+from pneuopt.quantities.keys import (
+    Key,
+    Takes,
+    argument_meanings,
+    choice,
+    first_sentence,
+    flag,
+    parameter_key,
+    read_entry,
+    read_table,
+    table,
+)
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.unit_algebra import difference_unit
+from pneuopt.quantities.units import count_gauge_from, read_value, write_value
+from pneuopt.tuning.method import Method
+from pneuopt.tuning.methods import METHODS
+
+MAX_CASES = 20_000
+"""Plants or cells that a file may ask for [1]: more take days and gigabytes; fewer refuse a map of 100 by 100."""
+MAX_OPTION = 1_000_000
+"""A whole number among a method's options [1]: a thousand times more fill the memory; fewer refuse a long search."""
+
+
+REQUIREMENTS_BY_KEY: Mapping[str, type[Requirement]] = {
+    re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in REQUIREMENT_KINDS
+}
+"""By its key each kind of requirement."""
+
+NORMAL_VOLUME = "(ANR)"  # what a volume of air is followed by that counts at ISO 8778's state
+
+
+def bound_units(loop: ClosedLoop) -> dict[str, str]:
+    """The unit of each requirement's bound, by key; "1" of what is a number alone.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.friction import Viscous
+    >>> units = bound_units(ClosedLoop(ForceDrive(Viscous()).system(), PID()))
+    >>> units["peak_control"], units["ripple"], units["overshoot"]
+    ('N', 'm/s', '1')
+    """
+    command, measured = loop.command.unit, loop.feedback.unit.partition("(")[0]
+    units = {key: kind.metric.unit_in(command, measured) for key, kind in REQUIREMENTS_BY_KEY.items()}
+    return {key: unit.removesuffix(NORMAL_VOLUME) for key, unit in units.items()}
+
+
+def read_bound(key: str, given: Any, unit: str, where: str) -> float:
+    """Read a requirement's bound.
+
+    Parameters
+    ----------
+    key : str
+    given : object
+        As written: "5 %", "150 N", 1.4, "2 l(ANR)".
+    unit : str
+        Of `bound_units`.
+    where : str
+        What the message of an error begins with.
+
+    Raises
+    ------
+    UnitError
+        If it cannot be read.
+    """
+    if REQUIREMENTS_BY_KEY[key].metric.unit.endswith(NORMAL_VOLUME):
+        normal = isinstance(given, str) and given.strip().endswith(NORMAL_VOLUME)
+        require(normal, f'{where}: {given!r}: air is counted at 20 degC and 100 kPa (ANR): "2 l(ANR)"', UnitError)
+        given = given.strip().removesuffix(NORMAL_VOLUME)
+    return read_value(given, unit, where=where)
+
+
+_PUSH = Key("by how much it changes", unit="{own}", example='"50 N"')
+_KNOWN = Key("its value at time 0", unit="{own}", example='"250 mm"')
+_OF_A_MOVE, _HAS_AN_END = "of a move", "of a move or a path"
+_SHARED_KEYS: Mapping[str, Key] = {
+    "initial": Key("value before", unit="{measured}", usual=Step.initial),
+    "at": Key("when it begins", unit="s", usual=Step.at),
+    "start": table(
+        "what else is known of the plant at time 0",
+        {},
+        others=_KNOWN,
+        named="output",
+        example='{ position = "250 mm" }',
+    ),
+    "disturbance": table(
+        "what changes of the plant at that instant",
+        {},
+        others=_PUSH,
+        named="parameter or input",
+        example='{ "load.force" = "50 N" }',
+    ),
+}
+STEP_KEYS: Mapping[str, Key] = {
+    "step": Key(
+        "height of the step; required without a move or a disturbance", unit="{difference}", example='"0.1 m/s"'
+    ),
+    "horizon": Key("end of the experiment", unit="s", example='"1 s"', condition="required of a step"),
+    "scale": Key(
+        "what fractions are of", unit="{difference}", example='"0.1 m/s"', condition="for a disturbance alone"
+    ),
+    **_SHARED_KEYS,
+}
+_DISTANCE = Key("distance of a move from rest to rest", unit="{difference}", example='"200 mm"', required=True)
+_MOTION_KEYS: Mapping[str, Key] = {
+    "speed": Key("its largest speed", unit="{measured}/s", example='"0.5 m/s"', condition="required of a move"),
+    "acceleration": Key(
+        "its largest acceleration", unit="{measured}/s^2", example='"5 m/s^2"', condition="required of a move"
+    ),
+    "jerk": Key("its largest jerk", unit="{measured}/s^3", example='"100 m/s^3"', condition=_OF_A_MOVE),
+    "profile": replace(
+        choice("its shape", {kind.value: kind for kind in MoveProfile}, Move.profile.value), condition=_OF_A_MOVE
+    ),
+    "dwell": Key("from its end to the end of the experiment", unit="s", usual=Move.dwell, condition=_HAS_AN_END),
+}
+OWN_MOVE_KEYS: Mapping[str, Key] = {"distance": _DISTANCE, **_MOTION_KEYS}
+"""Those of one of several moves."""
+MOVE_KEYS: Mapping[str, Key] = {
+    "move": replace(_DISTANCE, required=False, condition="in place of step and horizon"),
+    "moves": Key(
+        "distances of moves one after the other, or tables { distance, speed, dwell, ... } with limits of their own; "
+        "metrics are of the last",
+        Takes.LIST,
+        "{difference}",
+        example='["200 mm", "-200 mm"]',
+        condition="in place of move",
+        of=Key("a distance, or a table with it", Takes.PARAMETER, "{difference}", keys=OWN_MOVE_KEYS),
+        counts=(1, float("inf")),
+    ),
+    **_MOTION_KEYS,
+    **_SHARED_KEYS,
+}
+PATH_KEYS: Mapping[str, Key] = {
+    "path": Key(
+        "a table of time and the measured signal, in any format that a log has, beside this file",
+        Takes.TEXT,
+        example='"path.csv"',
+        condition="in place of step or move",
+    ),
+    **{n: MOVE_KEYS[n] for n in ("dwell", "start", "disturbance")},
+}
+REFERENCE_KEYS: Mapping[str, Key] = {**STEP_KEYS, **MOVE_KEYS, **PATH_KEYS}
+"""All of them."""
+
+
+SPREAD_KEY = Key("a fraction, or least and largest value", Takes.SPREAD, unit="{own}", example='"30 %"')
+_SECOND_IS_FRACTION = ("log_normal",)  # distributions whose second number has no unit
+_SECOND_IS_DIFFERENCE = ("normal",)  # and those whose second number is a difference: no pressure level
+SPREAD_KEYS: Mapping[str, Key] = {
+    "distribution": choice("how it is drawn", DISTRIBUTIONS, "uniform"),
+    "spread": Key(
+        "a fraction; or two values: least and largest, of normal mean and deviation, of log_normal median and fraction",
+        Takes.SPREAD,
+        unit="{own}",
+        required=True,
+        example='"5 %"',
+    ),
+}
+SAMPLE_KEYS: Mapping[str, Key] = {
+    "count": Key("how many", Takes.COUNT, usual=20, least=1, most=MAX_CASES),
+    "seed": Key("of the random numbers", Takes.COUNT, usual=0, least=0),
+    "sampling": choice("how they fill the box", {s.value: s for s in Sampling}, Sampling.RANDOM.value),
+}
+SAMPLED_KEY = Key(
+    "a fraction, least and largest value, or a distribution",
+    Takes.SPREAD,
+    unit="{own}",
+    keys=SPREAD_KEYS,
+    example='"30 %"',
+)
+SAMPLES_KEY = table(
+    "plants drawn from a box, or from distributions", SAMPLE_KEYS, others=SAMPLED_KEY, named="parameter"
+)
+CORNERS_KEY = table('plants at the corners of a box; "a + b" vary together', {}, others=SPREAD_KEY, named="parameter")
+
+
+@dataclass(frozen=True)
+class Draw:
+    """How many plants are drawn, and how."""
+
+    count: int
+    seed: int
+    sampling: Sampling
+
+
+def read_draw(given: Mapping[str, Any], where: str) -> Draw:
+    """Read how plants are drawn; what is left out is as usual."""
+    return Draw(**read_table(SAMPLE_KEYS, given, where))
+
+
+def read_spreads(entries: Mapping[str, Any], where: str, parameters: ParameterSet) -> dict[str, Spread]:
+    """Read by which fraction, or between which values, each pattern of parameters spreads.
+
+    Parameters
+    ----------
+    entries : mapping
+        Names or patterns to "30 %", or to ["3 kg", "7 kg"].
+    where : str
+        What the message of an error begins with.
+    parameters : ParameterSet
+        Gives the units.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, or a value cannot be read.
+    """
+    return {
+        pattern: _read_spread(given, pattern, where, parameters)
+        for pattern, given in _flatten(entries, parameters).items()
+    }
+
+
+def read_sample_spreads(
+    entries: Mapping[str, Any], where: str, parameters: ParameterSet
+) -> dict[str, Spread | Distribution]:
+    """Read spreads as `read_spreads` does, and distributions: { distribution = "normal", spread = "5 %" }."""
+    found: dict[str, Spread | Distribution] = {}
+    for pattern, given in _flatten(entries, parameters).items():
+        if not isinstance(given, dict):
+            found[pattern] = _read_spread(given, pattern, where, parameters)
+            continue
+        spot = f"{where} {pattern}"
+        said = read_table(SPREAD_KEYS, given, spot)
+        word = given.get("distribution", SPREAD_KEYS["distribution"].usual)
+        spread = _read_spread(said["spread"], pattern, where, parameters, word)
+        found[pattern] = construct_at(partial(said["distribution"], spread), spot)
+    return found
+
+
+def _read_spread(given: Any, pattern: str, where: str, parameters: ParameterSet, word: str = "") -> Spread:
+    spot = f"{where} {pattern}"
+    if not isinstance(given, list):
+        return read_value(given, "1", where=spot)
+    unit = parameters[parameters.match_names(pattern.split(TOGETHER, maxsplit=1)[0])[0]].unit
+    require(len(given) == 2, f'{spot}: write a fraction, "30 %", or two values, the least first')
+    second = difference_unit(unit) if word in _SECOND_IS_DIFFERENCE else "1" if word in _SECOND_IS_FRACTION else unit
+    with count_gauge_from(ambient_pressure(parameters)):
+        return read_value(given[0], unit, where=spot), read_value(given[1], second, where=spot)
+
+
+def _flatten(entries: Mapping[str, Any], parameters: ParameterSet, prefix: str = "") -> dict[str, Any]:
+    """By full name; without quotes, TOML reads `load.mass` as a table within a table."""
+    found: dict[str, Any] = {}
+    for key, entry in entries.items():
+        name = f"{prefix}{key}"
+        is_spread = (
+            name in parameters
+            or "*" in name
+            or TOGETHER in name
+            or not isinstance(entry, dict)
+            or SPREAD_KEYS.keys() & entry.keys()
+        )
+        found |= {name: entry} if is_spread else _flatten(entry, parameters, f"{name}.")
+    return found
+
+
+REPLACED_METHODS = {
+    "screening": "racing",
+    "condensed": "racing",
+}  # in files of older versions
+
+
+def _option_keys(name: str) -> dict[str, Key]:
+    """The options of a method that a file can state: numbers, and lists of them."""
+    meanings, condition = argument_meanings(METHODS[name]), f'with kind = "{name}"'
+    own = [f for f in fields(METHODS[name]) if isinstance(f.default, int | float | tuple)]
+    return {f.name: _option_key(f.default, meanings.get(f.name, ""), condition) for f in own}
+
+
+def _option_key(usual: Any, meaning: str = "", condition: str = "") -> Key:
+    if isinstance(usual, tuple):
+        return Key(meaning, Takes.LIST, usual=usual, condition=condition, of=_option_key(usual[0]))
+    if isinstance(usual, float):
+        return Key(meaning, usual=usual, condition=condition)
+    return Key(meaning, Takes.COUNT, usual=usual, condition=condition, least=-MAX_OPTION, most=MAX_OPTION)
+
+
+METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {name: _option_keys(name) for name in METHODS}
+"""The options of each method."""
+
+
+def _join_options() -> dict[str, Key]:
+    """The options of all methods; one that several have says of which its usual value is."""
+    found: dict[str, Key] = {}
+    for keys in METHOD_KEYS.values():
+        found |= {n: replace(key, condition=f"usual {key.condition}") if n in found else key for n, key in keys.items()}
+    return found
+
+
+METHOD_SECTION = table(
+    "how the search goes; by default the loop decides", {"kind": choice("method", METHODS), **_join_options()}
+)
+
+
+def read_method(entries: Mapping[str, Any], where: str) -> Method | None:
+    """Read a tuning method.
+
+    Parameters
+    ----------
+    entries : mapping
+        "kind", a key of `METHODS`, and options of that class: numbers, or lists of them. Empty: no method.
+    where : str
+        What the message of an error begins with.
+
+    Returns
+    -------
+    Method or None
+        None: the loop decides.
+
+    Raises
+    ------
+    InputError
+        Or its kind; the message names the key.
+
+    Examples
+    --------
+    >>> read_method({"kind": "racing", "members": 12, "margin": "2 %"}, "[method]").margin
+    0.02
+    """
+    if not entries:
+        return None
+    name = str(entries.get("kind"))
+    if name in REPLACED_METHODS:
+        successor = REPLACED_METHODS[name]
+        known = ", ".join(METHOD_KEYS[successor])
+        raise InputError(f"{where}: {name!r} is gone; write kind = {successor!r}, whose options are {known}")
+    chosen = {"kind": METHOD_SECTION.keys["kind"]}
+    kind: type[Method] = read_table(chosen, entries, where, partial=True)["kind"]
+    values = read_table({**chosen, **METHOD_KEYS[name]}, entries, where)
+    return construct_at(lambda: kind(**{n: values[n] for n in entries if n != "kind"}), where)
+
+
+ACCEPT_KEY = "accept"
+"""Top-level key of the defects with which a design is certified all the same."""
+
+
+def _words(kind: type[Enum]) -> dict[str, Enum]:
+    return {member.value: member for member in kind}
+
+
+LOOP_KEYS: Mapping[str, Mapping[str, Key]] = {
+    "loop": {
+        "measured": Key("output that is fed back; by default speed, or the only one", Takes.TEXT, example='"speed"'),
+        "actuated": Key("input that the controller drives; by default the only one", Takes.TEXT, example='"force"'),
+    },
+    "pid": {
+        "form": choice("which gains are stated", _words(Form), Form.PARALLEL.value),
+        "sample_time": Key("time between samples; without it the controller is continuous", unit="s", example='"1 ms"'),
+        "delay": Key("samples from reading to acting", Takes.SAMPLES, usual=0, example='"1 sample"'),
+        "anti_windup": choice(
+            "what keeps the integral at bay at a limit", _words(AntiWindup), AntiWindup.BACK_CALCULATION.value
+        ),
+        "limits": Key(
+            "least and largest command",
+            Takes.LIST,
+            "{command}",
+            example='["-5 V", "5 V"]',
+            of=Key("a command", unit="{command}"),
+            counts=(2, 2),
+        ),
+    },
+    PositionLoop.section: {},
+    "dither": {
+        "waveform": choice("shape of the oscillation", _words(Waveform), Waveform.SINE.value),
+        "analogue": flag("whether a generator behind the sampled controller adds it"),
+    },
+    "sensor": {
+        "lag": Key("lag with which the controller sees the signal", unit="s", example='"5 ms"'),
+        "resolution": Key("one count of an encoder, in place of a lag", unit="{position}", example='"10 um"'),
+        "filter": Key("time constant of the encoder's low-pass", unit="s", usual=Encoder.filter),
+    },
+    "feedforward": {},
+    **{
+        section: {
+            f.name: choice(first_sentence(type(f.default)), _words(type(f.default)), f.default.value)
+            for f in fields(part)
+        }
+        for section, part in COMPENSATORS.items()
+    },
+    GainSchedule.section: {},
+}
+"""By section the keys that choose how a loop is built, and those of its sensor."""
+
+LOOP_MEANINGS: Mapping[str, str] = {
+    "loop": "which signals the controller connects",
+    "pid": "the controller, with its first gain at least",
+    PositionLoop.section: "makes it a cascade: the position's error sets the speed that the PID controls",
+    "sensor": "what the controller sees of the signal: a lag, or an encoder",
+    "dither": "a small oscillation added to the command",
+    "feedforward": "what a change of the reference adds to the command",
+    **{section: first_sentence(part) for section, part in COMPENSATORS.items()},
+    GainSchedule.section: "gains that change with the position and the load",
+}
+
+
+def _read_band(entry: Any, where: str, units: Mapping[str, str]) -> Band:
+    """A fraction of the step, or a half width in the measured unit."""
+    try:
+        return read_value(entry, "1", where=where)
+    except UnitError:
+        width = units["measured"].partition("(")[0]
+    try:
+        return construct_at(lambda: Tolerance(read_value(entry, width, where=where)), where)
+    except UnitError as error:
+        raise UnitError(f'{error}, or as a fraction of the step, band = "2 %"') from None
+
+
+_ENVELOPE_ROW = Key(
+    "an instant, its lower and its upper bound",
+    Takes.LIST,
+    read=lambda row, where, _: _read_envelope_row(row, where),
+)
+
+
+def _read_envelope_row(row: Any, where: str) -> tuple[float, float, float]:
+    proper = isinstance(row, list) and len(row) == 3
+    require(proper, f'{where}: write instants with a lower and an upper bound, [["0 s", "-10 %", "110 %"], ...]')
+    instant, low, up = (read_value(v, unit, where=where) for v, unit in zip(row, ("s", "1", "1"), strict=True))
+    return instant, low, up
+
+
+OBJECTIVE_KEYS: Mapping[str, Key] = {"weight": Key("its share of the objective", usual=1.0, least=0.0, is_open=True)}
+_ENVELOPE = Key(
+    "rows of instant, lower and upper bound",
+    Takes.LIST,
+    example='[["0 s", "-10 %", "110 %"]]',
+    required=True,
+    of=_ENVELOPE_ROW,
+    counts=(1, float("inf")),
+)
+_BAND_MEANING = 'half width of the band, a fraction of the step or as "0.1 mm"'
+EXTRA_KEYS: Mapping[str, Mapping[str, Key]] = {
+    "settling_time": {"band": Key(_BAND_MEANING, usual=SettlingTime.band, read=_read_band)},
+    "step_envelope": {"bounds": _ENVELOPE},
+}
+"""The keys of some requirements beside their limit and weight."""
+
+_TOLERANCE = Key("a fraction of the gain", example='"1 %"')
+SCENARIO_KEYS: Mapping[str, Key] = {
+    "corners": CORNERS_KEY,
+    "samples": SAMPLES_KEY,
+    "tolerances": table("gains off by so much, either way", {}, others=_TOLERANCE, named="gain"),
+}
+
+BUDGET_KEYS: Mapping[str, Key] = {
+    "steps": Key("steps of the simulations that are refused as too many", usual=MAX_STEPS, least=0.0, is_open=True),
+}
+
+
+NO_HUNTING_KEY = "no_hunting"
+"""Key under [limits] of `NoHunting`, which has no metric."""
+_REPEATABILITY = Key("largest range of its errors at rest over the references", unit="{difference}", example='"0.1 mm"')
+NO_HUNTING_KEYS: Mapping[str, Key] = {
+    "duration": Key("for how long it is watched", unit="s", usual=NoHunting.duration),
+    "repeatability": _REPEATABILITY,
+}
+_NO_HUNTING = Key(
+    "the loop comes to rest, watched for so long on the rig's model",
+    Takes.PARAMETER,
+    "s",
+    keys=NO_HUNTING_KEYS,
+    condition="with --rig",
+    example='"60 s"',
+)
+
+
+def objective_key(name: str) -> Key:
+    """The key of a requirement under [minimise]."""
+    return table(first_sentence(REQUIREMENTS_BY_KEY[name]), {**OBJECTIVE_KEYS, **EXTRA_KEYS.get(name, {})})
+
+
+def limit_key(name: str) -> Key:
+    """The key of a requirement under [limits]: a bound, or a table with it."""
+    kind = REQUIREMENTS_BY_KEY[name]
+    bound, unit = kind.metric.sense.value, kind.metric.unit
+    usual = StepEnvelope.max if name == "step_envelope" else None
+    example = '"5 %"' if kind.metric.percent else "1.5" if unit == "1" else f'"1 {unit}"'
+    read = None
+    if unit.endswith(NORMAL_VOLUME):
+
+        def read(entry: Any, where: str, _: Mapping[str, str]) -> float:
+            return read_bound(name, entry, unit.removesuffix(NORMAL_VOLUME), where)
+
+    own = Key("the bound", unit=unit, usual=usual, example=example, required=usual is None, read=read)
+    keys = {bound: own, **EXTRA_KEYS.get(name, {})}
+    return Key(first_sentence(kind), Takes.PARAMETER, unit, keys=keys, example="" if "{" in unit else example)
+
+
+def signal_units(command: str, measured: str, position: str = "m") -> dict[str, str]:
+    """The units that the words in braces stand for."""
+    return {
+        "command": command,
+        "measured": measured,
+        "difference": difference_unit(measured),
+        "position": position,
+        "own": "its own",
+    }
+
+
+LIMIT_KEYS: Mapping[str, Key] = {**{n: limit_key(n) for n in REQUIREMENTS_BY_KEY}, NO_HUNTING_KEY: _NO_HUNTING}
+"""What [limits] may hold."""
+TUNING_KEYS: Mapping[str, Key] = {
+    ACCEPT_KEY: Key(
+        "defects with which a design is certified all the same",
+        Takes.LIST,
+        choices=_words(Defect),
+        usual=[],
+        example='["hunts"]',
+        named="defect",
+    ),
+    **{n: table(LOOP_MEANINGS[n], keys, required=n == "pid") for n, keys in LOOP_KEYS.items()},
+    "reference": table("a step or a move to follow; one or more", REFERENCE_KEYS, takes=Takes.TABLES, required=True),
+    "minimise": table("what shall be small, weighted", {n: objective_key(n) for n in REQUIREMENTS_BY_KEY}),
+    "limits": table("what shall be kept", LIMIT_KEYS),
+    "scenarios": table("other plants and gains for which it shall hold, too", SCENARIO_KEYS),
+    "method": METHOD_SECTION,
+    "budget": table("what a search may take", BUDGET_KEYS),
+}
+"""All sections; the parameters of the loop's parts come beside the keys of their sections."""
+
+
+SAMPLE_TIME = 1e-3
+"""Of a first controller, and of usual values that count in samples [s]: a common one; longer ones slow a loop down."""
+_CONDITIONS = {"Tt": "with limits, for back-calculation", "reset_band": "with reset_ratio"}
+_SECTION_CONDITIONS = {
+    "position_loop": "where a position is controlled",
+    GainSchedule.section: "with low, high and a coefficient",
+    "pressure_feedback": "where the plant shows both pressures",
+}
+_SAMPLED = "with sample_time; never free"
+_LIMITS = ("lower", "upper")  # parameters that a file states as a pair, limits
+
+
+FIRST_PARAMETERS: Mapping[str, str] = {
+    PositionLoop.section: "Kp",
+    "dither": "frequency",
+    "feedforward": "gain",
+    **{section: part.size for section, part in COMPENSATORS.items()},
+    GainSchedule.section: "low",
+}
+"""The parameter that a file must state of each part beside the PID."""
+
+
+def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping[str, Key]:
+    """All sections of a tuning.toml with all their keys.
+
+    Parameters
+    ----------
+    command, measured : str
+        Units of the loop's signals; by default these words stand for them.
+
+    Returns
+    -------
+    mapping of str to Key
+    """
+    signal = SensedSignal(Quantity("measured", measured), {}, SAMPLE_TIME)
+    parts = {
+        "pid": _pid_keys(command, measured),
+        PositionLoop.section: _parameter_keys(PositionLoop().parameters(measured, f"{measured}/s")),
+        "dither": _parameter_keys(Dither().parameters(command)),
+        "feedforward": _parameter_keys(Feedforward().parameters(measured, command)),
+        **{name: _parameter_keys(part().parameters(signal, command)) for name, part in COMPENSATORS.items()},
+        GainSchedule.section: _parameter_keys(GainSchedule(SCHEDULED_GAINS, 0.0, 1.0, 1.0).parameters("m", "kg")),
+    }
+    for section, first in FIRST_PARAMETERS.items():
+        parts[section][first] = replace(parts[section][first], required=True)
+    for section, condition in _SECTION_CONDITIONS.items():
+        parts[section] = {n: replace(key, condition=condition) for n, key in parts[section].items()}
+    return {n: replace(key, keys={**key.keys, **parts.get(n, {})}) for n, key in TUNING_KEYS.items()}
+
+
+def _pid_keys(command: str, measured: str) -> dict[str, Key]:
+    """The gains of every form, and what is shared; those of some forms say which."""
+    found: dict[str, Key] = {}
+    for form in Form:
+        pid = PID(SAMPLE_TIME, form=form, dead_band=True, reset=True).parameters(measured, command)
+        for name in (n for n in pid if n not in _LIMITS and n not in found):
+            forms = [f'"{f.value}"' for f in Form if name in f.gains]
+            own = f"form = {' or '.join(forms)}" if 0 < len(forms) < len(Form) else ""
+            found[name] = parameter_key(pid[name], own or _CONDITIONS.get(name, ""))
+    fixed = {n: replace(found[n], takes=Takes.NUMBER, condition=_SAMPLED) for n in ("fault_samples", "fault_output")}
+    centre = "safe output after that many, on the wire as limits are; default: where the valve is closed, its centre"
+    fixed["fault_output"] = replace(fixed["fault_output"], meaning=centre, usual=None, example='"0 V"')
+    return found | fixed
+
+
+def _parameter_keys(parameters: ParameterSet) -> dict[str, Key]:
+    return {n: parameter_key(p) for n, p in parameters.items()}
+
 
 TuningSections = Mapping[str, Any]
 
@@ -68,61 +673,33 @@ def read_loop_sections(
 
 
 def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
-    wiring = table.get("loop", {})
-    check_names("key", wiring, LOOP_KEYS["loop"], f"{path}: [loop]")
-    for key, signal in wiring.items():
-        require(isinstance(signal, str), f"{path}: [loop] {key} must be a signal's name, got {signal!r}")
+    wiring = {n: s for n, s in read_table(LOOP_KEYS["loop"], table.get("loop", {}), f"{path}: [loop]").items() if s}
+    for section, first in FIRST_PARAMETERS.items():
+        told = f"{path}: [{section}] has no {first}, without which it does nothing; write {first}"
+        require(section not in table or first in table[section], told)
     pid = _pid(table["pid"], f"{path}: [pid]")
     dither = _dither(table["dither"], f"{path}: [dither]") if "dither" in table else None
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
     lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
     parts = tuple(_compensator(n, table[n], f"{path}: [{n}]") for n in COMPENSATORS if n in table)
-    outer = (
-        _position_loop(table[PositionLoop.section], f"{path}: [{PositionLoop.section}]")
-        if PositionLoop.section in table
-        else None
-    )
+    outer = PositionLoop() if PositionLoop.section in table else None
     schedule = _schedule(table["schedule"], plant, f"{path}: [schedule]") if "schedule" in table else None
     loop = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
     return construct_at(lambda: loop(feedforward=lead, compensators=parts, outer=outer), str(path))
 
 
 def _pid(table: Mapping[str, Any], where: str) -> PID:
-    keys = LOOP_KEYS["pid"]
-    form = _read_choice(table, "form", keys, where)
-    _check_gains(table, form, where)
-    sample_time = _read_value(table, "sample_time", keys, where)
-    delay = _sample_count(table.get("delay", keys["delay"].usual), f"{where} delay")
+    keys = {n: key for n, key in LOOP_KEYS["pid"].items() if n != "limits"}  # their unit is the loop's
+    read = read_table(keys, table, where, partial=True)
+    _check_gains(table, read["form"], where)
     banded, resets = "dead_band" in table, "reset_ratio" in table
     told = "reset_band is that of resets; write reset_ratio, too, 1 for the whole integral"
     require(resets or "reset_band" not in table, f"{where} {told}")
-    unwinds = _read_choice(table, "anti_windup", keys, where)
+    unwinds = read["anti_windup"]
     told = "Tt is back-calculation's; clamping has none; leave it out"
     require("Tt" not in table or unwinds is AntiWindup.BACK_CALCULATION, f"{where} {told}")
-    return construct_at(lambda: PID(sample_time, "limits" in table, form, delay, banded, unwinds, resets), where)
-
-
-def _read_choice(table: Mapping[str, Any], key: str, keys: Mapping[str, Key], where: str) -> Any:
-    """What the word of a key stands for, of the usual one where the section leaves it out."""
-    word, words = str(table.get(key, keys[key].usual)), keys[key].choices or {}
-    check_names(key, [word], words, where)
-    return words[word]
-
-
-def _read_value(
-    table: Mapping[str, Any], key: str, keys: Mapping[str, Key], where: str, units: Mapping[str, str] | None = None
-) -> Any:
-    """A value that cannot be free, in its declared unit; the usual one where the section leaves it out."""
-    if key not in table:
-        return keys[key].usual
-    return read_fixed_value(table, key, keys[key].unit.format_map(units or {}), where)
-
-
-def _sample_count(table: Any, where: str) -> int:
-    match = re.fullmatch(r"\s*(\d+)\s*samples?\s*", table) if isinstance(table, str) else None
-    plainly = isinstance(table, int) and not isinstance(table, bool)
-    require(match is not None or plainly, f'{where}: {table!r} is no number of samples; write delay = "1 sample"')
-    return int(match[1]) if match else int(table)
+    made = partial(PID, read["sample_time"], "limits" in table, read["form"], read["delay"], banded, unwinds, resets)
+    return construct_at(made, where)
 
 
 def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
@@ -136,47 +713,34 @@ def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
 
 
 def _dither(table: Mapping[str, Any], where: str) -> Dither:
-    keys, analogue = LOOP_KEYS["dither"], table.get("analogue", LOOP_KEYS["dither"]["analogue"].usual)
-    shape = _read_choice(table, "waveform", keys, where)
-    require(isinstance(analogue, bool), f"{where} analogue must be true or false")
-    require("frequency" in table, f'{where} has no frequency; write frequency = "160 Hz"')
+    read = read_table(LOOP_KEYS["dither"], table, where, partial=True)
     given = read_parameter(table["frequency"], Parameter(1.0, "Hz"), f"{where} frequency")
-    return construct_at(lambda: Dither(given.value, analogue, shape), where)
+    return construct_at(lambda: Dither(given.value, read["analogue"], read["waveform"]), where)
 
 
 def _sensor(table: Mapping[str, Any], plant: System, where: str) -> SensorLag | Encoder:
-    keys = LOOP_KEYS["sensor"]
-    check_names("key", table, keys, where)
+    usual = Encoder() if plant.axis is None else Encoder(position=plant.axis.position)
+    units = {"position": {q.name: q.unit for q in plant.outputs}.get(usual.position, "m")}
+    read = read_table(LOOP_KEYS["sensor"], table, where, units=units)
     message = 'write lag = "5 ms", or of an encoder resolution = "10 um" and filter = "5 ms"'
     require(bool(table), f"{where} has no lag; {message}")
     require("lag" not in table or len(table) == 1, f"{where} has a lag or an encoder, not both; {message}")
     if "lag" in table:
-        lag = _read_value(table, "lag", keys, where)
-        return construct_at(lambda: SensorLag(lag), where)
-    usual = Encoder() if plant.axis is None else Encoder(position=plant.axis.position)
-    units = {"position": {q.name: q.unit for q in plant.outputs}.get(usual.position, "m")}
-    read = {key: _read_value(table, key, keys, where, units) for key in table}
-    return construct_at(lambda: replace(usual, **read), where)
+        return construct_at(lambda: SensorLag(read["lag"]), where)
+    return construct_at(lambda: replace(usual, **{key: read[key] for key in table}), where)
 
 
 def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
-    require("gain" in table, f"{where} has no gain; write gain and time")
     if "time" not in table:
         return Feedforward()
     time = read_parameter(table["time"], Parameter(1.0, "s"), f"{where} time").value
     return construct_at(lambda: Feedforward(time), where)
 
 
-def _position_loop(table: Mapping[str, Any], where: str) -> PositionLoop:
-    require("Kp" in table, f'{where} has no gain; write Kp = "10 1/s"')
-    return PositionLoop()
-
-
 def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedule:
     """A schedule of the gains whose coefficients are stated."""
-    told = 'has no {}, an end of the stroke; write low = "0 mm" and high = "200 mm", say'
-    for key in ("low", "high"):
-        require(key in table, f"{where} {told.format(key)}")
+    told = f'{where} has no high, the other end of the stroke; write low = "0 mm" and high = "200 mm", say'
+    require("high" in table, told)
     axis, units = plant.axis or Axis(), {q.name: q.unit for q in plant.outputs}
     unit = units.get(axis.position, "m")
     low, high = (read_parameter(table[key], Parameter(0.0, unit), f"{where} {key}").value for key in ("low", "high"))
@@ -192,10 +756,8 @@ def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedu
 
 def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensator:
     """A compensator, whose fields are choices of an enum."""
-    kind, keys = COMPENSATORS[section], LOOP_KEYS[section]
-    require(kind.size in table, f"{where} has no {kind.size}, without which it adds nothing; write {kind.size}")
-    chosen = {key: _read_choice(table, key, keys, where) for key in keys}
-    return construct_at(lambda: kind(**chosen), where)
+    chosen = read_table(LOOP_KEYS[section], table, where, partial=True)
+    return construct_at(lambda: COMPENSATORS[section](**chosen), where)
 
 
 def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centre: float) -> ParameterSet:
@@ -241,11 +803,7 @@ def _read_limits(entries: Mapping[str, Any], own: ParameterSet, centre: float, w
     if "limits" not in entries:
         return {}
     ends, unit = entries["limits"], own["pid.lower"].unit
-    require(
-        isinstance(ends, list) and len(ends) == 2,
-        f'{where} must be a pair: ["{write_value(-5.0, unit)}", "{write_value(5.0, unit)}"]',
-    )
-    low, high = (read_value(end, unit, where=where) for end in ends)
+    low, high = read_entry(LOOP_KEYS["pid"]["limits"], ends, where, {"command": unit})
     require(low < high, f"{where}: {ends[0]} is not below {ends[1]}")
     wire = [write_value(v, unit, 2) for v in (0.0, 2 * centre)]
     remedy = f'write what the wire may carry, limits = ["{wire[0]}", "{wire[1]}"] for instance'

@@ -22,11 +22,11 @@ from typing import Any, TypeVar
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
-from pneuopt.files.toml import construct_at, read_fixed_value, read_toml
+from pneuopt.files.toml import construct_at, read_toml
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import stick_slip_drive
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.keys import Key, table
+from pneuopt.quantities.keys import Key, check_sections, read_table, table
 from pneuopt.quantities.unit_algebra import difference_unit
 
 Part = TypeVar("Part", Actuator, Sensor, Encoder)
@@ -79,9 +79,7 @@ def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
         Or its kind; the message names file, section and key.
     """
     sections = read_toml(path).unwrap()
-    check_names("section", sections, RIG_KEYS, str(path))
-    for name, entry in sections.items():
-        require(isinstance(entry, dict), f"{path}: {name} must be a section, [{name}]")
+    check_sections(RIG_KEYS, sections, path)
     own = construct_at(lambda: replace(loop, plant=stick_slip_drive(drive).system(), sensor=None), str(path))
     actuator = _read_numbers(
         sections.get("actuator", {}), RIG_KEYS["actuator"], Actuator(), loop.command.unit, f"{path}: [actuator]"
@@ -116,7 +114,5 @@ def _own_sensors(loop: ClosedLoop) -> dict[str, Sensor]:
 
 def _read_numbers(entries: Mapping[str, Any], section: Key, usual: Part, unit: str, where: str) -> Part:
     """A copy of a part with the numbers that a section holds, in the unit of its signal, or in seconds."""
-    check_names("key", entries, section.keys, where)
-    units = {n: key.unit.format(signal=difference_unit(unit)) for n, key in section.keys.items()}
-    read: dict[str, Any] = {n: read_fixed_value(entries, n, units[n], where) for n in entries}
-    return construct_at(lambda: replace(usual, **read), where)
+    read = read_table(section.keys, entries, where, units={"signal": difference_unit(unit)})
+    return construct_at(lambda: replace(usual, **{n: read[n] for n in entries}), where)

@@ -1,31 +1,210 @@
-"""study.toml: the drive, the tuning, and the axes of a grid or the two requirements of a front; what to show."""
+"""study.toml: the drive, the tuning, and the axes, samples, corners or table of its cases, or a front; what to show."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.files.budget import MAX_CASES
-from pneuopt.files.drive import ambient_pressure
-from pneuopt.files.requirements import read_bound
-from pneuopt.files.study_cases import CASE_KEYS, SENSITIVITY_KEY
+from pneuopt.evaluation.monte_carlo import monte_carlo
+from pneuopt.evaluation.scenarios import SampleSpreads, corners
+from pneuopt.files.drive import ambient_pressure, read_fit
+from pneuopt.files.loop import (
+    CORNERS_KEY,
+    MAX_CASES,
+    SAMPLE_KEYS,
+    SAMPLED_KEY,
+    SAMPLES_KEY,
+    read_bound,
+    read_sample_spreads,
+    read_spreads,
+)
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_names, require
-from pneuopt.quantities.keys import Key, Takes, flag, table
+from pneuopt.quantities.keys import Key, Takes, check_sections, flag, read_table, table
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import count_gauge_from, read_unit, read_value, si_conversion, write_value
+from pneuopt.studies.cases import read_cases
+
+Cases = dict[str, dict[str, float]]
+CASE_KEYS: Mapping[str, Key] = {
+    "samples": replace(
+        SAMPLES_KEY,
+        keys={**SAMPLES_KEY.keys, "fit": flag("whether what the drive's fit.toml has estimated is drawn, too")},
+    ),
+    "corners": CORNERS_KEY,
+    "table": table(
+        "cases that a file lists",
+        {
+            "file": Key(
+                "a CSV file, a column a parameter: load.mass [kg]", Takes.TEXT, required=True, example='"plants.csv"'
+            )
+        },
+    ),
+}
+"""The sections that say which cases there are, in place of axes; a newcomer adds a row here and in `_READERS`."""
+SENSITIVITY_KEY = table(
+    "which tolerances matter: the shares of a metric's variance that parameters bring, in place of cases",
+    {
+        "count": Key(
+            "points, a power of two; so often each parameter and two more are evaluated",
+            Takes.COUNT,
+            usual=128,
+            least=16,
+        ),
+        "seed": SAMPLE_KEYS["seed"],
+        "local": flag("whether the slopes at the design are computed, too"),
+    },
+    others=SAMPLED_KEY,
+    named="parameter",
+)
+
+
+@dataclass(frozen=True)
+class CaseSource:
+    """What the reader of a section needs beside it.
+
+    Attributes
+    ----------
+    where : str
+        What messages begin with.
+    folder : Path
+        To which files are relative.
+    drive : Path
+    parameters : ParameterSet
+        The nominal values.
+    """
+
+    where: str
+    folder: Path
+    drive: Path
+    parameters: ParameterSet
+
+
+def read_study_cases(study: "Study", parameters: ParameterSet) -> Cases:
+    """Read the cases that a study's file asks for in place of a grid.
+
+    Parameters
+    ----------
+    study : Study
+        With `cases`.
+    parameters : ParameterSet
+        The nominal values.
+
+    Returns
+    -------
+    dict of str to dict of str to float
+
+    Raises
+    ------
+    InputError
+        The message names file, section and key.
+    """
+    ((kind, given),) = study.cases.items()
+    source = CaseSource(f"{study.path}: [{kind}]", study.path.parent, study.drive, parameters)
+    try:
+        cases = _READERS[kind](given, source)
+    except InputError as error:
+        raise error if str(study.path.parent) in str(error) else InputError(f"{source.where} {error}") from None
+    require(len(cases) <= MAX_CASES, f"{source.where} makes {len(cases)} cases, {MAX_CASES} are allowed; take fewer")
+    return cases
+
+
+@dataclass(frozen=True)
+class SensitivityTask:
+    """What a [sensitivity] asks for.
+
+    Attributes
+    ----------
+    spreads : mapping
+        As for `samples`.
+    count, seed : int
+    local : bool
+        Whether derivatives at the design are asked for, too.
+    """
+
+    spreads: SampleSpreads
+    count: int
+    seed: int
+    local: bool
+
+
+def read_sensitivity(study: "Study", parameters: ParameterSet) -> SensitivityTask:
+    """Read the [sensitivity] of a study.
+
+    Parameters
+    ----------
+    study : Study
+        With `sensitivity`.
+    parameters : ParameterSet
+        The nominal values.
+
+    Returns
+    -------
+    SensitivityTask
+
+    Raises
+    ------
+    InputError
+        The message names file, section and key.
+    """
+    entries, where = dict(study.sensitivity or {}), f"{study.path}: [sensitivity]"
+    read = read_table(SENSITIVITY_KEY.keys, entries, where, partial=True)
+    count, entries = read["count"], {n: entry for n, entry in entries.items() if n not in read}
+    require(count & (count - 1) == 0, f"{where} count must be a power of two, got {count}")
+    example = '"load.mass" = "30 %"'
+    require(len(entries) > 0, f"{where} has no parameter; add {example}")
+    spreads = read_sample_spreads(entries, where, parameters)
+    cases = count * (len(spreads) + 2)
+    require(cases <= MAX_CASES, f"{where} makes {cases} cases, {MAX_CASES} are allowed; take a smaller count")
+    return SensitivityTask(spreads, **read)
+
+
+def _read_samples(given: Mapping[str, Any], source: CaseSource) -> Cases:
+    where, draw = source.where, read_table(CASE_KEYS["samples"].keys, given, source.where, partial=True)
+    entries, from_fit = {n: entry for n, entry in given.items() if n not in draw}, draw["fit"]
+    fit = read_fit(source.drive) if from_fit else None
+    covariance = None if fit is None else fit.covariance
+    needed = f"{where} fit = true needs a fit.toml, which identify writes; {source.drive} has no estimates"
+    require(not from_fit or covariance is not None, needed)
+    return monte_carlo(
+        source.parameters,
+        draw["count"],
+        covariance=covariance,
+        estimates=None if fit is None else fit.estimates,
+        spreads=read_sample_spreads(entries, where, source.parameters),
+        seed=draw["seed"],
+        sampling=draw["sampling"],
+    )
+
+
+def _read_corners(given: Mapping[str, Any], source: CaseSource) -> Cases:
+    many = len(given) >= MAX_CASES.bit_length()
+    require(not many, f"{source.where}: {len(given)} parameters have too many corners; take [samples]")
+    return corners(source.parameters, read_spreads(given, source.where, source.parameters))
+
+
+def _read_table(given: Mapping[str, Any], source: CaseSource) -> Cases:
+    file = read_table(CASE_KEYS["table"].keys, given, source.where)["file"]
+    return read_cases(source.parameters, source.folder / file)
+
+
+_READERS: Mapping[str, Callable[[Mapping[str, Any], CaseSource], Cases]] = {
+    "samples": _read_samples,
+    "corners": _read_corners,
+    "table": _read_table,
+}
+
 
 _AXIS_EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
-_BETWEEN_EXAMPLE = 'between = ["settling_time", "peak_control"]'
 _DEFAULT_POINTS = 9  # designs of a front: each is a tuning, so more take long; fewer hide the bend
 _RANGE_KEYS: Mapping[str, Key] = {
     "from": Key("first value", unit="{own}", required=True, example='"2 kg"'),
     "to": Key("last value", unit="{own}", required=True, example='"8 kg"'),
-    "steps": Key("how many values", Takes.COUNT, required=True, example="4"),
+    "steps": Key("how many values", Takes.COUNT, required=True, example="4", least=2, most=MAX_CASES),
 }
 _SWEPT_AXIS = Key("a list of values, or a range", Takes.AXIS, "{own}", keys=_RANGE_KEYS, example='["4 kg", "8 kg"]')
 STUDY_KEYS: Mapping[str, Key] = {
@@ -45,9 +224,21 @@ STUDY_KEYS: Mapping[str, Key] = {
     "metrics": table(
         "what is shown of the cases",
         {
-            "band": Key("half width of the settling band; by default the tuning's", example='"2 %"'),
+            "band": Key(
+                "half width of the settling band, of the step; by default the tuning's",
+                example='"2 %"',
+                least=0.0,
+                most=1.0,
+                is_open=True,
+            ),
             "show": Key(
-                "metrics on screen and in the figure", Takes.LIST, usual=["SettlingTime", "Overshoot"], named="metric"
+                "metrics on screen and in the figure",
+                Takes.LIST,
+                usual=["SettlingTime", "Overshoot"],
+                named="metric",
+                of=Key("a metric", Takes.TEXT),
+                counts=(1, math.inf),
+                example='["SettlingTime", "Overshoot"]',
             ),
         },
     ),
@@ -59,8 +250,10 @@ STUDY_KEYS: Mapping[str, Key] = {
                 Takes.LIST,
                 required=True,
                 example='["settling_time", "peak_control"]',
+                of=Key("a requirement", Takes.TEXT),
+                counts=(2, 2),
             ),
-            "points": Key("designs of the front", Takes.COUNT, usual=_DEFAULT_POINTS),
+            "points": Key("designs of the front", Takes.COUNT, usual=_DEFAULT_POINTS, least=2, most=MAX_CASES),
             "lower": Key("where the second ends; by default the least that can be", unit="{own}", example='"100 N"'),
             "upper": Key("where it begins; by default the tuning's limit", unit="{own}", example='"250 N"'),
         },
@@ -172,13 +365,15 @@ def read_study(path: str | Path) -> Study:
         UnitError, UnknownNameError or other; the message names file, section and key.
     """
     path, sections = Path(path), read_toml(path).unwrap()
-    check_names("section", sections, STUDY_KEYS, str(path))
-    for name in sections:
-        require(isinstance(sections[name], dict), f"{path}: {name} must be a section, [{name}]")
-    for name, section in STUDY_KEYS.items():
-        if section.others is None:
-            check_names("key", sections.get(name, {}), section.keys, f"{path}: [{name}]")
-    axes, metrics = _flatten_axes(sections.get("axes", {})), sections.get("metrics", {})
+    check_sections(STUDY_KEYS, sections, path)
+    metrics, given = (
+        read_table(STUDY_KEYS[name].keys, sections.get(name, {}), f"{path}: [{name}]") for name in ("metrics", "study")
+    )
+    axes, band = _flatten_axes(sections.get("axes", {})), metrics["band"]
+    for name in ("pareto", "table"):  # read later, in the units of the drive
+        check_names("key", sections.get(name, {}), STUDY_KEYS[name].keys, f"{path}: [{name}]")
+    drive, tuning = (path.parent / given[key] for key in ("drive", "tuning"))
+    tune, batch = given["tune"], given["batch"]
     for name in ("axes", "metrics"):
         alone = name not in sections or "pareto" not in sections
         require(alone, f"{path}: [{name}] belongs to a grid, [pareto] to a front; leave one of them out")
@@ -186,11 +381,6 @@ def read_study(path: str | Path) -> Study:
     chosen = [*(["axes"] if axes else []), *cases, *(n for n in ("sensitivity", "pareto") if n in sections)]
     require(bool(chosen), f'{path}: no axis; add [axes] with "load.mass" = {_AXIS_EXAMPLE}')
     require(len(chosen) == 1, f"{path}: [{'], ['.join(chosen)}]: a study has cases of one kind; leave one of them out")
-    band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
-    require(band is None or 0 < band < 1, f'{path}: [metrics] band is a fraction of the step, "2 %" say, not {band}')
-    given = sections.get("study", {})
-    drive, tuning = (_file_path(given, key, path) for key in ("drive", "tuning"))
-    tune, batch = (_read_flag(given, key, path) for key in ("tune", "batch"))
     require(not (tune and batch), f"{path}: [study] a batch is of one design: leave out tune or batch")
     require(not (batch and "pareto" in sections), f"{path}: [study] batch is of cases; a front is tuned: leave it out")
     require(not (tune and "pareto" in sections), f"{path}: [study] tune belongs to a grid; a front is tuned anyway")
@@ -204,7 +394,7 @@ def read_study(path: str | Path) -> Study:
         tuning,
         axes,
         band,
-        _metric_names(metrics, path),
+        tuple(dict.fromkeys(metrics["show"])),
         sections.get("pareto"),
         tune,
         cases,
@@ -272,24 +462,18 @@ def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
         If a requirement is unknown or there twice, or a value cannot be read.
     """
     given, where = study.pareto or {}, f"{study.path}: [pareto]"
-    pair, points = given.get("between"), given.get("points", STUDY_KEYS["pareto"].keys["points"].usual)
-    two = isinstance(pair, list) and len(pair) == 2 and all(isinstance(key, str) for key in pair)
-    require(
-        two,
-        f"{where} between must name two requirements, {_BETWEEN_EXAMPLE}" + ("" if pair is None else f", got {pair}"),
-    )
-    first, second = (str(key) for key in pair or ())
+    plain = {n: key for n, key in STUDY_KEYS["pareto"].keys.items() if n not in ("lower", "upper")}
+    read = read_table(plain, given, where, partial=True)
+    first, second = read["between"]
     check_names("requirement", (first, second), units, f"{where} between")
-    require(first != second, f"{where} between names {first} twice; a front needs two requirements, {_BETWEEN_EXAMPLE}")
-    counts = isinstance(points, int) and not isinstance(points, bool) and 2 <= points <= MAX_CASES
-    require(counts, f"{where} points is the number of designs, from 2 to {MAX_CASES}, got {points!r}")
+    require(first != second, f"{where} between names {first} twice; a front needs two requirements")
     stated = [key for key in ("lower", "upper") if key in given]
     ends = {key: read_bound(second, given[key], units[second], f"{where} {key}") for key in stated}
     for key, value in ends.items():
         require(value > 0, f"{where} {key}: {second} must be positive, got {given[key]!r}")
     ordered = len(ends) < 2 or ends["lower"] < ends["upper"]
     require(ordered, f"{where} lower, {given.get('lower')}, is not below upper, {given.get('upper')}")
-    return Pareto((first, second), points, ends.get("lower"), ends.get("upper"))
+    return Pareto((first, second), read["points"], ends.get("lower"), ends.get("upper"))
 
 
 def _flatten_axes(entries: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -314,31 +498,5 @@ def _read_axis(name: str, entry: Any, unit: str, where: str) -> SweptAxis:
 
 
 def _read_range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
-    check_names("key", entry, _RANGE_KEYS, where)
-    for key in _RANGE_KEYS:
-        require(key in entry, f"{where} has no {key}; write {_AXIS_EXAMPLE}")
-    steps = entry["steps"]
-    counts = isinstance(steps, int) and not isinstance(steps, bool) and 2 <= steps <= MAX_CASES
-    require(counts, f"{where} steps is the number of values, from 2 to {MAX_CASES}, got {steps!r}")
-    first, last = (read_value(entry[key], unit, where=f"{where} {key}") for key in ("from", "to"))
-    return [float(v) for v in np.linspace(first, last, steps)]
-
-
-def _metric_names(metrics: Mapping[str, Any], path: Path) -> tuple[str, ...]:
-    show = metrics.get("show", STUDY_KEYS["metrics"].keys["show"].usual)
-    good = isinstance(show, list) and len(show) > 0 and all(isinstance(name, str) for name in show)
-    require(good, f'{path}: [metrics] show must be a list of names, ["SettlingTime", "Overshoot"], got {show!r}')
-    return tuple(dict.fromkeys(show))
-
-
-def _read_flag(given: Mapping[str, Any], key: str, path: Path) -> bool:
-    value = given.get(key, STUDY_KEYS["study"].keys[key].usual)
-    require(isinstance(value, bool), f"{path}: [study] {key} must be true or false, got {value!r}")
-    return bool(value)
-
-
-def _file_path(given: Mapping[str, Any], key: str, path: Path) -> Path:
-    if key not in given:
-        raise InputError(f'{path}: [study] has no {key}; write {key} = "{key}.toml"')
-    require(isinstance(given[key], str), f"{path}: [study] {key} must be a file's name, got {given[key]!r}")
-    return path.parent / str(given[key])
+    said = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
+    return [float(v) for v in np.linspace(said["from"], said["to"], said["steps"])]

@@ -153,11 +153,6 @@ def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter,
         entries[key] = inline_table({"value": entry or _format_value(found.value, found)} | fields)
 
 
-def read_fixed_value(entries: Mapping[str, Any], key: str, unit: str, where: str) -> float:
-    """A value that cannot be free [unit]."""
-    return read_value(entries[key], unit, where=f"{where} {key}")
-
-
 def construct_at(make: Callable[[], Made], where: str) -> Made:
     """Call `make`; an `InputError` that it raises gets the place in the file before its message."""
     try:

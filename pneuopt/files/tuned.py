@@ -11,11 +11,10 @@ import tomlkit
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.evaluate import metric_limits
 from pneuopt.files.certificate import CHECKSUM, checksum_section
-from pneuopt.files.drive import read_drive
+from pneuopt.files.drive import StoredFit, read_fit
 from pneuopt.files.loop import TUNABLE_SECTIONS
-from pneuopt.files.references import move_paths
 from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.files.tuning import TUNED_SECTIONS, read_tuning_table
+from pneuopt.files.tuning import TUNED_SECTIONS, move_paths, read_tuning_table
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
@@ -33,7 +32,7 @@ def write_tuned(
     result: "TuningResult",
     wire: Mapping[str, str] | None = None,
     *,
-    fit: str | Path | None = None,
+    fit: str | Path | StoredFit | None = None,
 ) -> None:
     """Write a tuning's file with the gains found: the user's text and comments, [certified], [status], [provenance].
 
@@ -47,7 +46,7 @@ def write_tuned(
     result : TuningResult
     wire : mapping of str to str, optional
         `Tuning.wire`.
-    fit : str or Path, optional
+    fit : str, Path or StoredFit, optional
         The plant's file that the result was made with. Without it the certificate gets no checksum: `pneuopt export`
         then takes the gains for uncertified.
 
@@ -76,8 +75,9 @@ def write_tuned(
     document["status"] = toml_table(status)
     document["provenance"] = toml_table(plain_value(result.provenance))
     if fit is not None:
-        _check_subject(document.unwrap(), path, fit, result, gains)
-        document[CHECKSUM] = checksum_section(document.unwrap(), path, fit)
+        stored = fit if isinstance(fit, StoredFit) else read_fit(fit)
+        _check_subject(document.unwrap(), path, stored, result, gains)
+        document[CHECKSUM] = checksum_section(document.unwrap(), path, stored)
     write_text(path, tomlkit.dumps(document))
 
 
@@ -92,16 +92,16 @@ def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: st
 
 
 def _check_subject(
-    table: Mapping[str, Any], path: str | Path, fit: str | Path, result: "TuningResult", gains: ParameterSet
+    table: Mapping[str, Any], path: str | Path, fit: StoredFit, result: "TuningResult", gains: ParameterSet
 ) -> None:
     """Refuse to bind a certificate to files that say something else than what was certified."""
-    drive, plant = read_drive(fit)
-    task = read_tuning_table(table, path, drive.system(), plant)
+    plant = fit.parameters
+    task = read_tuning_table(table, path, fit.drive.system(), plant)
     known = plant | task.parameters
     for n, p in known.items():
         same = n not in gains or isclose(gains.value(n), p.value, rel_tol=_SAME_GAINS)
         values = f"{write_value(p.value, p.unit)}, the result was made with {write_value(gains[n].value, p.unit)}"
-        require(same, f"{path}: {n} is {values}" if n in task.parameters else f"{fit}: {n} is {values}")
+        require(same, f"{path}: {n} is {values}" if n in task.parameters else f"{fit.path}: {n} is {values}")
     labels = [case.label for case in cases(task.references, task.scenarios(known), known)]
     told = "the result was made with other references or scenarios than its file has"
     require(labels == [str(n) for n in result.certified.columns], f"{path}: {told}")

@@ -1,47 +1,53 @@
-"""tuning.toml: the controller, what may be tuned, the steps to follow and what counts."""
+"""tuning.toml: the controller, what may be tuned, the references to follow and what counts."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from os.path import relpath
 from pathlib import Path
 from typing import Any
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Reference
+from pneuopt.control.moves import MotionPath, Move, MoveSequence
+from pneuopt.control.reference import Reference, Step
 from pneuopt.dynamics.centre import command_centre
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
-from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.sampling import further
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
-from pneuopt.files.budget import MAX_CASES
-from pneuopt.files.loop import TuningSections, read_loop_sections
-from pneuopt.files.method import read_method
-from pneuopt.files.references import read_references
-from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
-from pneuopt.files.spreads import read_draw, read_sample_spreads, read_spreads
-from pneuopt.files.toml import construct_at, read_fixed_value, read_toml
-from pneuopt.files.tuning_keys import (
+from pneuopt.files.loop import (
     ACCEPT_KEY,
     BUDGET_KEYS,
-    NO_HUNTING_KEY,
-    NO_HUNTING_KEYS,
+    LIMIT_KEYS,
+    MAX_CASES,
+    MOVE_KEYS,
+    PATH_KEYS,
+    REFERENCE_KEYS,
+    REQUIREMENTS_BY_KEY,
     SCENARIO_KEYS,
+    STEP_KEYS,
     TUNING_KEYS,
-    limit_key,
+    TuningSections,
     objective_key,
+    read_draw,
+    read_loop_sections,
+    read_method,
+    read_sample_spreads,
+    read_spreads,
+    signal_units,
 )
-from pneuopt.quantities.errors import InputError, UnitError, check_names, require
-from pneuopt.quantities.keys import Takes
+from pneuopt.files.toml import construct_at, read_toml
+from pneuopt.logs.read_log import read_log
+from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.keys import Key, Takes, check_sections, read_entry, read_named, read_table
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import read_value, write_value
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
 from pneuopt.tuning.method import Method
 
 TUNED_SECTIONS = ("certified", "wire", "status", "provenance", "checksum")
@@ -119,10 +125,7 @@ def read_tuning_table(
 ) -> Tuning:
     """Read a tuning from the table that its file holds; parameters and errors as for `read_tuning`."""
     table = {name: entry for name, entry in document.items() if name not in TUNED_SECTIONS}
-    check_names("section", table, TUNING_KEYS, str(path))
-    for name in (n for n, key in TUNING_KEYS.items() if key.takes is Takes.TABLE):
-        require(isinstance(table.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
-    require("pid" in table, f"{path}: no controller; add a section [pid]")
+    check_sections(TUNING_KEYS, table, path)
     centre = command_centre(plant, parameters or plant.parameters)
     loop, own = read_loop_sections(table, plant, path, centre)
     weights, limits = _read_objective(table, loop, path), _read_requirements(table, loop, path)
@@ -131,8 +134,8 @@ def read_tuning_table(
     scenarios, validation = (partial(read, *section) for read in (read_scenarios, read_validation_scenarios))
     method = read_method(table.get("method", {}), f"{path}: [method]")
     references = read_references(table.get("reference", []), loop, path)
-    max_steps = _read_budget(table.get("budget", {}), f"{path}: [budget]")
-    accept = _read_accept(table.get(ACCEPT_KEY, TUNING_KEYS[ACCEPT_KEY].usual), f"{path}: {ACCEPT_KEY}")
+    max_steps = read_table(BUDGET_KEYS, table.get("budget", {}), f"{path}: [budget]")["steps"]
+    accept = read_entry(TUNING_KEYS[ACCEPT_KEY], table.get(ACCEPT_KEY, []), f"{path}: {ACCEPT_KEY}")
     return Tuning(loop, references, own, spec, scenarios, validation, method, max_steps, accept, centre)
 
 
@@ -170,38 +173,17 @@ def _merge_scenarios(parts: Sequence[Mapping[str, float | Factor]]) -> dict[str,
     return {n: value for part in parts for n, value in part.items()}
 
 
-def _read_budget(table: Mapping[str, Any], where: str) -> float:
-    """Read how many steps a simulation may take."""
-    check_names("key", table, BUDGET_KEYS, where)
-    known = BUDGET_KEYS["steps"]
-    steps = read_fixed_value(table, "steps", known.unit, where) if "steps" in table else known.usual
-    require(steps > 0, f"{where} steps must be positive, got {steps:g}; {MAX_STEPS:g} is usual")
-    return steps
-
-
-def _read_accept(words: Any, where: str) -> tuple[Defect, ...]:
-    """Read the defects that the user accepts by name."""
-    proper = isinstance(words, list) and all(isinstance(word, str) for word in words)
-    require(proper, f'{where}: write defects in a list before the first section, {ACCEPT_KEY} = ["hunts"]')
-    known = TUNING_KEYS[ACCEPT_KEY].choices or {}
-    check_names("defect", words, known, where)
-    return tuple(known[word] for word in words)
-
-
 def _read_objective(table: TuningSections, loop: ClosedLoop, path: str | Path) -> dict[Requirement, float]:
     """Read [minimise]: requirements and their weights."""
     where = f"{path}: [minimise]"
     check_names("requirement", table.get("minimise", {}), REQUIREMENTS_BY_KEY, where)
-    weights = {}
+    weights, units = {}, _bare_units(loop)
     for key, entry in table.get("minimise", {}).items():
         spot = f"{where} {key}"
         require(isinstance(entry, dict), f"{spot}: write {key} = {{ weight = 1.0 }}; a limit belongs under [limits]")
-        keys = objective_key(key).keys
-        check_names("key", entry, keys, spot)
-        weight = read_fixed_value(entry, "weight", "1", spot) if "weight" in entry else keys["weight"].usual
-        require(0 < weight < float("inf"), f"{spot}: weight must be positive, got {weight:g}")
-        limit = {"max": None} if key == "step_envelope" else {}
-        weights[_make_requirement(key, entry, limit, loop.feedback.unit, spot)] = weight
+        own = read_table(objective_key(key).keys, entry, spot, units=units)
+        weight, limit = own.pop("weight"), {"max": None} if key == "step_envelope" else {}
+        weights[construct_at(partial(REQUIREMENTS_BY_KEY[key], **limit, **own), spot)] = weight
     return weights
 
 
@@ -210,66 +192,20 @@ def _read_requirements(
 ) -> tuple[Requirement | NoHunting, ...]:
     """Read [limits]: requirements with their bounds."""
     where = f"{path}: [limits]"
-    check_names("requirement", table.get("limits", {}), (*REQUIREMENTS_BY_KEY, NO_HUNTING_KEY), where)
-    units, found = bound_units(loop), list[Requirement | NoHunting]()
+    check_names("requirement", table.get("limits", {}), LIMIT_KEYS, where)
+    units, found = _bare_units(loop), list[Requirement | NoHunting]()
     for key, given in table.get("limits", {}).items():
         spot = f"{where} {key}"
-        if key == NO_HUNTING_KEY:
-            found.append(_read_no_hunting(given, loop.feedback.unit, spot))
-            continue
-        bound = REQUIREMENTS_BY_KEY[key].metric.sense.value
-        entry = given if isinstance(given, dict) else {bound: given}
-        check_names("key", entry, limit_key(key).keys, spot)
-        require(bound in entry or key == "step_envelope", f"{spot} has no {bound}")
-        at = f"{spot} {bound}" if entry is given else spot
-        limit = {bound: read_bound(key, entry[bound], units[key], at)} if bound in entry else {}
-        found.append(_make_requirement(key, entry, limit, loop.feedback.unit, spot))
+        known = LIMIT_KEYS[key]
+        kind: Callable[..., Requirement | NoHunting] = REQUIREMENTS_BY_KEY.get(key, NoHunting)
+        stated = {n: value for n, value in read_entry(known, given, spot, units).items() if value is not None}
+        found.append(construct_at(partial(kind, **stated), spot))
     return tuple(found)
 
 
-def _read_no_hunting(given: Any, measured: str, where: str) -> NoHunting:
-    """Read no_hunting: a duration, or a table with it and the repeatability."""
-    entry = given if isinstance(given, dict) else {"duration": given}
-    check_names("key", entry, NO_HUNTING_KEYS, where)
-    units = {"duration": "s", "repeatability": difference_unit(measured)}
-    at = {n: f"{where} {n}" if entry is given else where for n in entry}
-    values = {n: read_value(entry[n], units[n], where=at[n]) for n in entry}
-    return construct_at(lambda: NoHunting(**values), where)
-
-
-def _make_requirement(
-    key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], measured: str, where: str
-) -> Requirement:
-    """Make the requirement of a key, with its limit, and with its band or bounds where it has them."""
-    own: dict[str, Any] = dict(limit)
-    if key == "step_envelope":
-        own["bounds"] = _read_envelope(entry.get("bounds"), f"{where} bounds")
-    elif "band" in entry:
-        own["band"] = _read_band(entry, measured, where)
-    return construct_at(lambda: REQUIREMENTS_BY_KEY[key](**own), where)
-
-
-def _read_band(entry: Mapping[str, Any], measured: str, where: str) -> Band:
-    """Read a settling band: a fraction of the step, or a half width in the measured unit."""
-    try:
-        return read_fixed_value(entry, "band", "1", where)
-    except UnitError:
-        width = measured.partition("(")[0]
-    try:
-        return construct_at(lambda: Tolerance(read_fixed_value(entry, "band", width, where)), where)
-    except UnitError as error:
-        raise UnitError(f'{error}, or as a fraction of the step, band = "2 %"') from None
-
-
-def _read_envelope(table: Any, where: str) -> EnvelopeBounds:
-    """Read the rows of a StepEnvelope: an instant, a lower and an upper bound each."""
-    rows = table if isinstance(table, list) else []
-    proper = len(rows) > 0 and all(isinstance(row, list) and len(row) == 3 for row in rows)
-    require(proper, f'{where}: write instants with a lower and an upper bound, [["0 s", "-10 %", "110 %"], ...]')
-    return tuple(
-        (read_value(t, "s", where=where), read_value(low, "1", where=where), read_value(up, "1", where=where))
-        for t, low, up in rows
-    )
+def _bare_units(loop: ClosedLoop) -> dict[str, str]:
+    """The units of the loop's signals without (a) or (g): those of bounds and bands, which are differences."""
+    return signal_units(loop.command.unit, loop.feedback.unit.partition("(")[0])
 
 
 def _read_kinds(
@@ -307,3 +243,176 @@ def _read_kind(
         return tolerances(parameters, shares, new_count, seed=seed)
     except InputError as error:
         raise error if where in str(error) else InputError(f"{where} {error}") from None
+
+
+def read_references(entries: Any, loop: ClosedLoop, path: str | Path) -> tuple[Reference, ...]:
+    """Read the [[reference]] sections, in the units of the loop's signals.
+
+    Raises
+    ------
+    InputError
+        Or its kind; the message names file, section and key.
+    """
+    several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
+    require(several, f"{path}: write each reference as a section of its own, [[reference]]")
+    require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
+    found = tuple(_reference(e, loop, Path(path), k) for k, e in enumerate(entries, 1))
+    told = "two references step between the same values; tables tell them by that"
+    require(len({r.label for r in found}) == len(found), f"{path}: {told}")
+    return found
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A kind of reference: its name, its keys, the key by which it ends, and those without which it is none."""
+
+    name: str
+    keys: Mapping[str, Key]
+    end: str
+    needed: tuple[str, ...] = ()
+
+
+_STEP, _PATH = _Kind("step", STEP_KEYS, "horizon", ("step", "horizon")), _Kind("path", PATH_KEYS, "dwell")
+_MOVE = _Kind("move", MOVE_KEYS, "dwell", ("speed", "acceleration"))
+_REFERENCE_KINDS: Mapping[str, _Kind] = {"step": _STEP, "move": _MOVE, "moves": _MOVE, "path": _PATH}
+
+
+def move_paths(entries: Any, old: Path, new: Path) -> None:
+    """Rewrite the tables that [[reference]] sections name, beside a file in one folder, for a file in another.
+
+    Parameters
+    ----------
+    entries : list of dict
+        Of a TOML document, changed in place.
+    old, new : Path
+        The folders.
+    """
+    if old.resolve() == new.resolve():
+        return
+    for entry in entries:
+        if isinstance(entry.get("path"), str):
+            table = (old / entry["path"]).resolve()
+            try:
+                entry["path"] = Path(relpath(table, new.resolve())).as_posix()
+            except ValueError:  # on another drive of Windows
+                entry["path"] = table.as_posix()
+
+
+def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: int) -> Reference:
+    """Read one [[reference]]."""
+    where = f"{file}: [[reference]] {number}"
+    check_names("key", entry, REFERENCE_KEYS, where)
+    given = [key for key in _REFERENCE_KINDS if key in entry]
+    told = f"{where} has more than one of step, move, moves and path; write a section [[reference]] for each"
+    require(len(given) <= 1, told)
+    kind = _REFERENCE_KINDS[given[0]] if given else _STEP
+    for key in entry:
+        message = f"{where} {key} does not belong to a {kind.name}, which ends by {kind.end}"
+        message += f"; a {kind.name} has {', '.join(kind.keys)}"
+        require(key in kind.keys, message)
+    for key in ("horizon",) if "disturbance" in entry and kind is _STEP else kind.needed:
+        require(key in entry, f"{where} has no {key}")
+    known = _read_stated(kind.keys, entry, loop, where) | _circumstances(entry, loop, where)
+    if kind is _PATH:
+        table = file.parent / known.pop("path")
+        known = {"dwell": Move.dwell, **known}
+        return construct_at(lambda: read_path_of(loop.feedback.name, table, **known), f"{where} path")
+    if kind is _MOVE:
+        each = known.pop("moves", None) or [{"distance": known.pop("move")}]
+        return construct_at(lambda: _chain_moves(each, known), where)
+    return construct_at(lambda: Step(known.pop("step", 0.0), **known), where)
+
+
+def _read_stated(keys: Mapping[str, Key], entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Any]:
+    """What a reference states; of each of several moves, too, only what it states, for the rest is shared."""
+    units = signal_units(loop.command.unit, loop.feedback.unit)
+    plain = {n: key for n, key in keys.items() if key.takes is not Takes.TABLE}
+    values = read_table(plain, entry, where, units=units, partial=True)
+    if "moves" in entry:
+        own = [move if isinstance(move, dict) else {"distance": move} for move in entry["moves"]]
+        values["moves"] = [{n: all_[n] for n in said} for all_, said in zip(values["moves"], own, strict=True)]
+    return {n: values[n] for n in plain if n in entry}
+
+
+def _chain_moves(each: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) -> Reference:
+    """One move, or a sequence of moves that share the limits and the dwell that they have not for themselves."""
+    first, *others = each
+    if not others:
+        return Move(**{**settings, **first})
+    begins = {n: settings[n] for n in ("at", "initial", "start") if n in settings}
+    shared = {n: value for n, value in settings.items() if n not in begins and n != "disturbance"}
+    last = {"disturbance": settings.get("disturbance", {})}
+    moves = [Move(**{**shared, **own, **(last if k == len(others) else {})}) for k, own in enumerate(others, 1)]
+    return MoveSequence([Move(**{**begins, **shared, **first}), *moves])
+
+
+def _circumstances(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Any]:
+    """Read how the plant starts, and its disturbance."""
+    outputs = {q.name: q.unit for q in loop.plant.outputs}
+    begun = read_named(REFERENCE_KEYS["start"], entry.get("start", {}), outputs, f"{where} start")
+    return {"start": begun, "disturbance": _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")}
+
+
+def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
+    """Read a disturbance: the changes of parameters and inputs of the plant."""
+    if not isinstance(table, dict):
+        return read_named(REFERENCE_KEYS["disturbance"], table, {}, where)
+    flat = {f"{n}.{m}": v for n, e in table.items() if isinstance(e, dict) for m, v in e.items()}
+    flat |= {n: v for n, v in table.items() if not isinstance(v, dict)}
+    units = {q.name: q.unit for q in loop.plant.inputs} | {n: p.unit for n, p in loop.plant.parameters.items()}
+    changes = {n: unit.partition("(")[0] for n, unit in units.items()}
+    return read_named(REFERENCE_KEYS["disturbance"], flat, changes, where)
+
+
+PATH_CHANNELS = ("position_reference", "position", "speed_reference", "speed")
+"""Channels that may hold a path, the likelier first."""
+
+
+def read_path(path: str | Path, *, channel: str | None = None, **settings: Any) -> MotionPath:
+    """Read a path from a table of time and position, in any format and with any units that `read_log` takes.
+
+    Parameters
+    ----------
+    path : str or Path
+        Ten points at least; time may begin anywhere.
+    channel : str, optional
+        The channel that holds the points; by default the first of `PATH_CHANNELS` that the table has.
+    **settings
+        Fields of `MotionPath`: dwell, start, disturbance; its name is the file's.
+
+    Returns
+    -------
+    MotionPath
+
+    Raises
+    ------
+    InputError
+        Or its kind; the message names file, row and column.
+    """
+    log = read_log(path).trajectory
+    if channel is not None:
+        check_names("channel", [channel], log.names, str(path))
+    return _make_path(path, log, PATH_CHANNELS if channel is None else (channel,), settings)
+
+
+def read_path_of(measured: str, path: str | Path, **settings: Any) -> MotionPath:
+    """The path that a loop shall follow, from the column of its measured signal's reference, or of the signal itself.
+
+    Parameters
+    ----------
+    measured : str
+        The loop's measured signal.
+    path, **settings
+        As for `read_path`.
+    """
+    return _make_path(path, read_log(path).trajectory, (f"{measured}_reference", measured), settings)
+
+
+def _make_path(path: str | Path, log: Trajectory, channels: Sequence[str], settings: Mapping[str, Any]) -> MotionPath:
+    """The path in the first of the channels that the table has."""
+    found = [n for n in channels if n in log]
+    named = PATH_CHANNELS[1] if PATH_CHANNELS[1] in channels else channels[-1]
+    unit = {"position": " [mm]", "speed": " [m/s]"}.get(named, "")
+    require(bool(found), f"{path}: no column of a path; name one {named}{unit}")
+    points = log[found[0]]
+    return construct_at(lambda: MotionPath(log.t - log.t[0], points, name=Path(path).stem, **settings), str(path))

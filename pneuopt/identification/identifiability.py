@@ -20,7 +20,7 @@ from pneuopt.identification.examination import pose_problem
 from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion, with_values_in_words
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.profiles import Profile
-from pneuopt.identification.result import Verdict, join_names
+from pneuopt.identification.result import IdentifiableRow, Verdict, join_names
 from pneuopt.identification.widths import excerpts
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Mask
@@ -255,8 +255,7 @@ def _make_verdict(
             reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(excitation, [name]))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
-    columns = ["value", "stderr", "relative", "alone", "inflation", "identifiable"]
-    table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=list(IdentifiableRow.__annotations__))
     groups = (tuple(names[i] for i in np.flatnonzero(row)) for row in weak)
     harmful = tuple(group for group in groups if _is_harmful(table.loc[list(group)]))
     return Verdict(table, harmful, reasons, excitation=excitation)

@@ -36,7 +36,7 @@ from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
 from pneuopt.identification.profiled_optimum import fit_from_profiles
 from pneuopt.identification.repairs import input_behaviour, known_runs, window_runs
-from pneuopt.identification.result import ChosenWindow, IdentificationResult
+from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult
 from pneuopt.identification.review import review_fit
 from pneuopt.identification.statistics import confidence_interval
 from pneuopt.identification.width_bias import suspect_widths
@@ -58,10 +58,7 @@ from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, CpuBudget, Fit,
 if TYPE_CHECKING:
     import pandas as pd
 
-ESTIMATE_COLUMNS = [
-    *("value", "ci_low", "ci_high", "unit", "mark", "stderr", "dof", "range_low", "range_high"),
-    *("lower", "upper", "at_bound", "source"),
-]
+ESTIMATE_COLUMNS = [n for n in EstimateRow.__annotations__ if n != "note"]  # a note comes with the review
 NOTHING_IDENTIFIABLE = Status(
     Code.NOT_CONVERGED,
     ("the logs identify none of the free parameters by itself", "fix some, or log runs that separate them"),

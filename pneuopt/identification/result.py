@@ -3,7 +3,7 @@
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from pneuopt.dynamics.excitation import Excitation
 from pneuopt.identification.excitation import remedy
@@ -34,8 +34,7 @@ class Verdict(Shown):
     Attributes
     ----------
     table : DataFrame
-        A row a free parameter: value, expected standard deviation (`stderr`) and that over the value (`relative`), the
-        one if all others were known (`alone`), their ratio (`inflation`), and whether it is `identifiable`.
+        A row a free parameter, an `IdentifiableRow`.
     indistinguishable : tuple of tuple of str
         Groups of parameters of which the logs identify only a combination.
     reasons : mapping of str to str
@@ -148,6 +147,109 @@ class ChosenWindow:
         return f"{start}: {why}, and of {tried} these give the narrowest intervals"
 
 
+class EstimateRow(TypedDict):
+    """A row of `IdentificationResult.estimates`.
+
+    Attributes
+    ----------
+    value : float
+        The estimate; NaN where it is unidentifiable [unit].
+    ci_low, ci_high : float
+        Ends of the 95 % interval [unit].
+    unit : str
+        SI unit.
+    mark : str
+        How far the estimate can be trusted, a `Mark`.
+    stderr : float
+        Standard deviation [unit].
+    dof : float
+        Degrees of freedom of the standard deviation, for Student's t.
+    range_low, range_high : float
+        Ends of what it becomes when a part of the logs is left out [unit].
+    lower, upper : float
+        Bounds [unit].
+    at_bound : bool
+        Whether it is at a bound.
+    source : str
+        Source of the given value.
+    note : str
+        Why it has no interval.
+    """
+
+    value: float
+    ci_low: float
+    ci_high: float
+    unit: str
+    mark: str
+    stderr: float
+    dof: float
+    range_low: float
+    range_high: float
+    lower: float
+    upper: float
+    at_bound: bool
+    source: str
+    note: str
+
+
+class AgreementRow(TypedDict):
+    """A row of `IdentificationResult.fit`, by log and channel.
+
+    Attributes
+    ----------
+    rmse : float
+        Root mean square of the residuals [unit].
+    nrmse : float
+        Root mean square over the channel's variation [1].
+    fit_percent : float
+        Share of the variation that is explained [%].
+    samples : float
+        Number that was compared.
+    free_run_rmse, free_run_nrmse : float
+        The same of a simulation from the log's start to its end.
+    noise : float
+        Standard deviation of the channel's noise [unit].
+    unit : str
+        SI unit of the channel.
+    """
+
+    rmse: float
+    nrmse: float
+    fit_percent: float
+    samples: float
+    free_run_rmse: float
+    free_run_nrmse: float
+    noise: float
+    unit: str
+
+
+class IdentifiableRow(TypedDict):
+    """A row of `Verdict.table`.
+
+    Attributes
+    ----------
+    value : float
+        Value for which it holds [unit].
+    stderr : float
+        Standard deviation that the logs promise [unit].
+    relative : float
+        Standard deviation over the value [1].
+    alone : float
+        Standard deviation if all others were known [unit].
+    inflation : float
+        Ratio of the two [1].
+    identifiable : bool
+        Whether the logs identify it.
+    """
+
+    value: float
+    stderr: float
+    relative: float
+    alone: float
+    inflation: float
+    identifiable: bool
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class IdentificationResult(Result):
     """The result of `identify`: estimates, intervals, fitted trajectories and status; printed, it is its `summary()`.
@@ -159,18 +261,17 @@ class IdentificationResult(Result):
         does an unidentifiable one, unless the logs reject that value or identify it only together with another: then
         it has the value that belongs to the other estimates.
     estimates : DataFrame
-        A row a free parameter ("name[log]" for one of a log): value, ci_low, ci_high (95 %), unit, mark (a `Mark`),
-        stderr, dof (degrees of freedom of that, for Student's t), range_low, range_high, lower, upper, at_bound,
-        source, note. The value is NaN where the mark is "unidentifiable". No interval there, at a bound, without
-        convergence, or with a status of `Code.MISFIT`. Where a linear interval would be wrong it is the profile
-        likelihood's, infinite at an open end. The range is what the estimate becomes when a sixth of the logs' time,
-        any log, or a class of the motion on which the residuals depend is left out (linearised).
-        An unidentifiable parameter may lie a factor of ten from where it is held: the other intervals allow for that.
+        A row a free parameter ("name[log]" for one of a log), an `EstimateRow`. The value is NaN where the mark is
+        "unidentifiable". No interval there, at a bound, without convergence, or with a status of `Code.MISFIT`. Where a
+        linear interval would be wrong it is the profile likelihood's, infinite at an open end. The range is what the
+        estimate becomes when a sixth of the logs' time, any log, or a class of the motion on which the residuals depend
+        is left out (linearised). An unidentifiable parameter may lie a factor of ten from where it is held: the other
+        intervals allow for that.
     covariance : DataFrame
         Of the estimates, as wide as their intervals count the residuals (`stderr`); NaN for what has no interval.
     fit : DataFrame
-        A row a log and channel: rmse, nrmse, fit_percent, samples, noise, unit; free_run_rmse and free_run_nrmse of a
-        simulation from the log's fitted start to its end, which gaps or windows do not help (NaN where it diverges).
+        A row a log and channel, an `AgreementRow`; free_run_rmse and free_run_nrmse are of a simulation from the log's
+        fitted start to its end, which gaps or windows do not help (NaN where it diverges).
     trajectories : mapping of str to Trajectory
         Fitted states and outputs of each log.
     status : Status

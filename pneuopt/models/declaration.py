@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
 from pneuopt.dynamics.system import System
-from pneuopt.quantities.errors import InputError, check_names, require
-from pneuopt.quantities.keys import Key, Takes
+from pneuopt.quantities.keys import Key, Takes, read_table
 
 Sections = Mapping[str, Mapping[str, Any]]
 """Contents of a drive's file as written, by section and key."""
@@ -60,7 +59,7 @@ class Alias:
 
 
 @dataclass(frozen=True)
-class Structure:
+class DriveSections:
     """Sections of a drive's file, read key by key against their declaration.
 
     Parameters
@@ -86,31 +85,12 @@ class Structure:
         return f"{self.location(section, key)}: [{section}] {key}"
 
     def options(self, section: str) -> dict[str, Any]:
-        """Value of each declared key of a section, the usual one where the file leaves the key out.
+        """Values of a section's declared keys by `read_table`; the parameters beside them are passed over."""
 
-        Raises
-        ------
-        InputError
-            If a required key is missing, or a value is not one that the key takes.
-        """
-        return {key: self.option(section, key) for key in self.declared[section]}
+        def where(key: str) -> str:
+            return self.place(section, key) if key else f"{self.location(section, '')}: [{section}]"
 
-    def option(self, section: str, key: str) -> Any:
-        """Value of one key; see `options`."""
-        known = self.declared[section][key]
-        if not self.has(section, key):
-            if known.required:
-                words = ", ".join(known.choices or ())
-                where = self.location(section, "")
-                raise InputError(f'{where}: [{section}] has no {key}; write {key} = "...", one of: {words}')
-            return known.usual if known.choices is None else known.choices[known.usual]
-        entry = self.written[section][key]
-        proper = type(entry) in known.takes.types
-        require(proper, f"{self.place(section, key)} must be {known.takes.value}, got {entry!r}")
-        if known.choices is None:
-            return entry
-        check_names(key, [entry], known.choices, f"{self.location(section, key)}: [{section}]")
-        return known.choices[entry]
+        return read_table(self.declared[section], self.written.get(section, {}), where, partial=True)
 
 
 @dataclass(frozen=True)
@@ -164,7 +144,7 @@ class DriveKind:
     sections : mapping
         Sections that such a file may have, with their keys; a section of parameters alone has no keys.
     build : callable
-        Builds the drive from a `Structure`.
+        Builds the drive from a `DriveSections`.
     any_friction : bool
         Whether ``replace(drive, friction=...)`` works with every friction law.
     first : FirstFiles, optional
@@ -173,7 +153,7 @@ class DriveKind:
 
     name: str
     sections: Mapping[str, Mapping[str, Key]]
-    build: Callable[[Structure], Drive]
+    build: Callable[[DriveSections], Drive]
     aliases: tuple[Alias, ...] = ()
     any_friction: bool = True
     first: FirstFiles | None = None

@@ -133,7 +133,7 @@ class MotionDrive:
 FORCE_KIND = DriveKind(
     ForceDrive.kind,
     {"load": LOAD_KEYS, "friction": FRICTION_KEYS, "ambient": {}},
-    lambda structure: ForceDrive(read_friction(structure), Load(**structure.options("load"))),
+    lambda sections: ForceDrive(read_friction(sections), Load(**sections.options("load"))),
     first=FirstFiles(
         options={"friction": {"model": "stribeck"}},
         unknowns=("load.mass", "load.force", *STRIBECK_UNKNOWNS),
@@ -152,7 +152,7 @@ MOTION_KIND = DriveKind(
         "friction": FRICTION_KEYS,
         "ambient": {},
     },
-    lambda structure: MotionDrive(read_friction(structure), **structure.options("rig")),
+    lambda sections: MotionDrive(read_friction(sections), **sections.options("rig")),
 )
 
 AMBIENT_PARAMETERS = ParameterSet(

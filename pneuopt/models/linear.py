@@ -1,16 +1,16 @@
 """Transfer-function plants with named signals: first order, second order, integrator; dead time."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.models.dead_time import delay_line, pade_delay
-from pneuopt.models.declaration import DriveKind, FirstFiles, Structure
+from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drive import FORCE, POSITION, SPEED
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
@@ -177,27 +177,27 @@ class Integrator:
 Plant = FirstOrder | SecondOrder | Integrator
 
 
-def _build_plant(structure: Structure) -> Plant:
-    options = structure.options("plant")
+def _build_plant(sections: DriveSections) -> Plant:
+    options = sections.options("plant")
     signals = [options["input"], options["output"]]
-    check_names("channel", signals, CHANNELS, f"{structure.location('plant', '')}: [plant]")
-    u, y = (_signal(structure, key) for key in ("input", "output"))
+    check_names("channel", signals, CHANNELS, f"{sections.location('plant', '')}: [plant]")
+    u, y = (_signal(sections, options, key) for key in ("input", "output"))
     order = options["pade_order"]
     if order is None:
-        order = USUAL_PADE_ORDER if structure.has("plant", "dead_time") else 0
+        order = USUAL_PADE_ORDER if sections.has("plant", "dead_time") else 0
     if options["model"] is SecondOrder:
-        return SecondOrder(order, read_friction(structure) if structure.has("friction") else None, u, y)
+        return SecondOrder(order, read_friction(sections) if sections.has("friction") else None, u, y)
     plant: Plant = options["model"](order, u, y)
     return plant
 
 
-def _signal(structure: Structure, key: str) -> Quantity:
+def _signal(sections: DriveSections, options: Mapping[str, Any], key: str) -> Quantity:
     """The input or the output, in the channel's unit or in another one: that of a transducer, say."""
-    name, unit = structure.option("plant", key), structure.option("plant", f"{key}_unit")
+    name, unit = options[key], options[f"{key}_unit"]
     if unit is None:
         known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
         return known.get(name, Quantity(name, CHANNELS[name]))
-    where = structure.place("plant", f"{key}_unit")
+    where = sections.place("plant", f"{key}_unit")
     require(read_si(f"1 {unit}", where=where) == 1.0, f'{where}: {unit!r} is no SI unit without a prefix, such as "V"')
     return Quantity(name, unit)
 
@@ -220,7 +220,11 @@ LINEAR_KIND = DriveKind(
                 "unit of the output, of a transducer, say", Takes.TEXT, example='"V"', condition=_OWN_UNIT
             ),
             "pade_order": Key(
-                "order of the dead time's approximant, 0 to 5; 3 with a dead time", Takes.COUNT, example="3"
+                "order of the dead time's approximant, 0 to 5; 3 with a dead time",
+                Takes.COUNT,
+                example="3",
+                least=0,
+                most=5,
             ),
         },
         "friction": FRICTION_KEYS,

@@ -163,7 +163,7 @@ def _turning_run(run: Trajectory) -> Trajectory:
 ROTARY_KIND = DriveKind(
     RotaryDrive.kind,
     {"load": {}, "friction": FRICTION_KEYS},
-    lambda structure: RotaryDrive(read_friction(structure)),
+    lambda sections: RotaryDrive(read_friction(sections)),
     first=FirstFiles(
         options={"friction": {"model": "stribeck"}},
         unknowns=("load.inertia", "load.torque", *STRIBECK_UNKNOWNS),

@@ -1,15 +1,18 @@
-"""`Key`: the declaration of a key of a file; its reader reads by it, and templates, schemas and key lists come from it.
+"""`Key`: the declaration of a key of a file; `read_table` reads by it; templates, schemas and key lists come from it.
 
 A file is a table whose keys are its sections, a section is a table of keys, and so on down.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from math import inf
 from typing import Any
 
+from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import Parameter
+from pneuopt.quantities.units import read_value
 
 
 class Takes(Enum):
@@ -52,6 +55,10 @@ _TYPES: Mapping[Takes, tuple[type, ...]] = {
 }
 
 
+MAX_SHOWN_ENTRY = 60
+"""Length of a wrong entry in a message [character]: more hides what would be right."""
+
+
 @dataclass(frozen=True)
 class Key:
     """A key of a file: what it means, what it takes, and what holds where the file leaves it out.
@@ -73,13 +80,23 @@ class Key:
     others : Key, optional
         What the further keys of a table take: names that come from the user, each a `named`.
     named : str
-        What such a name is: "parameter".
+        What such a name, or a word of a list, is: "parameter".
     example : str
         As a file may write it; needed where nothing is usual.
     source : str
         Where the usual value comes from.
     condition : str
         When the file may have the key: 'form = "standard"'.
+    least, most : float
+        Bounds of a number, or of a whole one [unit].
+    is_open : bool
+        Whether the bounds themselves are excluded.
+    of : Key, optional
+        What each entry of a list is.
+    counts : (int, float)
+        Least and largest number of entries of a list.
+    read : callable, optional
+        ``read(entry, where, units)`` returns the value of an entry that no other key is like; it raises `InputError`.
     """
 
     meaning: str
@@ -94,6 +111,32 @@ class Key:
     example: str = ""
     source: str = ""
     condition: str = ""
+    least: float = -inf
+    most: float = inf
+    is_open: bool = False
+    of: "Key | None" = None
+    counts: tuple[int, float] = (0, inf)
+    read: "Callable[[Any, str, Mapping[str, str]], Any] | None" = None
+
+    @property
+    def usual_value(self) -> Any:
+        """What the reader gives where the file leaves the key out."""
+        if self.takes is Takes.TABLE and self.usual is None and not any(key.required for key in self.keys.values()):
+            return {name: key.usual_value for name, key in self.keys.items()}
+        if isinstance(self.usual, list):
+            return tuple(self.choices[word] for word in self.usual) if self.choices else tuple(self.usual)
+        return self.choices[self.usual] if self.choices and self.usual is not None else self.usual
+
+    @property
+    def limits(self) -> str:
+        """Its bounds in words, "from 2 to 9"; empty where it has none."""
+        if self.is_open and self.least == 0 and self.most == inf:
+            return "positive"
+        lower, upper = ("above", "below") if self.is_open else ("at least", "at most")
+        if not self.is_open and abs(self.least) < inf and self.most < inf:
+            return f"from {self.least:.10g} to {self.most:.10g}"
+        parts = [f"{lower} {self.least:.10g}"] if self.least > -inf else []
+        return " and ".join(parts + ([f"{upper} {self.most:.10g}"] if self.most < inf else []))
 
     def walk(self, prefix: str = "") -> Iterator[tuple[str, "Key"]]:
         """Yield each key below this one by its full name: "pid.Kp"; a key that the user names, as "noise.<channel>"."""
@@ -101,6 +144,156 @@ class Key:
         for name, key in {**self.keys, **named}.items():
             yield f"{prefix}{name}", key
             yield from key.walk(f"{prefix}{name}.")
+
+
+def read_table(
+    keys: Mapping[str, Key],
+    toml: Mapping[str, Any],
+    where: str | Callable[[str], str],
+    *,
+    units: Mapping[str, str] | None = None,
+    partial: bool = False,
+) -> dict[str, Any]:
+    """Read a table by the keys that declare it.
+
+    Parameters
+    ----------
+    keys : mapping of str to Key
+    toml : mapping
+        The table as it was parsed.
+    where : str or callable
+        What an error's message begins with: file and section; or ``where(key)``: file, line, section and key, of no
+        key file, line and section.
+    units : mapping of str to str, optional
+        What the words in braces of the keys' units stand for.
+    partial : bool
+        Whether the table has keys that another reader reads; they are passed over.
+
+    Returns
+    -------
+    dict of str to object
+        Of every declared key its value: a number in the key's unit, what a word stands for, a tuple of a list, a dict
+        of a table; what holds without it where the table leaves it out.
+
+    Raises
+    ------
+    InputError
+        UnitError, UnknownNameError or other, if a key is unknown or missing, or has a value that it does not take.
+
+    Examples
+    --------
+    >>> keys = {"speed": Key("how fast", unit="m/s", least=0.0), "softly": flag("whether it brakes softly")}
+    >>> read_table(keys, {"speed": "20 mm/s"}, "move.toml: [move]")
+    {'speed': 0.02, 'softly': False}
+    """
+
+    def place(key: str) -> str:
+        return where(key) if callable(where) else f"{where} {key}" if key else where
+
+    if not partial:
+        for name in toml:
+            check_names("key", [name], keys, place("") if not callable(where) else where(str(name)))
+    missing = next((name for name, key in keys.items() if key.required and name not in toml), None)
+    if missing is not None:
+        known = keys[missing]
+        words = known.example or (f'"...", one of: {", ".join(known.choices)}' if known.choices else '"..."')
+        raise InputError(f"{place('')} has no {missing}; write {missing} = {words}")
+    return {
+        name: read_entry(key, toml[name], place(name), units) if name in toml else key.usual_value
+        for name, key in keys.items()
+    }
+
+
+def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None = None) -> Any:
+    """Read the entry of one key; `where` says file, section and key. Values and errors are `read_table`'s."""
+    units = units or {}
+    if key.read is not None:
+        return key.read(entry, where, units)
+    if key.takes is Takes.PARAMETER and key.keys:  # a value that stands for the first key of its table
+        single = not isinstance(entry, dict)
+        fields = {next(iter(key.keys)): entry} if single else entry
+        return read_table(key.keys, fields, (lambda _: where) if single else where, units=units)
+    if key.takes is Takes.NUMBER:
+        return _in_bounds(key, read_value(entry, key.unit.format_map(units), where=where), entry, where)
+    if key.takes is Takes.SAMPLES:
+        return _read_samples(entry, where)
+    proper = type(entry) in key.takes.types
+    require(proper, f"{where} must be {key.takes.value}, got {repr(entry)[:MAX_SHOWN_ENTRY]}{_remedy(key, where)}")
+    if key.takes is Takes.COUNT:
+        return _in_bounds(key, entry, entry, where)
+    if key.takes is Takes.LIST:
+        return _read_list(key, entry, where, units)
+    if key.takes is Takes.TABLE and key.keys:
+        return read_table(key.keys, entry, where, units=units)
+    if key.choices is not None:
+        section, _, name = where.rpartition(" ")
+        check_names(key.named or name, [entry], key.choices, where if key.named else section.rstrip(":"))
+        return key.choices[entry]
+    return entry
+
+
+def read_named(key: Key, toml: Any, units: Mapping[str, str], where: str) -> dict[str, Any]:
+    """Read a table whose keys the user names.
+
+    Parameters
+    ----------
+    key : Key
+        Of the table; each entry is one of its `others`.
+    toml : object
+        As it was parsed.
+    units : mapping of str to str
+        By each name that there may be its unit, for which "{own}" stands.
+    where : str
+        File, section and key.
+    """
+    require(isinstance(toml, dict), f"{where} must be {Takes.TABLE.value}, got {toml!r}{_remedy(key, where)}")
+    check_names(key.named, toml, units, where)
+    assert key.others is not None
+    return {n: read_entry(key.others, entry, f"{where} {n}", {"own": units[n]}) for n, entry in toml.items()}
+
+
+def check_sections(sections: Mapping[str, Key], toml: Mapping[str, Any], path: object) -> None:
+    """Refuse an unknown section of a file, one that is no table, and a file without a required one."""
+    check_names("section", toml, sections, str(path))
+    for name, key in sections.items():
+        if key.takes is Takes.TABLE:
+            require(isinstance(toml.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
+        head = f"[[{name}]]" if key.takes is Takes.TABLES else f"[{name}]"
+        require(name in toml or not key.required, f"{path}: no {name}; add a section {head}: {key.meaning}")
+
+
+def _in_bounds(key: Key, value: Any, entry: Any, where: str) -> Any:
+    inside = key.least < value < key.most if key.is_open else key.least <= value <= key.most
+    require(inside, f"{where} must be {key.limits}, got {entry}")
+    return value
+
+
+def _read_list(key: Key, entries: list[Any], where: str, units: Mapping[str, str]) -> tuple[Any, ...]:
+    least, most = key.counts
+    count = f"{least}" if least == most else f"{least} at least" if most == inf else f"{least} to {most:g}"
+    told = f"{where} must be a list of {count}, got {entries}{_remedy(key, where)}"
+    require(least <= len(entries) <= most, told)
+    item = key.of or (Key("", Takes.TEXT, choices=key.choices, named=key.named) if key.choices else None)
+    spots = [f"{where} {k}" if isinstance(entry, dict) else where for k, entry in enumerate(entries, 1)]
+    return tuple(
+        entry if item is None else read_entry(item, entry, spot, units)
+        for spot, entry in zip(spots, entries, strict=True)
+    )
+
+
+def _read_samples(entry: Any, where: str) -> int:
+    """A number of samples, "1 sample" or 1."""
+    match = re.fullmatch(r"\s*(\d+)\s*samples?\s*", entry) if isinstance(entry, str) else None
+    whole = type(entry) is int
+    require(
+        match is not None or whole,
+        f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"',
+    )
+    return int(match[1]) if match else int(entry)
+
+
+def _remedy(key: Key, where: str) -> str:
+    return f"; write {where.rpartition(' ')[2]} = {key.example}" if key.example else ""
 
 
 def flag(meaning: str, usual: bool = False) -> Key:
@@ -118,8 +311,8 @@ def table(meaning: str, keys: Mapping[str, Key], **options: Any) -> Key:
     return replace(Key(meaning, Takes.TABLE, keys=keys), **options)
 
 
-def first_sentence(kind: type) -> str:
-    """What a class is, by its docstring; empty where Python was told to leave docstrings out."""
+def first_sentence(kind: object) -> str:
+    """What a class or a function is, by its docstring; empty where Python was told to leave docstrings out."""
     first = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
     return _plain(re.split(r"[.;] ", first)[0])
 

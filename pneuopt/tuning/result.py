@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from math import isfinite, isnan, nan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 # Room left of a limit, a fraction of it, within which it counts as active. A smaller one misses limits that the
 # search's margin keeps a design away from; a larger one names limits that hold nothing back.
 ACTIVE_ROOM = 0.02
-REQUIREMENT_COLUMNS = ("claimed", "certified", "allowed", "room", "case")
 RELAXATION_COLUMNS = ("asked", "needed", "share")
 MIN_DERIVATIVE_RATIO = 0.01
 """Td/Tf below which a derivative adds less than 1 % to Kp at any frequency: its time would be a riddle."""
@@ -48,6 +47,36 @@ class Refusal(Enum):
 
     END_STOP = "a response ran into an end stop"
     LATE = "only what comes after a horizon"
+
+
+class RequirementRow(TypedDict):
+    """A row of `TuningResult.requirements`, an objective or a limit at its worst over the cases.
+
+    Attributes
+    ----------
+    claimed : float
+        Value by the search, as the user writes it: a fraction where `Overshoot.max` is one.
+    certified : float
+        Value by the independent simulation.
+    allowed : float
+        Limit; NaN where there is none.
+    room : float
+        What is left of the limit as a fraction of it; negative where it is broken [1].
+    case : str
+        Where it is worst.
+    active : bool
+        Whether it holds the objective back.
+    """
+
+    claimed: float
+    certified: float
+    allowed: float
+    room: float
+    case: str
+    active: bool
+
+
+REQUIREMENT_COLUMNS = tuple(n for n in RequirementRow.__annotations__ if n != "active")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,10 +93,7 @@ class TuningResult(Result):
         measured signal's unit], and what else was asked for, as `evaluate` has it; by the search's own simulation, and
         by the independent one.
     requirements : DataFrame
-        A row a requirement, objective or limit, at its worst over the cases: "claimed", "certified" and "allowed" as
-        the user writes them (a fraction where `Overshoot.max` is one; NaN where there is no limit), "room", what is
-        left of the limit as a fraction of it, negative where it is broken, "active", whether it holds the objective
-        back, and "case", where it is worst.
+        A row a requirement, objective or limit, a `RequirementRow`.
     relaxations : DataFrame
         Where no design found keeps all limits: a row a limit with what is "asked", and what alone is "needed" for a
         design that keeps the others (NaN where none was found), "share", how far that is from what is asked as a

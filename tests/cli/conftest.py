@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from pneuopt.files.json_outputs import OUTPUTS, output_schema
+from pneuopt.files.outputs import OUTPUTS, output_schema
 from pneuopt.quantities.output import write_json
 
 

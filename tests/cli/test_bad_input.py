@@ -141,7 +141,7 @@ BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
     "disturbance of nothing": (
         TUNE,
         edit("tuning.toml", 'horizon = "0.3 s"', 'horizon = "0.3 s"\ndisturbance = { "load.froce" = "5 N" }'),
-        "[[reference]] 1 disturbance: unknown parameter or input of the plant 'load.froce'; did you mean 'load.force'?",
+        "[[reference]] 1 disturbance: unknown parameter or input 'load.froce'; did you mean 'load.force'?",
     ),
     "window": (IDENTIFY + " --window 0.001", None, "windows of 0.001 s hold 0 samples of run_01"),
     "what to simulate": ("simulate drive.toml -o x.csv", None, "give either a tuning file or --log"),

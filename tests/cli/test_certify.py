@@ -135,3 +135,25 @@ def test_the_best_of_a_refused_tuning_has_its_own_gains_and_no_certificate(place
     assert "NOT CERTIFIED: its tuning ended so" in text
     (gain,) = re.findall(r'Kp = \{ value = "(\S+) ', Path("failed_best.toml").read_text("utf-8"))
     assert f"parallel: Kp = {gain} " in text
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "tune fit.toml given.toml -o new.toml --rig rig.toml --report page.html",
+        "certify fit.toml tuned.toml -o new.toml --rig rig.toml --report page.html",
+        "simulate fit.toml tuned.toml --report page.html",
+        "export fit.toml tuned.toml --to st -o out",
+    ],
+)
+def test_a_fit_is_parsed_once_a_command(place: Path, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("rig.toml").write_text("[actuator]\n", "utf-8")
+    parsed, parse = list[str](), tomlkit.parse
+
+    def counted(text: str) -> tomlkit.TOMLDocument:
+        parsed.append(text)
+        return parse(text)
+
+    monkeypatch.setattr(tomlkit, "parse", counted)
+    assert run(command).exit_code in (0, 1)
+    assert parsed.count(Path("fit.toml").read_text("utf-8")) == 1

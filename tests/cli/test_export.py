@@ -8,6 +8,7 @@ from typer.testing import CliRunner, Result
 
 from pneuopt.cli.app import app
 from pneuopt.files.certificate import checksum_section
+from pneuopt.files.drive import read_fit
 from pneuopt.files.toml import read_toml
 
 DRIVE = """
@@ -66,7 +67,7 @@ def write_with_checksum(text: str) -> None:
     path = Path("tuned.toml")
     path.write_text(text, "utf-8")
     document = read_toml(path)
-    document["checksum"] = checksum_section(document.unwrap(), path, "fit.toml")
+    document["checksum"] = checksum_section(document.unwrap(), path, read_fit("fit.toml"))
     path.write_text(tomlkit.dumps(document), "utf-8")
 
 

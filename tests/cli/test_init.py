@@ -15,7 +15,7 @@ from pneuopt.cli.init import Asker
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import FIT_SECTIONS, read_drive
-from pneuopt.files.key_list import KeyRow, list_keys
+from pneuopt.files.keys import KeyRow, list_keys
 from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_study
 from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning

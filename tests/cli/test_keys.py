@@ -4,8 +4,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pneuopt.cli.app import app
-from pneuopt.files.json_outputs import OUTPUTS
-from pneuopt.files.key_list import list_keys
+from pneuopt.files.keys import list_keys
+from pneuopt.files.outputs import OUTPUTS
 
 
 def run(*words: str, width: int = 80) -> tuple[int, str]:

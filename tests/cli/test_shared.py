@@ -6,6 +6,7 @@ import pytest
 
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import Outputs, finish, warn_of_status
+from pneuopt.files.drive import read_fit
 from pneuopt.quantities.status import Code, Status
 
 
@@ -28,8 +29,9 @@ def test_estimates_that_may_be_biased_are_named_by_later_commands(
     mark: str, warns: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "fit.toml"
-    path.write_text(f'[estimates]\n"friction.coulomb" = {{ mark = "{mark}" }}\n', encoding="utf-8")
-    warn_of_status(path)
+    head = '[drive]\nkind = "force"\n[friction]\nmodel = "coulomb"\n'
+    path.write_text(f'{head}[estimates]\n"friction.coulomb" = {{ mark = "{mark}" }}\n', encoding="utf-8")
+    warn_of_status(read_fit(path))
     assert ("may be biased by a model error: friction.coulomb" in capsys.readouterr().err) is warns
 
 

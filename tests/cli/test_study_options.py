@@ -149,7 +149,7 @@ def test_a_study_tells_which_tolerances_matter(folder: Path, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("section", "said"),
     [
-        ("count = 20\nload.mass = '30 %'", "[sensitivity] count: a power of two, 16 or more, not 20"),
+        ("count = 20\nload.mass = '30 %'", "[sensitivity] count must be a power of two, got 20"),
         ("count = 16", '[sensitivity] has no parameter; add "load.mass" = "30 %"'),
         ("local = 1\nload.mass = '30 %'", "[sensitivity] local must be true or false, got 1"),
         ("load.mas = '30 %'", "unknown parameter 'load.mas'"),

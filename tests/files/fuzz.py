@@ -20,8 +20,8 @@ import tomlkit
 from pneuopt.cli.init import run_init
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.files.certificate import check_certificate, checksum_section
-from pneuopt.files.drive import read_covariance, read_drive, read_estimates, read_marks, read_status
-from pneuopt.files.requirements import bound_units
+from pneuopt.files.drive import read_drive, read_fit
+from pneuopt.files.loop import bound_units
 from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_pareto, read_study
 from pneuopt.files.tuning import Tuning, read_tuning
@@ -117,7 +117,7 @@ def _write_base(kind: str, folder: Path) -> Base:
     drive, parameters = read_drive(folder / "drive.toml")
     (folder / "fit.toml").write_text(texts["fit.toml"], "utf-8")
     document = tomlkit.parse(texts["tuning.toml"] + CERTIFICATE)
-    document["checksum"] = checksum_section(document.unwrap(), folder / "tuned.toml", folder / "fit.toml")
+    document["checksum"] = checksum_section(document.unwrap(), folder / "tuned.toml", read_fit(folder / "fit.toml"))
     texts["tuned.toml"] = tomlkit.dumps(document)
     return Base(folder, texts, drive, parameters, read_tuning(folder / "tuning.toml", drive.system(), parameters))
 
@@ -126,16 +126,16 @@ def _read(base: Base, name: str, path: Path) -> str:
     """Read a file as the commands do; nothing is wrong with what is read."""
     loop: ClosedLoop = base.tuning.loop
     if name in ("drive.toml", "fit.toml"):
-        read_drive(path)
-        for read in (read_status, read_marks, read_covariance, read_estimates):
-            read(path)
+        fit = read_fit(path)
+        for part in ("status", "marks", "covariance", "estimates", "noise", "assumed_options"):
+            getattr(fit, part)
     elif name == "tuning.toml":
         task = read_tuning(path, base.drive.system(), base.parameters)
         given = base.parameters.fixed(*base.parameters.free_names) | task.parameters
         task.scenarios(given)
         task.validation_scenarios(given)
     elif name == "tuned.toml":
-        check_certificate(base.folder / "fit.toml", path)
+        check_certificate(read_fit(base.folder / "fit.toml"), path)
     elif name == "rig.toml":
         read_rig(path, base.drive, loop)
     else:

@@ -13,7 +13,7 @@ import tomlkit
 
 from pneuopt.evaluation.cases import cases
 from pneuopt.files.certificate import CertificateCheck, check_certificate, checksum_section
-from pneuopt.files.drive import read_drive
+from pneuopt.files.drive import read_drive, read_fit
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuned import write_tuned
 from pneuopt.files.tuning import read_tuning
@@ -88,13 +88,13 @@ def write(folder: Path, text: str) -> str:
     path = folder / "tuned.toml"
     path.write_text(text, "utf-8")
     document = read_toml(path)
-    document["checksum"] = checksum_section(document.unwrap(), path, folder / "fit.toml")
+    document["checksum"] = checksum_section(document.unwrap(), path, read_fit(folder / "fit.toml"))
     path.write_text(tomlkit.dumps(document), "utf-8")
     return path.read_text("utf-8")
 
 
 def check(folder: Path) -> CertificateCheck:
-    found = check_certificate(folder / "fit.toml", folder / "tuned.toml")
+    found = check_certificate(read_fit(folder / "fit.toml"), folder / "tuned.toml")
     assert found is not None
     return found
 
@@ -185,7 +185,7 @@ def test_a_certificate_without_a_checksum_is_none(place: Path) -> None:
     (place / "tuned.toml").write_text(TUNED.partition("[status]")[0], "utf-8")
     assert check(place).reasons == ("its gains were not written by pneuopt tune",)
     (place / "tuned.toml").write_text(TUNED.partition("[certified]")[0], "utf-8")
-    assert check_certificate(place / "fit.toml", place / "tuned.toml") is None
+    assert check_certificate(read_fit(place / "fit.toml"), place / "tuned.toml") is None
 
 
 def test_an_edited_checksum_is_no_certificate(place: Path) -> None:
@@ -277,7 +277,7 @@ def certified_result(folder: Path, **changes: float) -> TuningResult:
 def test_what_is_written_is_bound_to_its_files(place: Path) -> None:
     tuned, fit = place / "tuned.toml", place / "fit.toml"
     write_tuned(place / "new.toml", tuned, certified_result(place, **{"pid.Kp": 12.5}), fit=fit)
-    assert check_certificate(fit, place / "new.toml") == CertificateCheck(True)
+    assert check_certificate(read_fit(fit), place / "new.toml") == CertificateCheck(True)
     assert "checksum" not in (place / "new.toml").read_text("utf-8").partition("[checksum")[0]
     write_tuned(place / "free.toml", tuned, certified_result(place))
     assert "checksum" not in read_toml(place / "free.toml")
@@ -305,7 +305,7 @@ def data_pairs() -> Iterator[tuple[Path, Path]]:
 @pytest.mark.parametrize(("drive", "tuning"), list(data_pairs()), ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_every_kind_of_drive_and_loop_has_a_checksum_that_repeats(drive: Path, tuning: Path) -> None:
     table = read_toml(tuning).unwrap()
-    first, second = (checksum_section(table, tuning, drive).unwrap() for _ in range(2))
+    first, second = (checksum_section(table, tuning, read_fit(drive)).unwrap() for _ in range(2))
     assert first == second
     assert {"loop", "plant", "references", "limits", "scenarios", "figures", "status"} <= first.keys()
     assert " object at 0x" not in str(first)

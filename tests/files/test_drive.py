@@ -1,3 +1,5 @@
+"""fit.toml: the covariance of a fit's estimates, from which a design's plants are drawn."""
+
 import math
 import re
 from collections.abc import Mapping
@@ -11,12 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.files.drive import read_drive, read_status, write_fit
+from pneuopt.files.drive import read_drive, read_fit, read_status, write_fit
+from pneuopt.files.study import read_axes, read_study
 from pneuopt.files.toml import read_toml
+from pneuopt.files.tuning import read_scenarios
 from pneuopt.identification.result import IdentificationResult, Verdict
+from pneuopt.models.declaration import Drive
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.linear import FirstOrder, SecondOrder
+from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
 from pneuopt.models.pneumatic.cylinder import Cylinder
@@ -24,9 +29,10 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle, Smoothing
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import ATMOSPHERE, read_value
 
 AXIS = """# my axis, 2024
 [drive]
@@ -330,7 +336,7 @@ IMPOSSIBLE = "drive.toml:{}: .{}. {} is impossible; {}"
         (
             "[load]",
             "[valve.smoothing]\nzero = 0\n[load]",
-            "smoothing: zero must be positive, got 0; smaller is sharper",
+            "smoothing zero must be positive, got 0",
         ),
         ("[load]", "[valve.smoothing]\nzero_flow = 1\n[load]", "unknown key 'zero_flow'; did you mean 'zero'"),
         ("critical_ratio = 0.3", 'law = "iso"', "unknown law 'iso'; did you mean 'iso6358'"),
@@ -384,3 +390,138 @@ def test_smoothing_widths_are_settable(tmp_path: Path) -> None:
     drive, rig = read_drive(written(tmp_path, text))
     assert drive == PneumaticDrive(ProportionalValve(smoothing=Smoothing(zero=0.01, pressure=1.0)))
     assert (rig.value("valve.rounding"), rig.value("friction.smoothing")) == (0.002, 0.002)
+
+
+FORCE_AXIS = '[drive]\nkind = "force"\n[load]\nmass = "5 kg"\n[friction]\nmodel = "coulomb"\n'
+
+
+def fit_with(parameters: ParameterSet, covariance: pd.DataFrame) -> IdentificationResult:
+    empty = pd.DataFrame()
+    return IdentificationResult(parameters, empty, covariance, empty, {}, Status(Code.CONVERGED), {}, {})
+
+
+def test_the_covariance_of_a_fit_is_in_its_file_without_what_the_logs_do_not_identify(tmp_path: Path) -> None:
+    source = written(tmp_path, FORCE_AXIS)
+    _, rig = read_drive(source)
+    names = ["load.mass", "load.force", "friction.coulomb"]
+    matrix = np.array([[4.0, -1.5, np.nan], [-1.5, 1.0, np.nan], [np.nan, np.nan, np.nan]])
+    result = fit_with(rig, pd.DataFrame(matrix, names, names))
+    write_fit(tmp_path / "fit.toml", source, result)
+    found = read_fit(tmp_path / "fit.toml").covariance
+    assert found is not None
+    assert list(found.index) == list(found.columns) == names[:2]
+    assert found.to_numpy().tolist() == matrix[:2, :2].tolist()
+    assert read_drive(tmp_path / "fit.toml")[1] == rig
+    assert read_fit(source).covariance is None
+
+
+def test_a_fit_without_a_covariance_gives_the_variances_of_its_estimates(tmp_path: Path) -> None:
+    rows = '[estimates]\n"load.mass" = {value = 5.0, stderr = 0.2}\n"load.force" = {value = 1.0, stderr = nan}\n'
+    found = read_fit(written(tmp_path, FORCE_AXIS + rows)).covariance
+    assert found is not None
+    assert found.to_dict() == {"load.mass": {"load.mass": pytest.approx(0.04)}}
+
+
+def test_degrees_of_freedom_and_ranges_are_read_with_the_estimates(tmp_path: Path) -> None:
+    rows = '"load.mass" = {value = 5.0, stderr = nan, dof = 3.5, range_low = 4.0, range_high = 6.0, mark = "exact"}\n'
+    found = read_fit(written(tmp_path, f'{AXIS}[estimates]\n{rows}"load.force" = {{value = 1.0}}\n')).estimates
+    assert found is not None
+    assert found.loc["load.mass"].dropna().to_dict() == {"dof": 3.5, "range_low": 4.0, "range_high": 6.0}
+    assert found.loc["load.force"].isna().all()
+    assert read_fit(written(tmp_path, FORCE_AXIS)).estimates is None
+
+
+@pytest.mark.parametrize("rows", ['"load.mass" = 3', '"load.mass" = [1, 2]', '"a" = [1, 2]\n"b" = [3, 1]', "a = ['x']"])
+def test_a_covariance_that_is_none_is_refused(tmp_path: Path, rows: str) -> None:
+    with pytest.raises(InputError, match=r"fit.toml: \[covariance\] must hold a row of numbers .*run identify again"):
+        assert read_fit(written(tmp_path, f"{AXIS}[covariance]\n{rows}\n", "fit.toml")).covariance is None
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        '"a" = [4e-20, 1e-20]\n"b" = [-1e-20, 1e-20]',  # far below any absolute tolerance, and not symmetric
+        '"a" = [-4.0, 0.0]\n"b" = [0.0, 1.0]',
+        '"a" = [4e-20, 3e-20]\n"b" = [3e-20, 1e-20]',  # a correlation of 1.5
+    ],
+)
+def test_a_covariance_is_checked_on_the_scale_of_its_variances(tmp_path: Path, rows: str) -> None:
+    with pytest.raises(InputError, match=r"fit.toml: \[covariance\] must "):
+        assert read_fit(written(tmp_path, f"{AXIS}[covariance]\n{rows}\n", "fit.toml")).covariance is None
+
+
+def test_a_covariance_may_be_rounded(tmp_path: Path) -> None:
+    rows = '"a" = [4e-20, 1.9999999999e-20]\n"b" = [2e-20, 1e-20]'
+    assert read_fit(written(tmp_path, f"{AXIS}[covariance]\n{rows}\n", "fit.toml")).covariance is not None
+
+
+HIGH_PLACE = ParameterSet({"supply.pressure": Parameter(6.84e5, "Pa(a)"), "ambient.pressure": Parameter(84e3, "Pa(a)")})
+GAUGE_CYLINDER = """[drive]
+kind = "pneumatic"
+[cylinder]
+[valve]
+[load]
+[friction]
+model = "stribeck"
+[supply]
+pressure = { value = "6 bar(g)", upper = "9 bar(g)" }
+[ambient]
+"""
+
+
+@pytest.mark.parametrize("ambient", ["84 kPa(a)", "1.0 bar(a)", None])
+def test_gauge_pressures_count_from_the_drives_own_ambient_pressure(tmp_path: Path, ambient: str | None) -> None:
+    _, rig = read_drive(written(tmp_path, GAUGE_CYLINDER + (f'pressure = "{ambient}"\n' if ambient else "")))
+    zero = read_value(ambient, "Pa(a)") if ambient else ATMOSPHERE
+    assert rig.value("supply.pressure") == pytest.approx(6e5 + zero, rel=1e-12)
+    assert rig["supply.pressure"].upper == pytest.approx(9e5 + zero, rel=1e-12)
+
+
+@pytest.mark.parametrize("said", ['{ value = "6 bar(g)", upper = "9 bar(g)" }', '"6 bar(g)"'])
+def test_a_found_ambient_pressure_leaves_the_others_what_they_are(tmp_path: Path, said: str) -> None:
+    text = GAUGE_CYLINDER.replace('{ value = "6 bar(g)", upper = "9 bar(g)" }', said)
+    rig = read_drive(written(tmp_path, text + 'pressure = "1 bar(a)"\n'))[1]
+    found, table = rig.with_values({"ambient.pressure": 0.98e5}), pd.DataFrame()
+    result = IdentificationResult(found, table, table, table, {}, Status(Code.CONVERGED, ("gaps 1e-9",)), {}, {})
+    write_fit(tmp_path / "fit.toml", tmp_path / "drive.toml", result)
+    again = read_drive(tmp_path / "fit.toml")[1]
+    assert again.value("ambient.pressure") == 0.98e5
+    assert again.value("supply.pressure") == pytest.approx(rig.value("supply.pressure"), rel=1e-9)
+    assert again["supply.pressure"].upper == pytest.approx(rig["supply.pressure"].upper, rel=1e-9)
+
+
+def test_a_corner_of_gauge_pressures_counts_from_the_drives_ambient_pressure() -> None:
+    section = {"corners": {"supply.pressure": ["5 bar(g)", "7 bar(g)"]}}
+    found = read_scenarios(section, "tuning.toml", HIGH_PLACE)
+    assert {round(float(str(case["supply.pressure"]))) for case in found.values()} >= {584_000, 784_000}
+
+
+def test_an_axis_of_gauge_pressures_counts_from_the_drives_ambient_pressure(tmp_path: Path) -> None:
+    text = '[study]\ndrive = "fit.toml"\ntuning = "tuned.toml"\n[axes]\n"supply.pressure" = ["4 bar(g)", "5 bar(g)"]\n'
+    (pressure,) = read_axes(read_study(written(tmp_path, text, "study.toml")), HIGH_PLACE)
+    assert pressure.points == pytest.approx((484e3, 584e3))
+    assert pressure.in_axis_unit(pressure.points).tolist() == pytest.approx([4.0, 5.0])
+
+
+def read(folder: Path, text: str) -> tuple[Drive, ParameterSet]:
+    path = folder / "drive.toml"
+    path.write_text(text, encoding="utf-8")
+    return read_drive(path)
+
+
+def test_a_linear_plants_signal_in_a_unit_of_its_own(tmp_path: Path) -> None:
+    text = '[drive]\nkind = "linear"\n[plant]\nmodel = "second_order"\noutput_unit = "V"\ngain = 14.7\n'
+    drive, p = read(tmp_path, text)
+    assert drive == SecondOrder(output=Quantity("speed", "V"))
+    assert p.value("plant.gain") == 14.7
+    for unit, message in (("mV", "no SI unit without a prefix"), ("bananas", "bananas")):
+        with pytest.raises(InputError, match=message):
+            read(tmp_path, text.replace('"V"', f'"{unit}"'))
+
+
+def test_a_linear_plant_between_other_signals(tmp_path: Path) -> None:
+    text = '[drive]\nkind = "linear"\n[plant]\nmodel = "integrator"\noutput = "position"\ngain = "50 mm/(V*s)"\n'
+    plant, rig = read(tmp_path, text)
+    assert isinstance(plant, Integrator)
+    assert [q.name for q in (*plant.system().inputs, *plant.system().outputs)] == ["valve_voltage", "position"]
+    assert rig.value("plant.gain") == 0.05

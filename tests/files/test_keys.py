@@ -11,7 +11,7 @@ import pytest
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.files.drive import read_drive
-from pneuopt.files.key_list import KeyRow, list_keys
+from pneuopt.files.keys import KeyRow, list_keys
 from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_study
 from pneuopt.files.tuning import read_tuning

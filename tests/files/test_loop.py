@@ -96,7 +96,7 @@ def test_the_series_form_is_read(tmp_path: Path) -> None:
         ('"1 sample"', "3", "[pid]: PID: delay is 0 or 1, whole samples, got 3"),
         ('"2 mm/s"', '"-2 mm/s"', "[pid] dead_band: value -0.002 m/s lies outside its bounds [0, inf]"),
         ('"30 ms"', '"0 ms"', "[feedforward]: Feedforward: time must be at least 1e-06 s, got 0 s"),
-        ("gain =", "gian =", "[feedforward] has no gain; write gain and time"),
+        ("gain =", "gian =", "[feedforward] has no gain"),
         ('time = "30', 'tine = "30', "[feedforward]: unknown key 'tine'; did you mean 'time'?"),
     ],
 )

@@ -1,15 +1,26 @@
+"""`accept` of a tuning.toml: the defects with which a design is certified all the same."""
+
+import json
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import tomlkit
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from pneuopt.cli.app import app
 from pneuopt.control.dither import Dither, Waveform
+from pneuopt.control.moves import MotionPath, Move, MoveProfile, MoveSequence
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.band import Tolerance
+from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
@@ -29,15 +40,17 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
+from pneuopt.evaluation.rest_check import NoHunting
+from pneuopt.evaluation.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.files.drive import read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuned import write_tuned
-from pneuopt.files.tuning import Tuning, read_tuning
+from pneuopt.files.tuning import Tuning, move_paths, read_path, read_scenarios, read_tuning, read_validation_scenarios
 from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Coulomb, PressureDependent
+from pneuopt.models.friction import Coulomb, PressureDependent, Stribeck
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.result import TuningResult
 
@@ -171,18 +184,18 @@ def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
         ('"2 V*s/m", lower', '"99 V*s/m", lower', "[pid] Kp: value 99 V*s/m lies outside its bounds [0.2, 60]"),
         (', upper = "60 V*s/m"', "", "[pid] Kp is free, so it needs both bounds: lower and upper"),
         ("upper = ", "uper = ", "[pid] Kp: unknown key 'uper'; did you mean 'upper'?"),
-        ('["-5 V", "5 V"]', '"5 V"', '[pid] limits must be a pair: ["-5 V", "5 V"]'),
+        ('["-5 V", "5 V"]', '"5 V"', "[pid] limits must be a list, got '5 V'"),
         ('["-5 V", "5 V"]', '["5 V", "-5 V"]', "[pid] limits: 5 V is not below -5 V"),
         ('limits = ["-5 V", "5 V"]', 'Tt = "1 s"', "[pid] Tt unwinds the integral at limits; write limits, too"),
         ('"sine"', '"square"', "[dither]: unknown waveform 'square'"),
-        ('frequency = "160 Hz"', "", '[dither] has no frequency; write frequency = "160 Hz"'),
+        ('frequency = "160 Hz"', "", "[dither] has no frequency"),
         ('"160 Hz"', '"1000 rad/s"', "[dither] frequency: unit 'rad/s' does not measure 'Hz'; write it in Hz"),
         ("offset = ", "ofset = ", "[dither]: unknown key 'ofset'; did you mean 'offset'?"),
         ('waveform = "sine"', "analogue = 1", "[dither] analogue must be true or false"),
         (
             'horizon = "1 s"\n\n[[ref',
             'horizon = "1 s"\nstart = "250 mm"\n[[ref',
-            '[[reference]] 1 start: write start = { position = "250 mm" }',
+            "[[reference]] 1 start must be a table",
         ),
         (
             'horizon = "1 s"\n\n[[ref',
@@ -200,7 +213,7 @@ def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
             "2",
             "[minimise] overshoot: write overshoot = { weight = 1.0 }; a limit belongs under [limits]",
         ),
-        ("{ weight = 2 }", "{ weight = 0 }", "[minimise] overshoot: weight must be positive, got 0"),
+        ("{ weight = 2 }", "{ weight = 0 }", "[minimise] overshoot weight must be positive, got 0"),
         ("{ weight = 2 }", "{ band = 0.1 }", "[minimise] overshoot: unknown key 'band'"),
         ('band = "2 %"', 'band = "3 %"', "[minimise] and [limits]: settling bands differ: [0.02, 0.03]"),
         ('"5 %"', '"5 mm"', "[limits] overshoot: unit 'mm' does not measure '1'"),
@@ -225,9 +238,9 @@ def test_refuses_a_tuning_and_says_where(tmp_path: Path, old: str, new: str, sai
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("# nothing\n", "no controller; add a section [pid]"),
-        ('[pid]\nKi = "1 V/m"\n', "[pid] has no gain; write at least Kp"),
-        ('[pid]\nKp = "2 V*s/m"\n', "no reference; add [[reference]]"),
+        ("# nothing\n", "no pid; add a section [pid]"),
+        ('[pid]\nKi = "1 V/m"\n[[reference]]\n', "[pid] has no gain; write at least Kp"),
+        ('[pid]\nKp = "2 V*s/m"\n', "no reference; add a section [[reference]]"),
         ('[pid]\nKp = "2 V*s/m"\n[reference]\nstep = "1 m/s"\n', "write each reference as a section of its own, [[ref"),
     ],
 )
@@ -384,3 +397,391 @@ def test_a_triangle_and_a_limit_on_the_air(tmp_path: Path) -> None:
 def test_air_needs_its_conditions_and_a_waveform_its_name(tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         read_tuning(written(tmp_path, TUNING.replace(old, new)), PLANT)
+
+
+LOOP = '[pid]\nKp = "2 V*s/m"\n[[reference]]\nstep = "0.2 m/s"\nhorizon = "1 s"\n'
+
+
+def read_accept(folder: Path, line: str) -> tuple[Defect, ...]:
+    path = folder / "tuning.toml"
+    path.write_text(f"{line}\n{LOOP}", encoding="utf-8")
+    return read_tuning(path, SecondOrder().system()).accept
+
+
+def test_defects_are_accepted_by_their_words(tmp_path: Path) -> None:
+    assert read_accept(tmp_path, "") == ()
+    every = ", ".join(f'"{defect.value}"' for defect in Defect)
+    assert read_accept(tmp_path, f"accept = [{every}]") == tuple(Defect)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('accept = ["hunt"]', "tuning.toml: accept.*unknown defect 'hunt'; did you mean 'hunts'"),
+        ('accept = "hunts"', "tuning.toml: accept must be a list"),
+        ("accept = [1]", "tuning.toml: accept must be text"),
+        ('acept = ["hunts"]', "unknown section 'acept'.*accept"),
+    ],
+)
+def test_another_word_is_refused_with_the_nearest_one(tmp_path: Path, line: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read_accept(tmp_path, line)
+
+
+REST_TUNING = """
+[loop]
+measured = "position"
+[pid]
+Kp = "2 N/m"
+[[reference]]
+step = "100 mm"
+horizon = "1 s"
+[limits]
+no_hunting = {}
+"""
+
+
+def read_rest(folder: Path, written: str) -> NoHunting | None:
+    path = folder / "tuning.toml"
+    path.write_text(REST_TUNING.format(written), encoding="utf-8")
+    return read_tuning(path, ForceDrive(Stribeck()).system()).specification.rest
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [
+        ('"20 s"', NoHunting(20.0)),
+        ('{ duration = "20 s", repeatability = "0.1 mm" }', NoHunting(20.0, 1e-4)),
+        ('{ repeatability = "0.2 mm" }', NoHunting(repeatability=2e-4)),
+    ],
+)
+def test_a_file_says_for_how_long_and_how_near(tmp_path: Path, written: str, expected: NoHunting) -> None:
+    found = read_rest(tmp_path, written)
+    assert found is not None
+    assert (found.duration, found.repeatability) == pytest.approx((expected.duration, expected.repeatability))
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ('"20 mm"', r"\[limits\] no_hunting: unit 'mm' does not measure 's'"),
+        ('{ repeatability = "1 V" }', r"\[limits\] no_hunting repeatability: unit 'V' does not measure 'm'"),
+        ('{ repeatability = "0 mm" }', r"\[limits\] no_hunting: NoHunting: repeatability must be positive, got 0"),
+        ('{ time = "20 s" }', r"\[limits\] no_hunting: unknown key 'time'"),
+    ],
+)
+def test_what_it_cannot_be_is_said(tmp_path: Path, written: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_rest(tmp_path, written)
+
+
+RIG = ParameterSet({"load.mass": Parameter(5.0, "kg", 1.0, 20.0), "friction.coulomb": Parameter(40.0, "N")})
+RIG = RIG | ParameterSet({"pid.Kp": Parameter(2.0, "V*s/m", free=True)})
+
+
+def read_boxes(tmp_path: Path, text: str) -> Scenarios:
+    path = tmp_path / "tuning.toml"
+    path.write_text(text, encoding="utf-8")
+    return read_scenarios(read_toml(path).unwrap()["scenarios"], "tuning.toml", RIG)
+
+
+def test_corners_samples_and_tolerances_join(tmp_path: Path) -> None:
+    found = read_boxes(
+        tmp_path,
+        """
+[scenarios.corners]
+"load.mass" = "30 %"
+"friction.*" = ["30 N", "60 N"]
+[scenarios.samples]
+count = 3
+seed = 7
+"load.mass" = 0.1
+[scenarios.tolerances]
+"pid.*" = "1 %"
+""",
+    )
+    spreads: dict[str, Spread] = {"load.mass": 0.3, "friction.*": (30.0, 60.0)}
+    assert found == {
+        **corners(RIG, spreads),
+        **samples(RIG, {"load.mass": 0.1}, 3, seed=7),
+        **tolerances(RIG, {"pid.*": 0.01}),
+    }
+    assert found["pid.* high"] == {"pid.Kp": Factor(1.01)}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('[scenarios.corner]\n"load.mass" = "30 %"', r"tuning\.toml: \[scenarios\].*corner"),
+        ('[scenarios]\ncorners = "30 %"', r"\[scenarios\.corners\] must be a section"),
+        ('[scenarios.corners]\n"load.mas" = "30 %"', r"\[scenarios\.corners\] .*load\.mas"),
+        ('[scenarios.corners]\n"load.mass" = ["3 kg"]', r"\[scenarios\.corners\] load\.mass: write a fraction"),
+        ('[scenarios.corners]\n"load.mass" = "3 kg"', r"\[scenarios\.corners\] load\.mass"),
+        ('[scenarios.tolerances]\n"pid.Kp" = ["1 V*s/m", "3 V*s/m"]', "a tolerance is a fraction"),
+        ('[scenarios.samples]\ncount = "many"\n"load.mass" = "30 %"', "count must be a whole number"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_section(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read_boxes(tmp_path, text)
+
+
+def test_a_tuning_gives_the_scenarios_of_a_fit(tmp_path: Path) -> None:
+    path = tmp_path / "tuning.toml"
+    lines = ['[pid]\nKp = "2 V*s/m"', '[[reference]]\nstep = "0.2 m/s"\nhorizon = "1 s"']
+    path.write_text("\n".join(lines), encoding="utf-8")
+    plant = SecondOrder().system()
+    assert dict(read_tuning(path, plant).scenarios(plant.parameters)) == {}
+    path.write_text("\n".join([*lines, '[scenarios.corners]\n"plant.gain" = "20 %"']), encoding="utf-8")
+    fitted = plant.parameters.with_values({"plant.gain": 3.0})
+    values = [case["plant.gain"] for case in read_tuning(path, plant).scenarios(fitted).values()]
+    assert values == pytest.approx([2.4, 3.6])
+
+
+def test_the_commands_certify_every_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    drive = '[drive]\nkind = "force"\n[load]\nmass = "5 kg"\n[friction]\nmodel = "viscous"\nviscous = "40 N*s/m"'
+    loop = '[pid]\nsample_time = "5 ms"\nKp = "300 N*s/m"\nKi = "5000 N/m"\n[[reference]]\nstep = "0.2 m/s"'
+    Path("drive.toml").write_text(drive, encoding="utf-8")
+    scenarios = '[scenarios.corners]\n"load.mass" = "30 %"'
+    Path("tuning.toml").write_text(f'{loop}\nhorizon = "0.3 s"\n{scenarios}', encoding="utf-8")
+    result = CliRunner().invoke(app, ["simulate", "drive.toml", "tuning.toml", "--json", "out.json"])
+    assert result.exit_code == 0, result.output
+    rows = json.loads(Path("out.json").read_text(encoding="utf-8"))["certified"]
+    assert len(rows) == 3
+    slow, fast = (rows[k]["RiseTime"] for k in (2, 1))
+    assert slow > 1.3 * fast
+
+
+def test_new_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> None:
+    path = tmp_path / "tuning.toml"
+    text = '[scenarios.samples]\ncount = 3\n"load.mass" = "30 %"\n[scenarios.tolerances]\n"pid.Kp" = "1 %"'
+    path.write_text(text, encoding="utf-8")
+    said = read_toml(path).unwrap()["scenarios"]
+    seen, fresh = (found(said, "tuning.toml", RIG) for found in (read_scenarios, read_validation_scenarios))
+    assert len(fresh) == 100
+    masses = [v["load.mass"] for v in fresh.values()]
+    factors = [v["pid.Kp"] for v in fresh.values()]
+    assert all(isinstance(m, float) and 3.5 <= m <= 6.5 for m in masses)
+    assert all(isinstance(f, Factor) and 0.99 <= f.share <= 1.01 for f in factors)
+    assert not {v["load.mass"] for v in seen.values() if "load.mass" in v} & set(masses)
+
+
+def test_a_tuning_with_scenarios_is_validated_on_new_plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    drive = '[drive]\nkind = "force"\n[load]\nmass = "5 kg"\n[friction]\nmodel = "viscous"\nviscous = "40 N*s/m"'
+    gain = '{ value = "300 N*s/m", lower = "100 N*s/m", upper = "900 N*s/m", free = true }'
+    loop = f'[pid]\nsample_time = "5 ms"\nKp = {gain}\nKi = "2000 N/m"\n[[reference]]\nstep = "0.2 m/s"'
+    asked = '[minimise]\nsettling_time = { band = "5 %" }\n[limits]\novershoot = "20 %"'
+    scenarios = '[scenarios.corners]\n"load.mass" = "30 %"'
+    Path("drive.toml").write_text(drive, encoding="utf-8")
+    Path("tuning.toml").write_text(f'{loop}\nhorizon = "0.3 s"\n{asked}\n{scenarios}', encoding="utf-8")
+    result = CliRunner().invoke(app, ["tune", "drive.toml", "tuning.toml", "--json", "out.json"])
+    assert result.exit_code == 0, result.output
+    assert "holds on 100 of 100 plants" in result.output
+    assert "as the scenarios have them: load.mass" in result.output
+    assert "assumed tolerances: friction.viscous +-10 %" in result.output
+    found = json.loads(Path("out.json").read_text(encoding="utf-8"))
+    settling, overshoot = found["validation"]
+    worst_corner = max(row["SettlingTime"] for row in found["certified"])
+    assert settling["violations"] == overshoot["violations"] == 0
+    assert 0.5 * worst_corner < settling["median"] <= settling["p95"] <= settling["worst"]
+    assert settling["worst"] <= 1.05 * worst_corner, "friction and the gain vary beside the mass: by 10 % and by 1 %"
+    assert settling["certified"] == pytest.approx(settling["worst"], rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[scenarios.samples]\ncount = 100000000\n'load.mass' = '30 %'", "count must be from 1 to 20000"),
+        ("[scenarios.samples]\ncount = 3\nseed = -1\n'load.mass' = '30 %'", "seed must be at least 0"),
+        (
+            "[scenarios.corners]\n" + "".join(f"'friction.{k}' = '30 %'\n" for k in range(20)),
+            "20 parameters have too many corners; take",
+        ),
+    ],
+)
+def test_more_plants_than_can_be_computed_are_refused_at_once(text: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=said):
+        read_boxes(tmp_path, text)
+
+
+def written_tuning(folder: Path, text: str) -> Path:
+    path = folder / "tuning.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+MOVE = """[loop]
+measured = "position"
+[pid]
+Kp = "200 N/m"
+[[reference]]
+move = "-200 mm"
+speed = "0.5 m/s"
+acceleration = "5 m/s^2"
+jerk = "100 m/s^3"
+at = "100 ms"
+initial = "50 mm"
+dwell = "2 s"
+disturbance = { "load.force" = "20 N" }
+[minimise]
+settling_time = {}
+"""
+
+
+@pytest.mark.parametrize(("text", "band"), [('"0.1 mm"', Tolerance(1e-4)), ('"2 %"', 0.02), ("0.05", 0.05)])
+def test_a_band_may_be_in_the_measured_unit(tmp_path: Path, text: str, band: float | Tolerance) -> None:
+    given = MOVE.replace("settling_time = {}", f"settling_time = {{ band = {text} }}")
+    assert read_tuning(written_tuning(tmp_path, given), ForceDrive(Coulomb()).system()).specification.band == band
+
+
+def test_a_reference_may_be_several_moves(tmp_path: Path) -> None:
+    drive = ForceDrive(Coulomb()).system()
+    several = MOVE.replace('move = "-200 mm"', 'moves = ["200 mm", "-100 mm"]')
+    first = Move(0.2, speed=0.5, acceleration=5.0, jerk=100.0, at=0.1, initial=0.05, dwell=2.0)
+    second = replace(first, distance=-0.1, at=0.0, initial=0.0, disturbance={"load.force": 20.0})
+    assert read_tuning(written_tuning(tmp_path, several), drive).references == (MoveSequence([first, second]),)
+
+
+def test_one_of_several_moves_may_have_limits_of_its_own(tmp_path: Path) -> None:
+    drive = ForceDrive(Coulomb()).system()
+    own = '{ distance = "-0.1 m", speed = "10 mm/s", dwell = "1 s", profile = "s-curve" }'
+    several = MOVE.replace('move = "-200 mm"', f'moves = ["200 mm", {own}]')
+    first = Move(0.2, speed=0.5, acceleration=5.0, jerk=100.0, at=0.1, initial=0.05, dwell=2.0)
+    second = replace(first, distance=-0.1, speed=0.01, dwell=1.0, at=0.0, initial=0.0, disturbance={"load.force": 20.0})
+    assert read_tuning(written_tuning(tmp_path, several), drive).references == (MoveSequence([first, second]),)
+
+
+def test_a_reference_may_be_a_move(tmp_path: Path) -> None:
+    drive = ForceDrive(Coulomb()).system()
+    push = {"load.force": 20.0}
+    move = Move(-0.2, speed=0.5, acceleration=5.0, jerk=100.0, at=0.1, initial=0.05, dwell=2.0, disturbance=push)
+    assert read_tuning(written_tuning(tmp_path, MOVE), drive).references == (move,)
+    shaped = MOVE.replace('jerk = "100 m/s^3"', 'profile = "minimum jerk"')
+    (found,) = read_tuning(written_tuning(tmp_path, shaped), drive).references
+    assert found == replace(move, jerk=math.inf, profile=MoveProfile.MINIMUM_JERK)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('dwell = "2 s"', 'horizon = "2 s"', "horizon does not belong to a move, which ends by dwell"),
+        ('move = "-200 mm"', 'step = "-200 mm"', "speed does not belong to a step, which ends by horizon"),
+        ('move = "-200 mm"', 'step = "1 mm"\nmove = "1 mm"', "has more than one of step, move, moves and path"),
+        ('move = "-200 mm"', 'moves = "-200 mm"', "moves must be a list"),
+        ('move = "-200 mm"', 'moves = ["-200 mm", "0 mm"]', "Move: distance must not be zero"),
+        ('move = "-200 mm"', 'moves = ["1 mm", { speed = "1 m/s" }]', "moves 2 has no distance"),
+        ('move = "-200 mm"', 'moves = ["1 mm", { distance = "1 mm", at = "1 s" }]', "unknown key 'at'"),
+        ('speed = "0.5 m/s"', "", "[[reference]] 1 has no speed"),
+        ('jerk = "100 m/s^3"', 'profile = "ramp"', "unknown profile 'ramp'"),
+        (
+            'jerk = "100 m/s^3"',
+            'jerk = "9 m/s^3"\nprofile = "trapezoid"',
+            "the acceleration of a trapezoid steps",
+        ),
+        ('"0.5 m/s"', '"0.5 m"', "speed: unit 'm' does not measure 'm/s'"),
+        ('"0.5 m/s"', '"-0.5 m/s"', "Move: speed is a limit on its size and must be positive"),
+    ],
+)
+def test_refuses_a_move_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in MOVE
+    with pytest.raises(InputError) as error:
+        read_tuning(written_tuning(tmp_path, MOVE.replace(old, new, 1)), ForceDrive(Coulomb()).system())
+    assert "[[reference]] 1" in str(error.value)
+    assert said in str(error.value)
+
+
+CAM = '[loop]\nmeasured = "position"\n[pid]\nKp = "200 N/m"\n[[reference]]\npath = "cams/cam.csv"\ndwell = "0.4 s"\n'
+
+
+def table(folder: Path, head: str, points: np.ndarray) -> None:
+    (folder / "cams").mkdir(exist_ok=True)
+    rows = "\n".join(",".join(f"{x:.9g}" for x in row) for row in points)
+    (folder / "cams" / "cam.csv").write_text(f"{head}\n{rows}\n", encoding="utf-8")
+
+
+def cam(folder: Path, head: str = "t [ms],x [mm]") -> np.ndarray:
+    """A cam of 100 mm, written beside the tuning [s, m]."""
+    t = np.linspace(0.0, 0.8, 41)
+    points = np.column_stack([t, 0.05 * (1 - np.cos(np.pi * t / 0.8))])
+    table(folder, head, 1e3 * points)
+    return points
+
+
+def test_a_reference_may_be_a_path_from_a_table(tmp_path: Path) -> None:
+    """Beside the tuning's own file, wherever the command runs; the column of the measured signal's reference counts."""
+    points, drive = cam(tmp_path, "time [ms],position_reference [mm]"), ForceDrive(Coulomb()).system()
+    tuning = written_tuning(tmp_path, CAM + 'start = { speed = "0.1 m/s" }\ndisturbance = { "load.force" = "20 N" }\n')
+    (found,) = read_tuning(tuning, drive).references
+    assert isinstance(found, MotionPath)
+    np.testing.assert_allclose([found.t, found.points], points.T, atol=1e-9)
+    assert (found.name, found.dwell, found.start, found.disturbance) == ("cam", 0.4, {"speed": 0.1}, {"load.force": 20})
+    wider = np.column_stack([1e3 * points, 1e3 * points[:, 1] + 7.0])
+    table(tmp_path, "time [ms],position_reference [mm],position [mm]", wider)
+    assert read_tuning(tuning, drive).references[0].origin == pytest.approx(0.0)
+    table(tmp_path, "time [ms],position [mm]", 1e3 * points)
+    (found,) = read_tuning(written_tuning(tmp_path, CAM.replace('dwell = "0.4 s"\n', "")), drive).references
+    assert found.horizon == pytest.approx(points[-1, 0] + Move.dwell)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("cams/cam.csv", "cam.csv", "path: {folder}/cam.csv: cannot be read (No such file or directory)"),
+        ('"cams/cam.csv"', "3", "[[reference]] 1 path must be text, got 3"),
+        ('dwell = "0.4 s"', 'horizon = "1 s"', "horizon does not belong to a path, which ends by dwell"),
+        ('dwell = "0.4 s"', 'speed = "1 m/s"', "speed does not belong to a path, which ends by dwell"),
+        ('dwell = "0.4 s"', 'step = "1 mm"', "has more than one of step, move, moves and path"),
+        ('dwell = "0.4 s"', 'dwell = "-2 s"', "MotionPath: dwell -2 s ends the experiment before it begins"),
+        ('"position"', '"speed"', "no column of a path; name one speed [m/s]"),
+    ],
+)
+def test_refuses_a_path_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    cam(tmp_path, "time [ms],position [mm]")
+    text = CAM.replace("N/m", "N*s/m") if new == '"speed"' else CAM
+    assert old in text
+    with pytest.raises(InputError) as error:
+        read_tuning(written_tuning(tmp_path, text.replace(old, new, 1)), ForceDrive(Coulomb()).system())
+    assert "[[reference]] 1" in str(error.value)
+    assert said.format(folder=tmp_path) in str(error.value)
+
+
+def test_a_tuned_file_elsewhere_names_the_same_table(tmp_path: Path) -> None:
+    points, drive = cam(tmp_path, "time [ms],position [mm]"), ForceDrive(Coulomb()).system()
+    tuning = written_tuning(tmp_path, CAM + "[minimise]\nfollowing_error = {}\n")
+    folder = tmp_path / "results" / "today"
+    folder.mkdir(parents=True)
+    document = read_toml(tuning)
+    move_paths(document["reference"], tmp_path, folder)
+    (folder / "tuned.toml").write_text(tomlkit.dumps(document), encoding="utf-8")
+    assert document["reference"][0]["path"] == "../../cams/cam.csv"
+    (found,) = read_tuning(folder / "tuned.toml", drive).references
+    assert found.final == pytest.approx(points[-1, 1])
+
+
+def written_cam(folder: Path, head: str, points: np.ndarray) -> Path:
+    path = folder / "cam.csv"
+    rows = "\n".join(f"{t:.6g};{y:.9g}".replace(".", ",") for t, y in points)
+    path.write_text(f"{head}\n{rows}\n", encoding="utf-8")
+    return path
+
+
+def test_a_path_is_read_with_its_units(tmp_path: Path) -> None:
+    t = np.linspace(0, 500, 21)
+    y = 50 * (1 - np.cos(2 * np.pi * t / 1000))
+    path = read_path(written_cam(tmp_path, "time [ms];position [mm]", np.column_stack([t + 2000, y])), dwell=0.2)
+    assert path.label == "cam"
+    np.testing.assert_allclose(path.t, t / 1000, atol=1e-12)
+    np.testing.assert_allclose(path.points, y / 1000, atol=1e-9)
+    assert path.horizon == pytest.approx(0.7)
+
+
+def test_a_table_without_a_motion_is_refused(tmp_path: Path) -> None:
+    t = np.linspace(0, 1, 21)
+    with pytest.raises(InputError, match=r"cam\.csv: no column of a path; name one position \[mm\]"):
+        read_path(written_cam(tmp_path, "time [s];force [N]", np.column_stack([t, t])))
+    with pytest.raises(InputError, match=r"cam\.csv.*nothing moves, every point is 0\.005"):
+        read_path(written_cam(tmp_path, "time [s];position [mm]", np.column_stack([t, 5 + 0 * t])))
+    with pytest.raises(InputError, match="unknown channel 'postion'"):
+        read_path(written_cam(tmp_path, "time [s];position [mm]", np.column_stack([t, t])), channel="postion")

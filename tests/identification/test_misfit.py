@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import ttest_1samp
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.files.drive import read_drive, read_marks, write_fit
+from pneuopt.files.drive import read_drive, read_fit, write_fit
 from pneuopt.identification import identify as identification
 from pneuopt.identification.identify import identify
 from pneuopt.identification.misfit import Misfit, _hotelling_p
@@ -171,8 +171,8 @@ def test_far_beyond_the_noise_there_is_a_range_and_no_interval(tmp_path: Path) -
     source = tmp_path / "drive.toml"
     source.write_text('[drive]\nkind = "force"\n[friction]\nmodel = "coulomb"\n', encoding="utf-8")
     write_fit(tmp_path / "fit.toml", source, result)
-    assert read_marks(tmp_path / "fit.toml") == dict.fromkeys(FREE, Mark.BIAS_POSSIBLE)
-    assert read_marks(source) == {}
+    assert read_fit(tmp_path / "fit.toml").marks == dict.fromkeys(FREE, Mark.BIAS_POSSIBLE)
+    assert read_fit(source).marks == {}
     assert read_drive(tmp_path / "fit.toml")[1].value("load.mass") == pytest.approx(rows["value"]["load.mass"])
 
 
@@ -194,9 +194,13 @@ def test_few_degrees_of_freedom_reach_profiles() -> None:
 
 def test_a_mark_that_is_none_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fit.toml"
-    path.write_text('[estimates]\n"load.mass" = {value = 5.0, mark = "perfect"}\n', encoding="utf-8")
+    path.write_text(
+        '[drive]\nkind = "force"\n[friction]\nmodel = "coulomb"\n'
+        '[estimates]\n"load.mass" = {value = 5.0, mark = "perfect"}\n',
+        encoding="utf-8",
+    )
     with pytest.raises(InputError, match="perfect"):
-        read_marks(path)
+        read_fit(path).marks  # noqa: B018
 
 
 def test_a_width_that_the_logs_reject_marks_what_it_moves() -> None:

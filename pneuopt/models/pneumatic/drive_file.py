@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from pneuopt.models.declaration import Alias, DriveKind, FirstFiles, Structure
+from pneuopt.models.declaration import Alias, DriveKind, DriveSections, FirstFiles
 from pneuopt.models.friction_section import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.pneumatic.chamber import ChamberModel, Polytropic, Thermal
@@ -17,22 +17,24 @@ from pneuopt.models.pneumatic.gas import (
     conductance_of_nominal_flow,
 )
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
-from pneuopt.quantities.errors import UnitError, check_names, require
+from pneuopt.quantities.errors import UnitError, require
 from pneuopt.quantities.keys import Key, choice, flag, table
 from pneuopt.quantities.units import read_value
 
 _CRITICAL_RATIO = "valve.critical_ratio"
 _SMOOTHING_KEYS = {
-    "corner": Key("rounding of the corner where the flow chokes", usual=Smoothing.corner),
-    "zero": Key("rounding of the flow law at no flow", usual=Smoothing.zero),
-    "pressure": Key("rounding of the larger of two pressures", unit="Pa", usual=Smoothing.pressure),
+    "corner": Key("rounding of the corner where the flow chokes", usual=Smoothing.corner, least=0.0, is_open=True),
+    "zero": Key("rounding of the flow law at no flow", usual=Smoothing.zero, least=0.0, is_open=True),
+    "pressure": Key(
+        "rounding of the larger of two pressures", unit="Pa", usual=Smoothing.pressure, least=0.0, is_open=True
+    ),
 }
 _SECTIONS: Mapping[str, Mapping[str, Key]] = {
     "cylinder": {"stops": flag("whether the covers stop the piston", usual=True)},
     "valve": {
         "law": choice("flow law of the edges", {"iso6358": Iso6358, "isentropic": IsentropicNozzle}, "iso6358"),
         "spool": choice("lag of the spool", {spool.name.lower(): spool for spool in Spool}, "second_order"),
-        "smoothing": table("widths over which the flow law is rounded", _SMOOTHING_KEYS, usual={}),
+        "smoothing": table("widths over which the flow law is rounded", _SMOOTHING_KEYS),
     },
     "supply": {},
     "gas": {},
@@ -46,29 +48,19 @@ _SECTIONS: Mapping[str, Mapping[str, Key]] = {
 }
 
 
-def _build_drive(structure: Structure) -> PneumaticDrive:
-    options = structure.options("valve")
-    valve = ProportionalValve(options["law"](), options["spool"], _read_smoothing(options["smoothing"], structure))
-    cylinder, load = Cylinder(**structure.options("cylinder")), Load(**structure.options("load"))
-    return PneumaticDrive(valve, read_friction(structure), load, _read_chamber(structure), cylinder)
+def _build_drive(sections: DriveSections) -> PneumaticDrive:
+    options = sections.options("valve")
+    valve = ProportionalValve(options["law"](), options["spool"], Smoothing(**options["smoothing"]))
+    cylinder, load = Cylinder(**sections.options("cylinder")), Load(**sections.options("load"))
+    return PneumaticDrive(valve, read_friction(sections), load, _read_chamber(sections), cylinder)
 
 
-def _read_smoothing(entries: Mapping[str, Any], structure: Structure) -> Smoothing:
-    """Read the rounding of the flow law: smoothing = { corner = 0.02, zero = 1e-3, pressure = "100 Pa" }."""
-    where = structure.place("valve", "smoothing")
-    check_names("key", entries, _SMOOTHING_KEYS, where)
-    widths = {n: read_value(v, _SMOOTHING_KEYS[n].unit, where=f"{where}: {n}") for n, v in entries.items()}
-    for name, width in widths.items():
-        require(width > 0, f"{where}: {name} must be positive, got {entries[name]}; smaller is sharper and stiffer")
-    return Smoothing(**widths)
-
-
-def _read_chamber(structure: Structure) -> ChamberModel:
-    options = structure.options("chamber")
+def _read_chamber(sections: DriveSections) -> ChamberModel:
+    options = sections.options("chamber")
     if options["model"] is Polytropic:
         return Polytropic(options["mixed"])
-    message = f"{structure.place('chamber', 'mixed')}: a thermal chamber has no exponents; leave it out"
-    require(not structure.has("chamber", "mixed"), message)
+    message = f"{sections.place('chamber', 'mixed')}: a thermal chamber has no exponents; leave it out"
+    require(not sections.has("chamber", "mixed"), message)
     return Thermal()
 
 

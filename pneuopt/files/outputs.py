@@ -1,15 +1,31 @@
-"""What the commands write with --json: one declaration, for the schema and `pneuopt keys --outputs`.
+"""What the commands write with --json, by the types of the results: for the schema and `pneuopt keys --outputs`.
 
 Numbers are in SI units unless a name or a "unit" beside them says otherwise; what is not finite is null; a table is a
 list of records, one a row. Members may be added from version to version; none is renamed without the changelog.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
+from types import NoneType
+from typing import Any, get_args
 
-from pneuopt.quantities.status import Code
+from pneuopt.evaluation.dither_verdict import DitherVerdict
+from pneuopt.files.certificate import CertificateCheck
+from pneuopt.identification.assumptions import Assumption
+from pneuopt.identification.result import (
+    AgreementRow,
+    ChosenWidth,
+    ChosenWindow,
+    EstimateRow,
+    IdentifiableRow,
+    Verdict,
+)
+from pneuopt.logs.checks.findings import LogFinding
+from pneuopt.quantities.keys import argument_meanings, first_sentence
+from pneuopt.quantities.parameters import Parameter
+from pneuopt.quantities.status import Status
+from pneuopt.tuning.result import RequirementRow
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _NUMBER: dict[str, Any] = {"type": ["number", "null"]}
@@ -124,10 +140,6 @@ def _text(meaning: str) -> Member:
     return Member(meaning, Holds.TEXT)
 
 
-def _flag(meaning: str) -> Member:
-    return Member(meaning, Holds.FLAG)
-
-
 def _rows(meaning: str, members: Mapping[str, Member], *, is_open: bool = False) -> Member:
     return Member(meaning, Holds.ROWS, members, is_open)
 
@@ -140,102 +152,97 @@ def _numbers(**meanings: str) -> dict[str, Member]:
     return {name: Member(meaning) for name, meaning in meanings.items()}
 
 
-_CODES = ", ".join(f'"{code.value}"' for code in Code)
-_STATUS = Member(
-    "how it ended", Holds.RECORD, {"code": _text(f"one of {_CODES}"), "message": _text("verdict, details, remedy")}
-)
+_HOLDS: Mapping[Any, Holds] = {
+    str: Holds.TEXT,
+    float: Holds.NUMBER,
+    int: Holds.COUNT,
+    bool: Holds.FLAG,
+    float | str | bool: Holds.VALUE,
+    tuple[str, ...]: Holds.TEXTS,
+    tuple[int, int]: Holds.COUNTS,
+    tuple[tuple[str, ...], ...]: Holds.GROUPS,
+    Mapping[str, str]: Holds.WORDS,
+}
+
+
+def members_of(kind: type, only: Sequence[str] = (), *, are_optional: bool = False) -> dict[str, Member]:
+    """The members that a result's type declares, by the annotations of its fields and their lines in its docstring.
+
+    Parameters
+    ----------
+    kind : type
+        A dataclass, or a TypedDict that declares the rows of a table.
+    only : sequence of str
+        Names of fields and properties, where not every field is written, in the order in which they are.
+    are_optional : bool
+        Whether the whole record may be empty.
+
+    Raises
+    ------
+    TypeError
+        If a field is of a type that no output holds.
+    """
+    meanings = argument_meanings(kind)
+    names = only or tuple(kind.__annotations__)
+    return {n: _member_of(kind, n, meanings.get(n, ""), are_optional) for n in names}
+
+
+def _member_of(kind: type, name: str, meaning: str, is_optional: bool) -> Member:
+    own = getattr(kind, name, None)
+    if isinstance(own, property):
+        annotation, meaning = own.fget.__annotations__["return"], first_sentence(own.fget)
+    else:
+        annotation = kind.__annotations__[name]
+    parts = [part for part in get_args(annotation) if part is not NoneType]
+    if NoneType in get_args(annotation):
+        annotation, is_optional = parts[0], True
+    is_word = isinstance(annotation, type) and issubclass(annotation, Enum)
+    if not is_word and annotation not in _HOLDS:
+        raise TypeError(f"{kind.__name__}.{name}: no output holds {annotation}")
+    words = f"one of {', '.join(str(word.value) for word in annotation)}" if is_word else ""
+    told = "; ".join(filter(None, [meaning or name.replace("_", " "), words]))
+    return Member(told, Holds.TEXT if is_word else _HOLDS[annotation], is_optional=is_optional)
+
+
+_STATUS = Member("how it ended", Holds.RECORD, members_of(Status, ("code", "message")))
 _PROVENANCE = Member("versions, options, SHA-256 of what was read", Holds.WORDS)
 _STATS = Member("figures of the search, as the result's docstring says", Holds.NUMBERS)
+_NAMED = {"name": _text("what the row is of")}
 _FIT = _rows(
     "agreement, a row a log and channel",
-    {
-        "log": _text("name"),
-        "channel": _text("name"),
-        **_numbers(rmse="[unit]", nrmse="over the channel's variation [1]", fit_percent="[%]", samples="compared"),
-        **_numbers(free_run_rmse="simulated to the end [unit]", free_run_nrmse="likewise [1]", noise="[unit]"),
-        "unit": _text("of the channel"),
-    },
+    {"log": _text("name"), "channel": _text("name"), **members_of(AgreementRow)},
     is_open=True,
 )
-_IDENTIFIABLE = {
-    "name": _text("parameter"),
-    **_numbers(value="[its unit]", stderr="expected", relative="over the value", alone="if others were known"),
-    **_numbers(inflation="their ratio"),
-    "identifiable": _flag("whether the logs identify it"),
-}
+_IDENTIFIABLE = {"name": _text("parameter"), **members_of(IdentifiableRow)}
 _VERDICT = Member(
     "what the logs identify; empty where nothing was tried",
     Holds.RECORD,
     {
-        "sentences": Member("in words", Holds.TEXTS, is_optional=True),
-        "unidentifiable": Member("parameters", Holds.TEXTS, is_optional=True),
-        "unchanged": Member("parameters that keep their given values", Holds.TEXTS, is_optional=True),
-        "indistinguishable": Member("parameters that act only together", Holds.GROUPS, is_optional=True),
-        "reasons": Member("by parameter", Holds.WORDS, is_optional=True),
+        **members_of(
+            Verdict,
+            ("sentences", "unidentifiable", "unchanged", "indistinguishable", "reasons"),
+            are_optional=True,
+        ),
         "table": _optional(_rows("a row a free parameter", _IDENTIFIABLE)),
     },
 )
-_ESTIMATES = {
-    "name": _text('parameter, "name[log]" for one of a log'),
-    **_numbers(value="null where it is unidentifiable [unit]", ci_low="95 % [unit]", ci_high="95 % [unit]"),
-    "unit": _text("SI"),
-    "mark": _text("what to think of it"),
-    **_numbers(stderr="[unit]", dof="degrees of freedom", range_low="[unit]", range_high="[unit]"),
-    **_numbers(lower="bound [unit]", upper="bound [unit]"),
-    "at_bound": _flag("whether it is at a bound"),
-    "source": _text("of the given value"),
-    "note": _text("why it has no interval"),
-}
-_WIDTHS = {
-    "name": _text("parameter"),
-    "value": Member("[unit]"),
-    "unit": _text("SI"),
-    "given": Member("before [unit]"),
-    "too_stiff": _flag("whether narrower ones take too many steps"),
-}
-_WINDOW = _numbers(duration="[s]", shortest="tried [s]", longest="tried [s]", gap_share="of the cost [1]")
+_ESTIMATES = {"name": _text('parameter, "name[log]" for one of a log'), **members_of(EstimateRow)}
 _METRICS = "a row a reference or case, a column a metric, in the metric's unit"
 _GAINS = {
     "name": _text("parameter"),
-    **_numbers(value="[unit]"),
-    "unit": _text("SI"),
-    **_numbers(lower="bound [unit]", upper="bound [unit]"),
-    **{n: _flag(n) for n in ("log", "free", "per_log")},
-    "source": _text("of the value"),
+    **members_of(Parameter, ("value", "unit", "lower", "upper", "log", "free", "per_log", "source")),
 }
-_REQUIREMENTS = {
-    "name": _text("metric"),
-    **_numbers(claimed="by the search", certified="by the independent simulation", allowed="limit", room="left [1]"),
-    "case": _text("where it is worst"),
-    "active": _flag("whether it holds the objective back"),
-}
+_REQUIREMENTS = {"name": _text("metric"), **members_of(RequirementRow)}
 _DITHER = {
-    "usefulness": _text("useful, useless, harmful, ..."),
-    "reasons": Member("in words", Holds.TEXTS),
+    **members_of(DitherVerdict, ("usefulness", "reasons")),
     "rival": Member("gains tuned without it", Holds.NUMBERS, is_optional=True),
 }
-_STANDING = {
-    "holds": Member("for the files as they are", Holds.FLAG),
-    "reasons": Member("why not: what was changed", Holds.TEXTS),
-}
-_NAMED = {"name": _text("what the row is of")}
 _READ = {
     **{n: _text(m) for n, m in {"log": "name", "file": "path", "sidecar": "path, or empty"}.items()},
     **{n: Member(n.replace("_", " "), Holds.COUNT) for n in ("rows", "first_row")},
     **_numbers(begin="[s]", end="[s]", sample_time="[s]"),
     "channels": Member("by channel: column, unit and what says so", Holds.RECORDS),
     **{n: Member(m, Holds.TEXTS) for n, m in {"unread": "columns", "remarks": "what was mended or skipped"}.items()},
-}
-_ASSUMED = {
-    "name": _text("parameter or option"),
-    "value": Member("[unit]", Holds.VALUE),
-    "unit": _text("SI"),
-    "key": _text("what states it"),
-}
-_FOUND = {
-    **{n: _text(m) for n, m in {"severity": "fault, doubt or note", "log": "name", "check": "name"}.items()},
-    "rows": Member("first and last", Holds.COUNTS, is_optional=True),
-    "message": _text("what is wrong, and the remedy"),
 }
 _OF_AN_AXIS = {"figure": _text("metric"), "axis": _text("parameter or pattern")}
 _SHARES = _OF_AN_AXIS | _numbers(
@@ -259,8 +266,8 @@ OUTPUTS: Mapping[str, Member] = {
         "`pneuopt check`",
         verdict=_text("whether a fit takes the logs"),
         read=_rows("a row a log", _READ),
-        assumed=_rows("values that stand in no file", _ASSUMED),
-        found=_rows("what is wrong", _FOUND),
+        assumed=_rows("values that stand in no file", members_of(Assumption, ("name", "value", "unit", "key"))),
+        found=_rows("what is wrong", members_of(LogFinding, ("severity", "log", "rows", "check", "message"))),
         identifiable=_rows("a row a free parameter", _IDENTIFIABLE),
         reasons=Member("why one is not, by parameter", Holds.WORDS),
         runs=Member("by run that would help: the parameters", Holds.LISTS),
@@ -271,8 +278,8 @@ OUTPUTS: Mapping[str, Member] = {
         estimates=_rows("a row a free parameter", _ESTIMATES),
         fit=_FIT,
         verdict=_VERDICT,
-        widths=_rows("widths that the logs have chosen", _WIDTHS),
-        window=Member("windows in which logs were fitted", Holds.RECORD, _WINDOW, is_optional=True),
+        widths=_rows("widths that the logs have chosen", members_of(ChosenWidth)),
+        window=Member("windows in which logs were fitted", Holds.RECORD, members_of(ChosenWindow), is_optional=True),
         bootstrap=_optional(_rows("with --bootstrap, a row an estimate", _NAMED, is_open=True)),
         stats=_STATS,
         provenance=_PROVENANCE,
@@ -303,7 +310,9 @@ OUTPUTS: Mapping[str, Member] = {
     "simulate": _output(
         "`pneuopt simulate FIT TUNING`",
         certified=_rows(_METRICS, _NAMED, is_open=True),
-        certificate=Member("whether a tuned.toml's holds", Holds.RECORD, _STANDING, is_optional=True),
+        certificate=Member(
+            "whether a tuned.toml's holds", Holds.RECORD, members_of(CertificateCheck), is_optional=True
+        ),
         provenance=_PROVENANCE,
     ),
     "predict": _output("`pneuopt simulate FIT --log LOG`", fit=_FIT, provenance=_PROVENANCE),

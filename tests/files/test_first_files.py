@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from pneuopt.evaluation.excitation_run import ExcitationRun, excitation_run
-from pneuopt.files.path import read_path
-from pneuopt.files.run_files import PLAYED_FILE, RUN_FILE, run_files
-from pneuopt.files.tuning import read_tuning
+from pneuopt.files.first_files import PLAYED_FILE, RUN_FILE, run_files
+from pneuopt.files.tuning import read_path, read_tuning
 from pneuopt.models.catalog import s25
 
 
