@@ -19,7 +19,7 @@ MAX_FIGURE_BYTES = 120_000
 
 
 def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / ".docs" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -45,7 +45,7 @@ def test_pages_written_by_hand_have_their_tables_and_a_place(pages: ModuleType) 
     assert "| `load.mass` | kg |" in pages.HAND_WRITTEN["keys.md"]()
     assert "**identify**: `pneuopt identify`" in pages.HAND_WRITTEN["outputs.md"]()
     shown = {f"{page}.md" for part in pages.CONTENTS.values() for page in part}
-    assert {p.name for p in (ROOT / ".docs").glob("*.md")} == set(pages.HAND_WRITTEN) <= shown
+    assert {p.name for p in (ROOT / "docs").glob("*.md")} == set(pages.HAND_WRITTEN) <= shown
 
 
 def test_sources_link_to_pages_of_the_site(pages: ModuleType) -> None:
@@ -77,8 +77,8 @@ def test_rows_that_a_docstring_names_stay_as_they_are(pages: ModuleType) -> None
 def test_the_gallery_of_a_clean_clone_shows_what_scripts_have_drawn(pages: ModuleType) -> None:
     scripts = [ROOT / call.split()[0] for _, call, _ in pages.scripts() if call]
     shown = {figure for script in scripts for figure in pages.figures_of(script)}
-    committed = set((ROOT / ".docs" / "figures").glob("*.png"))
-    assert committed <= {ROOT / ".docs" / "figures" / figure.name for figure in shown}, "each is of a script in README"
+    committed = set((ROOT / "docs" / "figures").glob("*.png"))
+    assert committed <= {ROOT / "docs" / "figures" / figure.name for figure in shown}, "each is of a script in README"
     assert len(shown) >= MIN_FIGURES
     assert all(figure.stat().st_size < MAX_FIGURE_BYTES for figure in committed)
 
@@ -96,7 +96,7 @@ def test_a_kept_figure_is_small_and_says_what_drew_it(
     with Image.open(kept) as image:
         assert image.size == (1200, 400)
     assert pages.drawing_command(kept, "problems/tune/p32.py") == command
-    assert pages.drawing_command(ROOT / ".docs/figures/crawl.png", "a.py PATH") == "python a.py PATH --out out"
+    assert pages.drawing_command(ROOT / "docs/figures/crawl.png", "a.py PATH") == "python a.py PATH --out out"
 
 
 def test_a_kept_figure_shows_the_colours_that_were_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_kept_figure_shows_the_colours_that_were_drawn(monkeypatch: pytest.Mon
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning_or_a_broken_link(tmp_path: Path) -> None:
     pytest.importorskip("furo", reason="the group docs is not installed: make docs")
-    pages, site, config = tmp_path / "pages", tmp_path / "site", ROOT / ".docs"
+    pages, site, config = tmp_path / "pages", tmp_path / "site", ROOT / "docs"
     sphinx = ["-m", "sphinx", "-q", "-W", "--keep-going", "-c", str(config), str(pages), str(site)]
     for arguments in ([str(config / "make_pages.py"), str(pages)], sphinx, [str(config / "check_links.py"), str(site)]):
         done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)

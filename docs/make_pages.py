@@ -1,6 +1,6 @@
 """Write the site's pages from what stands elsewhere: README, CONTRIBUTING, docstrings, scripts, the commands' help.
 
-    python .docs/make_pages.py FOLDER
+    python docs/make_pages.py FOLDER
 
 Pages written by hand stand beside this file; keys.md and outputs.md get their tables from the declarations. A source's
 link to what is no page of the site ends this, so that nothing is moved without its readers.
@@ -212,8 +212,8 @@ def escape_asterisks(text: str) -> str:
 
 
 def figures_of(script: Path) -> list[Path]:
-    """What a script has drawn: with `--out out` in this checkout, else as it stands beside the script or in `.docs`."""
-    places = [ROOT / ".docs" / "figures", script.parent, ROOT / "out"]  # a later one replaces an earlier one's figures
+    """What a script has drawn: with `--out out` in this checkout, else as it stands beside the script or in `docs`."""
+    places = [ROOT / "docs" / "figures", script.parent, ROOT / "out"]  # a later one replaces an earlier one's figures
     stems = {own.stem for own in script.parent.glob("*.py")} - {script.stem}
     found = {f.name: f for place in places for f in sorted(place.glob(f"{script.stem}*.png"))}
     longer = [stem for stem in stems if stem.startswith(script.stem)]  # b32_partial.png is no figure of b32.py
