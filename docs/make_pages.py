@@ -59,11 +59,6 @@ CONTENTS = {  # the site's pages by what a reader comes for
     "Results": ["gallery", "paper", "data"],
     "Project": ["contributing", "changelog", "security"],
 }
-TABLES: Mapping[str, Callable[[], str]] = {  # at the ends of pages written by hand
-    "keys.md": lambda: format_markdown(list_keys()),
-    "outputs.md": describe_outputs,
-    "commands.md": lambda: describe_commands(),
-}
 FOLDER = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "build" / "pages"
 
 
@@ -231,6 +226,13 @@ def write_gallery() -> None:
             parts += [f"*Drawn by* `{drawing_command(figure, call)}`", ""]
         parts += [escape_asterisks(text), ""]
     write("gallery.md", "\n".join(parts))
+
+
+TABLES: Mapping[str, Callable[[], str]] = {  # at the ends of pages written by hand
+    "keys.md": lambda: format_markdown(list_keys()),
+    "outputs.md": describe_outputs,
+    "commands.md": describe_commands,
+}
 
 
 def write_all() -> None:

@@ -4,10 +4,10 @@
 
 A page that has commands names in a comment at its head what its folder holds: ``<!-- folder: data/own_rig/*.csv -->``,
 paths of this checkout. In the order of the page are run: blocks of ``console`` (a line that begins with "$ " is a
-command, the lines below it are what it prints), blocks of ``toml`` that begin with "# name.toml" (each line replaces the
-key of its name in that file), and blocks of ``python``. "..." stands for lines that are left out; "exit status 1" as a
-last line is what the command ends with. With --write the numbers on the page become those that were printed; a line
-whose words have changed is named, for a hand to mend it.
+command, the lines below it are what it prints) and blocks of ``toml`` that begin with "# name.toml" (each line replaces
+the key of its name in that file); by themselves, as one program, blocks of ``python``. "..." stands for lines that are
+left out; "exit status 1" as a last line is what the command ends with. With --write the numbers on the page become
+those that were printed; a line whose words have changed is named, for a hand to mend it.
 """
 
 import argparse
@@ -73,18 +73,11 @@ def _commands(lines: list[str], first: int) -> Iterator[Step]:
 
 def run_page(page: Path, folder: Path, *, write: bool = False) -> list[str]:
     """Run a page in a folder; a sentence for each difference from what it shows."""
-    text = page.read_text("utf-8")
-    for pattern in folder_of(text).split():
-        for path in sorted(ROOT.glob(pattern)):
-            _copy(path, folder / (path.name if "*" in pattern else pattern))
-    differences, lines, python = list[str](), text.splitlines(), ""
+    text = fill(page, folder)
+    differences, lines = list[str](), text.splitlines()
     for step in steps(text):
         where = f"{page.name}:{step.line}"
-        if step.kind == "python":
-            python += step.text
-        elif step.kind != "$":
-            replace_keys(folder / step.kind, step.text)
-        else:
+        if step.kind == "$":
             status, printed, said = run(step.text, folder)
             differences += [f"{where}: {step.text}: exit status {status}\n{printed}{said}"] * (
                 status != expected_status(step.shown)
@@ -92,12 +85,26 @@ def run_page(page: Path, folder: Path, *, write: bool = False) -> list[str]:
             found, fresh = compare(step.shown, printed)
             lines[step.line : step.line + len(step.shown)] = fresh
             differences += [f"{where}: {step.text}: {difference}" for difference in found]
-    if python:
-        done = _call([sys.executable, "-c", python], folder)
-        differences += [f"{page.name}: its Python ends with\n{done.stderr}"] * (done.returncode != 0)
+        elif step.kind != "python":
+            replace_keys(folder / step.kind, step.text)
     if write:
         page.write_text("\n".join(lines) + "\n", "utf-8")
     return differences
+
+
+def run_python(page: Path, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run the Python of a page as one program."""
+    code = "".join(step.text for step in steps(fill(page, folder)) if step.kind == "python")
+    return _call([sys.executable, "-c", code], folder)
+
+
+def fill(page: Path, folder: Path) -> str:
+    """Copy into a folder what a page expects there; the page's text."""
+    text = page.read_text("utf-8")
+    for pattern in folder_of(text).split():
+        for path in sorted(ROOT.glob(pattern)):
+            _copy(path, folder / (path.name if "*" in pattern else pattern))
+    return text
 
 
 def run(command: str, folder: Path) -> tuple[int, str, str]:
@@ -171,7 +178,7 @@ def _squeeze(line: str) -> str:
 def _copy(path: Path, place: Path) -> None:
     place.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
-        shutil.copytree(path, place)
+        shutil.copytree(path, place, dirs_exist_ok=True)
     else:
         shutil.copy(path, place)
 
@@ -193,5 +200,9 @@ if __name__ == "__main__":
     for shown_page in options.pages:
         with tempfile.TemporaryDirectory() as empty:
             wrong += run_page(shown_page.resolve(), Path(empty), write=options.write)
+        with tempfile.TemporaryDirectory() as empty:
+            wrong += [
+                f"{shown_page}: {done.stderr}" for done in [run_python(shown_page, Path(empty))] if done.returncode
+            ]
     print("\n".join([*wrong, f"{len(wrong)} differences"]))
     sys.exit(bool(wrong))

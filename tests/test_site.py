@@ -1,6 +1,7 @@
 """The site: every public name has its page, no source links to what is none; the slow part builds it."""
 
 import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -42,18 +43,22 @@ def test_every_public_name_and_script_has_its_place(pages: ModuleType) -> None:
 
 
 def test_pages_written_by_hand_have_their_tables_and_a_place(pages: ModuleType) -> None:
-    assert "| `load.mass` | kg |" in pages.HAND_WRITTEN["keys.md"]()
-    assert "**identify**: `pneuopt identify`" in pages.HAND_WRITTEN["outputs.md"]()
+    assert "| `load.mass` | kg |" in pages.TABLES["keys.md"]()
+    assert "**identify**: `pneuopt identify`" in pages.TABLES["outputs.md"]()
     shown = {f"{page}.md" for part in pages.CONTENTS.values() for page in part}
-    assert {p.name for p in (ROOT / "docs").glob("*.md")} == set(pages.HAND_WRITTEN) <= shown
+    assert set(pages.PAGES.values()) - {"index.md"} == shown - {"api/index.md"}
+    assert set(pages.TABLES) <= set(pages.BY_HAND)
 
 
 def test_sources_link_to_pages_of_the_site(pages: ModuleType) -> None:
-    for title, _ in pages.SECTIONS.values():
-        pages.localise(pages.section(title), "", "index.md")
+    for source in pages.PAGES:
+        pages.localise((ROOT / source).read_text("utf-8"), str(Path(source).parent))
     with pytest.raises(AssertionError, match=r"a link to LICENSE, of which the site has no page"):
-        pages.localise("[licence](LICENSE)", "", "index.md")
-    assert pages.localise("[words](#concept-map)", "", "index.md") == "[words](concepts.md)"
+        pages.localise("[licence](LICENSE)", "")
+    with pytest.raises(AssertionError, match=r"a link to docs/no.md, which is not there"):
+        pages.localise("[no](docs/no.md)", "")
+    assert pages.localise("[words](logs.md#formats)", "docs") == "[words](logs.md#formats)"
+    assert pages.localise("[b32](../problems/identify/b32.py)", "docs") == "[b32](gallery.md#b32)"
     assert pages.link_names("see `tune`\n```\n`tune`\n```") == "see {py:obj}`tune <pneuopt.tune>`\n```\n`tune`\n```"
 
 
@@ -78,7 +83,9 @@ def test_the_gallery_of_a_clean_clone_shows_what_scripts_have_drawn(pages: Modul
     scripts = [ROOT / call.split()[0] for _, call, _ in pages.scripts() if call]
     shown = {figure for script in scripts for figure in pages.figures_of(script)}
     committed = set((ROOT / "docs" / "figures").glob("*.png"))
-    assert committed <= {ROOT / "docs" / "figures" / figure.name for figure in shown}, "each is of a script in README"
+    assert committed <= {ROOT / "docs" / "figures" / figure.name for figure in shown}, "each is of a script"
+    linked = set(re.findall(r"\(\.\./docs/figures/(\S+?)\)", (ROOT / "problems" / "README.md").read_text("utf-8")))
+    assert linked == {figure.name for figure in committed}, "the table of claims links them"
     assert len(shown) >= MIN_FIGURES
     assert all(figure.stat().st_size < MAX_FIGURE_BYTES for figure in committed)
 
