@@ -312,6 +312,8 @@ def test_the_version_is_that_of_the_newest_changes() -> None:
     newest = re.search(r"^## ([\d.]+)( \(unreleased\))?$", text, re.MULTILINE)
     assert newest is not None
     assert pneuopt.__version__ == newest[1] + (".dev0" if newest[2] else "")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.findall(r"^version: (.+)$", citation, re.MULTILINE) == [pneuopt.__version__]
 
 
 def test_the_data_are_those_that_the_readme_lists() -> None:
