@@ -30,9 +30,9 @@ lint: .venv/installed
 
 docs: .venv/installed
 	$(PY) -m pip install --quiet --disable-pip-version-check --group docs
-	$(PY) .docs/make_pages.py build/pages
-	$(PY) -m sphinx --quiet --fail-on-warning --keep-going -c .docs build/pages build/docs
-	$(PY) .docs/check_links.py build/docs
+	$(PY) docs/make_pages.py build/pages
+	$(PY) -m sphinx --quiet --fail-on-warning --keep-going -c docs build/pages build/docs
+	$(PY) docs/check_links.py build/docs
 
 format: .venv/installed
 	$(PY) -m ruff format .

@@ -1,4 +1,4 @@
-"""The package's face: lazy names, their stub, the README's code and the data's sums."""
+"""The package's face: lazy names, their stub, the tables of scripts and the data's sums."""
 
 import ast
 import hashlib
@@ -308,10 +308,12 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 
 
 def test_the_version_is_that_of_the_newest_changes() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    newest = re.search(r"^## Changelog\n+\*\*([\d.]+)( \(unreleased\))?\*\*", text, re.MULTILINE)
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    newest = re.search(r"^## ([\d.]+)( \(unreleased\))?$", text, re.MULTILINE)
     assert newest is not None
     assert pneuopt.__version__ == newest[1] + (".dev0" if newest[2] else "")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.findall(r"^version: (.+)$", citation, re.MULTILINE) == [pneuopt.__version__]
 
 
 def test_the_data_are_those_that_the_readme_lists() -> None:
@@ -323,21 +325,11 @@ def test_the_data_are_those_that_the_readme_lists() -> None:
         assert hashlib.sha256((ROOT / "data" / path).read_bytes()).hexdigest() == digest
 
 
-def test_the_readme_names_scripts_that_exist() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_the_table_of_claims_names_scripts_that_exist() -> None:
+    text = (ROOT / "problems" / "README.md").read_text(encoding="utf-8")
     named = set(re.findall(r"problems/\w+/\w+\.py", text))
     scripts = (p for p in (ROOT / "problems").rglob("*.py") if "__main__" in p.read_text(encoding="utf-8"))
     assert named == {p.relative_to(ROOT).as_posix() for p in scripts}
-
-
-@pytest.mark.slow
-def test_the_readmes_code_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(ROOT)
-    exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
-    printed = capsys.readouterr().out
-    assert "friction.coulomb" in printed
-    assert "SettlingTime" in printed
 
 
 def imports_of(path: Path) -> set[str]:

@@ -1,6 +1,7 @@
 """The site: every public name has its page, no source links to what is none; the slow part builds it."""
 
 import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +20,7 @@ MAX_FIGURE_BYTES = 120_000
 
 
 def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / ".docs" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -42,18 +43,22 @@ def test_every_public_name_and_script_has_its_place(pages: ModuleType) -> None:
 
 
 def test_pages_written_by_hand_have_their_tables_and_a_place(pages: ModuleType) -> None:
-    assert "| `load.mass` | kg |" in pages.HAND_WRITTEN["keys.md"]()
-    assert "**identify**: `pneuopt identify`" in pages.HAND_WRITTEN["outputs.md"]()
+    assert "| `load.mass` | kg |" in pages.TABLES["keys.md"]()
+    assert "**identify**: `pneuopt identify`" in pages.TABLES["outputs.md"]()
     shown = {f"{page}.md" for part in pages.CONTENTS.values() for page in part}
-    assert {p.name for p in (ROOT / ".docs").glob("*.md")} == set(pages.HAND_WRITTEN) <= shown
+    assert set(pages.PAGES.values()) - {"index.md"} == shown - {"api/index.md"}
+    assert set(pages.TABLES) <= set(pages.BY_HAND)
 
 
 def test_sources_link_to_pages_of_the_site(pages: ModuleType) -> None:
-    for title, _ in pages.SECTIONS.values():
-        pages.localise(pages.section(title), "", "index.md")
+    for source in pages.PAGES:
+        pages.localise((ROOT / source).read_text("utf-8"), str(Path(source).parent))
     with pytest.raises(AssertionError, match=r"a link to LICENSE, of which the site has no page"):
-        pages.localise("[licence](LICENSE)", "", "index.md")
-    assert pages.localise("[words](#concept-map)", "", "index.md") == "[words](concepts.md)"
+        pages.localise("[licence](LICENSE)", "")
+    with pytest.raises(AssertionError, match=r"a link to docs/no.md, which is not there"):
+        pages.localise("[no](docs/no.md)", "")
+    assert pages.localise("[words](logs.md#formats)", "docs") == "[words](logs.md#formats)"
+    assert pages.localise("[b32](../problems/identify/b32.py)", "docs") == "[b32](gallery.md#b32)"
     assert pages.link_names("see `tune`\n```\n`tune`\n```") == "see {py:obj}`tune <pneuopt.tune>`\n```\n`tune`\n```"
 
 
@@ -77,8 +82,10 @@ def test_rows_that_a_docstring_names_stay_as_they_are(pages: ModuleType) -> None
 def test_the_gallery_of_a_clean_clone_shows_what_scripts_have_drawn(pages: ModuleType) -> None:
     scripts = [ROOT / call.split()[0] for _, call, _ in pages.scripts() if call]
     shown = {figure for script in scripts for figure in pages.figures_of(script)}
-    committed = set((ROOT / ".docs" / "figures").glob("*.png"))
-    assert committed <= {ROOT / ".docs" / "figures" / figure.name for figure in shown}, "each is of a script in README"
+    committed = set((ROOT / "docs" / "figures").glob("*.png"))
+    assert committed <= {ROOT / "docs" / "figures" / figure.name for figure in shown}, "each is of a script"
+    linked = set(re.findall(r"\(\.\./docs/figures/(\S+?)\)", (ROOT / "problems" / "README.md").read_text("utf-8")))
+    assert linked == {figure.name for figure in committed}, "the table of claims links them"
     assert len(shown) >= MIN_FIGURES
     assert all(figure.stat().st_size < MAX_FIGURE_BYTES for figure in committed)
 
@@ -96,7 +103,7 @@ def test_a_kept_figure_is_small_and_says_what_drew_it(
     with Image.open(kept) as image:
         assert image.size == (1200, 400)
     assert pages.drawing_command(kept, "problems/tune/p32.py") == command
-    assert pages.drawing_command(ROOT / ".docs/figures/crawl.png", "a.py PATH") == "python a.py PATH --out out"
+    assert pages.drawing_command(ROOT / "docs/figures/crawl.png", "a.py PATH") == "python a.py PATH --out out"
 
 
 def test_a_kept_figure_shows_the_colours_that_were_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -118,7 +125,7 @@ def test_a_kept_figure_shows_the_colours_that_were_drawn(monkeypatch: pytest.Mon
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning_or_a_broken_link(tmp_path: Path) -> None:
     pytest.importorskip("furo", reason="the group docs is not installed: make docs")
-    pages, site, config = tmp_path / "pages", tmp_path / "site", ROOT / ".docs"
+    pages, site, config = tmp_path / "pages", tmp_path / "site", ROOT / "docs"
     sphinx = ["-m", "sphinx", "-q", "-W", "--keep-going", "-c", str(config), str(pages), str(site)]
     for arguments in ([str(config / "make_pages.py"), str(pages)], sphinx, [str(config / "check_links.py"), str(site)]):
         done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)

@@ -201,6 +201,11 @@ def worst(certified: "pd.DataFrame", metric: str) -> float:
     return float(np.max(certified.loc[metric].to_numpy(dtype=float)))
 
 
+def figures(demo: Demo) -> "dict[str, Figure]":
+    """All panels, and the two that stand at the head of README."""
+    return {"rig_demo": figure(demo), "rig_demo_before_after": before_and_after(demo)}
+
+
 def figure(demo: Demo) -> "Figure":
     picture, grid = axes_grid(5, 2, (1.5, 2.1, 1.3, 1.5, 1.4), width=8.0)
     _draw_log(grid[0][0], demo)
@@ -225,6 +230,21 @@ def figure(demo: Demo) -> "Figure":
     ):
         ax.set_ylabel(label)
     legend_above(picture, grid[1][0])
+    return picture
+
+
+def before_and_after(demo: Demo) -> "Figure":
+    """The speed on the rig model with the hand-tuned PID and with PID and dither tuned together, a panel each."""
+    picture, ((before, after),) = axes_grid(1, 2, (2.0,), width=8.0)
+    for ax, name, text in ((before, "hand", "before: hand-tuned PID,"), (after, "tuned", "after: PID and dither,")):
+        for step in (STEPS[0], STEPS[2]):
+            run = po.respond(the_rig(), step, rig_parameters(demo.designs[name].parameters))
+            ax.plot(run.t, run["speed"], color=SHOWN[name][0], lw=1.4)
+            ax.axhline(step.final, color="k", lw=0.8, ls="--")
+        ax.set_title(f"{text} {_settled(demo.designs[name])}", fontsize=10)
+        ax.set(xlabel="time [s]", xlim=(0, min(step.horizon for step in STEPS)), ylim=(-0.36, 0.29))
+    before.set_ylabel("speed [m/s]")
+    after.tick_params(labelleft=False)
     return picture
 
 
@@ -281,4 +301,4 @@ def _draw_friction(ax: "Axes", demo: Demo) -> None:
 if __name__ == "__main__":
     options = arguments(__doc__).parse_args()
     demo = run()
-    sys.exit(finish(main(demo), options, lambda: {"rig_demo": figure(demo)}))
+    sys.exit(finish(main(demo), options, lambda: figures(demo)))

@@ -68,8 +68,14 @@ def test_foreign_rig() -> None:
 def test_rig_demo(tmp_path: Path) -> None:
     demo = rig_demo.run()
     assert failed(rig_demo.main(demo)) == []
-    rig_demo.figure(demo).savefig(tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").stat().st_size > 10_000
+    figures = rig_demo.figures(demo)
+    assert set(figures) == {"rig_demo", "rig_demo_before_after"}
+    titles = [ax.get_title() for ax in figures["rig_demo_before_after"].axes]
+    assert titles[0] == "before: hand-tuned PID, never settles"
+    assert titles[1].startswith("after: PID and dither, mean settles in 0.2")
+    for name, figure in figures.items():
+        figure.savefig(tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -1,9 +1,9 @@
-"""Write the site's pages from what stands elsewhere: README, CONTRIBUTING, docstrings, scripts, the commands' help.
+"""Write the site's pages: those beside this file, README, CHANGELOG and others, docstrings, scripts, commands' help.
 
-    python .docs/make_pages.py FOLDER
+    python docs/make_pages.py FOLDER
 
-Pages written by hand stand beside this file; keys.md and outputs.md get their tables from the declarations. A source's
-link to what is no page of the site ends this, so that nothing is moved without its readers.
+keys.md, outputs.md and commands.md get their tables from the declarations. A source's link to a file that is no page of
+the site ends this, so that nothing is moved without its readers.
 """
 
 import ast
@@ -25,18 +25,16 @@ from pneuopt.files.keys import list_keys
 from pneuopt.files.outputs import describe_outputs
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text("utf-8")
+BY_HAND = sorted(path.name for path in Path(__file__).parent.glob("*.md"))
 PAGES = {  # of the site, for the files that the sources link to
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
     "data/README.md": "data.md",
+    "problems/README.md": "gallery.md",
     "problems/paper/README.md": "paper.md",
-}
-SECTIONS = {  # pages of README's sections
-    "tutorial.md": ("Your own rig", "# Tutorial: your own rig"),
-    "jobs.md": ("The three jobs", "# How to: the three jobs"),
-    "concepts.md": ("Concept map", "# Concepts"),
-    "changelog.md": ("Changelog", "# Changelog"),
+    **{f"docs/{name}": name for name in BY_HAND},
 }
 ROOMS = {  # whose public names have a page, in the order in which data go through them
     "logs": "Logs",
@@ -55,17 +53,11 @@ ROOMS = {  # whose public names have a page, in the order in which data go throu
     "quantities": "Numbers, trajectories, errors",
 }
 CONTENTS = {  # the site's pages by what a reader comes for
-    "Learn": ["tutorial", "jobs", "concepts", "theory", "validated"],
-    "Look up": ["commands", "keys", "outputs", "api/index"],
+    "Learn": ["own_rig", "how_to", "concepts", "logs", "certificate", "export", "install"],
+    "Look up": ["commands", "keys", "outputs", "reference", "api/index"],
+    "Understand": ["theory", "validated", "decisions"],
     "Results": ["gallery", "paper", "data"],
-    "Project": ["contributing", "decisions", "changelog"],
-}
-HAND_WRITTEN: Mapping[str, Callable[[], str]] = {  # the pages beside this file, and the tables at their ends
-    "theory.md": str,
-    "validated.md": str,
-    "decisions.md": str,
-    "keys.md": lambda: format_markdown(list_keys()),
-    "outputs.md": describe_outputs,
+    "Project": ["contributing", "changelog", "security"],
 }
 FOLDER = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "build" / "pages"
 
@@ -77,31 +69,25 @@ def write(page: str, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def section(title: str) -> str:
-    """The text below a heading of README."""
-    found = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", README, re.DOTALL | re.MULTILINE)
-    assert found is not None, f"README has no section {title!r}"
-    return found[1]
-
-
-def localise(text: str, folder: str, page: str) -> str:
+def localise(text: str, folder: str) -> str:
     """A source's text with its links turned into the site's; figures are copied into it."""
 
     def turn(found: re.Match[str]) -> str:
         label, target = found[1], found[2]
-        if target.startswith(("http:", "https:")):
-            return found[0]
         path, _, anchor = target.partition("#")
-        if not path:
-            return f"[{label}]({home_of(anchor, page)})"
+        if not path or target.startswith(("http:", "https:")):
+            return found[0]
         file = (ROOT / folder / path).resolve().relative_to(ROOT).as_posix()
+        assert (ROOT / file).exists(), f"{folder or 'README'}: a link to {target}, which is not there"
         if file.endswith(".png"):
             copy_figure(file)
-            return f"[{label}](figures/{Path(file).name})"
+            return f"{label}](figures/{Path(file).name})"
+        if file.endswith(".py"):
+            return f"{label}](gallery.md#{Path(file).stem.replace('_', '-')})"
         assert file in PAGES, f"{folder or 'README'}: a link to {target}, of which the site has no page"
-        return f"[{label}]({home_of(anchor, PAGES[file]) if anchor else PAGES[file]})"
+        return f"{label}]({PAGES[file]}{'#' * bool(anchor)}{anchor})"
 
-    return link_names(re.sub(r"(?<=\[)([^\]]*)\]\(([^)\s]+)\)", lambda m: turn(m)[1:], text))
+    return link_names(re.sub(r"(?<=\[)([^\]]*)\]\(([^)\s]+)\)", turn, text))
 
 
 def link_names(text: str) -> str:
@@ -118,14 +104,6 @@ def link_to(name: str, text: str) -> str:
     """The link to a public name's page; the text itself where it is none."""
     is_public = not name.startswith("_") and name in pneuopt.__all__
     return f"{{py:obj}}`{name} <pneuopt.{name}>`" if is_public else text
-
-
-def home_of(anchor: str, page: str) -> str:
-    """The page of README's section with an anchor, or the anchor on the page itself."""
-    for name, (title, _) in SECTIONS.items():
-        if re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") == anchor:
-            return name
-    return f"#{anchor}" if page not in SECTIONS else f"{page}#{anchor}"
 
 
 def copy_figure(file: str) -> None:
@@ -177,8 +155,8 @@ def table_of_contents(caption: str, pages: list[str], *, hidden: bool) -> list[s
     return ["```{toctree}", *options, "", *pages, "```", ""]
 
 
-def write_commands() -> None:
-    """What each command says of itself, at 80 columns."""
+def describe_commands() -> str:
+    """The help of each command, at 80 columns."""
     environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1", "TERM": "dumb"}
 
     def ask(*words: str) -> str:
@@ -189,21 +167,20 @@ def write_commands() -> None:
     first = ask()
     names = re.findall(r"^  ([a-z][a-z-]+) {2,}\S", first.partition("Commands:")[2], re.MULTILINE)
     assert len(names) > 5, f"no commands in {first!r}"
-    parts = ["# Commands", "", f"```text\n{first}\n```", ""]
+    parts = ["", f"```text\n{first}\n```", ""]
     for name in names:
         parts += [f"## pneuopt {name}", "", f"```text\n{ask(name)}\n```", ""]
-    write("commands.md", "\n".join(parts))
+    return "\n".join(parts)
 
 
 def scripts() -> Iterator[tuple[str, str, str]]:
-    """Group, path with arguments, and result of each row of README's table of results; a group's row has no path."""
-    group = ""
-    for first, second in re.findall(r"^\| (.+?) \| ?(.*?) ?\|$", section("Results"), re.MULTILINE):
-        if first.startswith("**"):
-            group = first.strip("*")
-            yield group, "", second
-        elif first.startswith("`"):
-            yield group, first.strip("`"), second
+    """Group, path with arguments, and result of each script in problems/README.md; a group's lead has no path."""
+    text = (ROOT / "problems" / "README.md").read_text("utf-8")
+    for group, body in re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL):
+        lead, _, table = body.partition("| script |")
+        yield group, "", lead.strip()
+        for call, result in re.findall(r"^\| `(.+?)` \| (.*?) \|[^|]*\|$", table, re.MULTILINE):
+            yield group, call, result
 
 
 def escape_asterisks(text: str) -> str:
@@ -213,8 +190,8 @@ def escape_asterisks(text: str) -> str:
 
 
 def figures_of(script: Path) -> list[Path]:
-    """What a script has drawn: with `--out out` in this checkout, else as it stands beside the script or in `.docs`."""
-    places = [ROOT / ".docs" / "figures", script.parent, ROOT / "out"]  # a later one replaces an earlier one's figures
+    """What a script has drawn: with `--out out` in this checkout, else as it is kept in docs/figures."""
+    places = [ROOT / "docs" / "figures", ROOT / "out"]  # a later one replaces an earlier one's figures
     stems = {own.stem for own in script.parent.glob("*.py")} - {script.stem}
     found = {f.name: f for place in places for f in sorted(place.glob(f"{script.stem}*.png"))}
     longer = [stem for stem in stems if stem.startswith(script.stem)]  # b32_partial.png is no figure of b32.py
@@ -229,18 +206,18 @@ def drawing_command(figure: Path, call: str) -> str:
 
 def write_gallery() -> None:
     """Every claim script with its result, its figures (`figures_of`) and the command that draws them."""
-    lead = section("Results").partition("|")[0].strip()
-    parts = ["# Gallery", "", localise(lead, "", "gallery.md"), ""]
+    lead = (ROOT / "problems" / "README.md").read_text("utf-8").partition("\n## ")[0]
+    parts = [localise(lead, "problems"), ""]
     for group, call, result in scripts():
         if not call:
-            parts += [f"## {group}", "", localise(result, "", "gallery.md"), ""]
+            parts += [f"## {group}", "", localise(result, "problems"), ""]
             continue
         path = ROOT / call.split()[0]
         text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
         parts += [
             f"### {path.stem.replace('_', ' ')}",
             "",
-            localise(result[:1].upper() + result[1:], "", "gallery.md") + ".",
+            localise(result[:1].upper() + result[1:], "problems") + ".",
             "",
         ]
         for figure in figures_of(path):
@@ -251,20 +228,23 @@ def write_gallery() -> None:
     write("gallery.md", "\n".join(parts))
 
 
+TABLES: Mapping[str, Callable[[], str]] = {  # at the ends of pages written by hand
+    "keys.md": lambda: format_markdown(list_keys()),
+    "outputs.md": describe_outputs,
+    "commands.md": describe_commands,
+}
+
+
 def write_all() -> None:
     """All pages."""
-    head = README.partition("\n## The three jobs")[0]
-    contents = [table_of_contents(caption, pages, hidden=True) for caption, pages in CONTENTS.items()]
-    write("index.md", "\n".join([localise(head, "", "index.md"), "", *(line for part in contents for line in part)]))
-    for page, (title, heading) in SECTIONS.items():
-        write(page, f"{heading}\n\n{localise(section(title), '', page)}")
+    contents = [line for caption, pages in CONTENTS.items() for line in table_of_contents(caption, pages, hidden=True)]
     for source, page in PAGES.items():
-        if page != "index.md":
-            write(page, localise((ROOT / source).read_text("utf-8"), str(Path(source).parent), page))
-    for page, table in HAND_WRITTEN.items():
-        write(page, Path(__file__).with_name(page).read_text("utf-8") + table())
+        if page == "gallery.md":
+            continue
+        text = localise((ROOT / source).read_text("utf-8"), str(Path(source).parent))
+        end = "\n".join(["", *contents]) if page == "index.md" else TABLES.get(page, str)()
+        write(page, text + "\n" + end)
     write_api()
-    write_commands()
     write_gallery()
 
 

@@ -1,6 +1,6 @@
 """Keep figures that scripts have drawn with --out for the gallery of a clean clone: small, with what drew them.
 
-python .docs/keep_figures.py out/FIGURE.png ...
+python docs/keep_figures.py out/FIGURE.png ...
 """
 
 import sys
@@ -17,7 +17,7 @@ PALETTE = {"colors": 256, "method": Image.Quantize.MAXCOVERAGE, "dither": Image.
 
 
 def keep(path: Path) -> Path:
-    """Write a figure into `.docs/figures`, at most WIDTH wide, in a palette, with its Description."""
+    """Write a figure into `docs/figures`, at most WIDTH wide, in a palette, with its Description."""
     said = PngInfo()
     with Image.open(path) as drawn:
         said.add_text("Description", drawn.info["Description"])

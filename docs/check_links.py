@@ -1,6 +1,6 @@
 """Check that each link of the built site leads somewhere, and that no page fetches anything from elsewhere.
 
-    python .docs/check_links.py FOLDER
+    python docs/check_links.py FOLDER
 
 Exit status 1 and a line for each that does not. Addresses on other machines are counted, not visited.
 """
