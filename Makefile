@@ -43,7 +43,7 @@ format: .venv/installed
 	$(PYTHON) -m venv .venv
 	$(PY) -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
 	$(PY) -m pip install --quiet --disable-pip-version-check --editable . --group dev
-	$(PY) -c "import os, sys; from pneuopt.dynamics.compiled.toolchain import find_compiler; sys.exit(not (find_compiler() or os.environ.get('PNEUOPT_CC') == ''))" \
+	$(PY) -c "import os, sys; from pneuopt.dynamics.compiled.compiler import find_compiler; sys.exit(not (find_compiler() or os.environ.get('PNEUOPT_CC') == ''))" \
 		|| $(PY) -m pip install --quiet --disable-pip-version-check --editable ".[compiler]" \
 		|| $(PY) -c "print('no C compiler could be installed: everything runs without one, more slowly')"
 	$(PY) -c "open('.venv/installed', 'w').close()"

@@ -20,7 +20,7 @@ from types import ModuleType
 from PIL import Image
 
 import pneuopt
-from pneuopt.cli.keys import format_markdown
+from pneuopt.cli.info import format_markdown
 from pneuopt.files.keys import list_keys
 from pneuopt.files.outputs import describe_outputs
 

@@ -38,35 +38,38 @@ from .dynamics.python_control import from_control, to_control
 from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
 from .dynamics.stick_slip import EventKind
 from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
-from .evaluation.band import Tolerance
-from .evaluation.certificate import Certificate, certificate
-from .evaluation.compensator_verdict import CompensatorVerdict, judge_compensators
-from .evaluation.defects import Defect, Finding
-from .evaluation.distributions import LogNormal, LogUniform, Normal, Uniform
-from .evaluation.dither_effect import dither_effect
-from .evaluation.dither_verdict import DitherVerdict, Usefulness, judge_dither
-from .evaluation.energy import EnergyUse
+from .evaluation.certificate import Certificate, Defect, Finding, certificate
+from .evaluation.dither import (
+    CompensatorVerdict,
+    DitherVerdict,
+    Usefulness,
+    dither_effect,
+    judge_compensators,
+    judge_dither,
+)
 from .evaluation.evaluate import evaluate, respond
-from .evaluation.excitation_run import ExcitationRun, excitation_run
-from .evaluation.expected_plants import ExpectedPlants, expected_plants
 from .evaluation.limit_cycle import LimitCycle, find_limit_cycle
 from .evaluation.margins import Margins, frequency_response, margins
+from .evaluation.metric import Tolerance
 from .evaluation.metrics import BandCentre, step_metrics
-from .evaluation.monte_carlo import monte_carlo
-from .evaluation.motion_requirements import Compliance, FollowingError, FollowingErrorRMS, OvershootDistance
-from .evaluation.move_check import check_move, shortest_move
-from .evaluation.record import Recording, record
+from .evaluation.moves import ExcitationRun, check_move, excitation_run, shortest_move
+from .evaluation.plants import ExpectedPlants, expected_plants, monte_carlo
 from .evaluation.requirements import (
     IAE,
     ISE,
     ITAE,
     AirUse,
+    Compliance,
     ControlRate,
+    EnergyUse,
+    FollowingError,
+    FollowingErrorRMS,
     GainMargin,
     MaxComplementarySensitivity,
     MaxSensitivity,
     NoiseGain,
     Overshoot,
+    OvershootDistance,
     PeakControl,
     PhaseMargin,
     Ripple,
@@ -76,9 +79,23 @@ from .evaluation.requirements import (
     StepEnvelope,
 )
 from .evaluation.rest_check import NoHunting, RestCase, RestCheck, RestKind, check_rest
-from .evaluation.rig import Actuator, Rig, Sensor
-from .evaluation.sampling import Sampling
-from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
+from .evaluation.rig import Actuator, Recording, Rig, Sensor, record
+from .evaluation.scenarios import (
+    Factor,
+    LogNormal,
+    LogUniform,
+    Normal,
+    Sampling,
+    Uniform,
+    apply_scenario,
+    corners,
+    draws,
+    samples,
+    tolerances,
+)
+from .experiments.design import AOptimal, DOptimal, ExperimentDesign, Precision, WantedPrecision
+from .experiments.next_experiment import next_experiment
+from .experiments.outlook import DesignOutlook, predict_loss
 from .export.blocks import export_settings
 from .export.fmu import export_fmu
 from .export.languages import Language, export_controller
@@ -87,32 +104,28 @@ from .files.drive import read_drive, write_fit
 from .files.results import load_result
 from .files.tuned import write_tuned
 from .files.tuning import read_path, read_tuning
-from .identification.assumptions import Assumption
-from .identification.checkup import Checkup, check
+from .identification.checkup import Assumption, Checkup, check
 from .identification.compare_logs import LogComparison, compare_logs
-from .identification.criteria import AOptimal, DOptimal, Precision, WantedPrecision
-from .identification.design_outlook import DesignOutlook, predict_loss
 from .identification.examination import examine_logs
-from .identification.experiment_design import ExperimentDesign
 from .identification.identifiability import identifiability
 from .identification.identify import identify, predict, validate
 from .identification.losses import Huber, SoftL1
-from .identification.next_experiment import next_experiment
-from .identification.profiles import Profile, profile
-from .identification.propagation import PropagatedValue, propagate_error
+from .identification.profiles import Profile, PropagatedValue, profile, propagate_error
 from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
 from .identification.select_model import ModelSelection, select_model
 from .identification.tracking import Tracking, track
-from .logs.checks.findings import LogFinding, Severity
-from .logs.experiments import Experiment, differentiate, resample, split
+from .logs.doctor import LogFinding, Severity
+from .logs.experiment import Experiment, differentiate, resample, split
 from .logs.read_log import read_log
 from .models import catalog
-from .models.drive import ForceDrive, MotionDrive
 from .models.drive_kinds import stick_slip_drive
+from .models.drives import ForceDrive, MotionDrive, RotaryDrive
 from .models.friction import (
     Asymmetric,
     Coulomb,
+    LoadDependent,
     LuGre,
+    Presliding,
     PressureDependent,
     Stribeck,
     Viscous,
@@ -121,14 +134,11 @@ from .models.friction_laws import friction_ladder
 from .models.karnopp import Karnopp
 from .models.linear import FirstOrder, Integrator, SecondOrder
 from .models.load import Load
-from .models.load_dependent import LoadDependent
 from .models.pneumatic.chamber import Polytropic, Thermal
 from .models.pneumatic.cylinder import Cylinder
 from .models.pneumatic.drive import PneumaticDrive
 from .models.pneumatic.gas import IsentropicNozzle, Iso6358
 from .models.pneumatic.valve import ProportionalValve, Spool
-from .models.presliding import Presliding
-from .models.rotary import RotaryDrive
 from .models.sensing import coarse_delay, with_sensors
 from .plotting import (
     plot_bode,
@@ -148,27 +158,21 @@ from .plotting import (
     save_figure,
 )
 from .quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
-from .quantities.intersample import Intersample
-from .quantities.parameters import Parameter, ParameterSet, Quantity
-from .quantities.progress import Progress
+from .quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
 from .quantities.report import Report
-from .quantities.status import Code, Status
+from .quantities.status import Code, Progress, Status
 from .quantities.trajectories import Trajectory
-from .report.write_report import write_report
+from .report.tuning_page import write_report
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
 from .studies.batch import BatchEvaluation, evaluate_batch
 from .studies.bootstrap import Bootstrap, bootstrap
-from .studies.cases import grid, read_cases
-from .studies.cluster import open_executor
-from .studies.journal import Journal
-from .studies.local_sensitivity import LocalSensitivity, local_sensitivity
+from .studies.executors import Processes, open_executor
+from .studies.journal import Journal, RowFile
 from .studies.neighbours import search_again, sweep_from_neighbours
-from .studies.processes import Processes
-from .studies.row_file import RowFile
-from .studies.sensitivity import Sensitivity, sensitivity
-from .studies.sweep import sweep
-from .tuning.pareto import pareto_front
+from .studies.sensitivity import LocalSensitivity, Sensitivity, local_sensitivity, sensitivity
+from .studies.sweep import grid, read_cases, sweep
+from .tuning.front import pareto_front
 from .tuning.racing import Racing
 from .tuning.tune import TuningResult, certify, tune
 from .tuning.two_phase import TwoPhase

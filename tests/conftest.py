@@ -18,17 +18,18 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.compiled import compiler, library_cache, toolchain
-from pneuopt.dynamics.compiled import pieces as kernels
+from pneuopt.dynamics.compiled import compiler
+from pneuopt.dynamics.compiled import compiler as library_cache
+from pneuopt.dynamics.compiled import compiler as toolchain
+from pneuopt.dynamics.compiled import rollout as kernels
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define
 from pneuopt.models.catalog import t32
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.linearised import LinearisedProblem
+from pneuopt.tuning.gradients import LinearisedProblem
 
 # a run of CI fails for what was changed, not for the examples that chance drew; at a desk each run draws new ones
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)

@@ -3,39 +3,181 @@
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 70 an
 error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated. Each command imports what it
 needs, so that `--help` waits for no heavy import.
+
+What `pneuopt --help` says of each command in a line, and the examples and pointers below a command's own help.
+
+Options that several commands have.
 """
 
 from collections.abc import Callable
 from math import inf
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 from typer.models import CommandFunctionType
 
-from pneuopt.cli.command_help import COMMAND_HELP, epilog
 from pneuopt.cli.errors import report_errors
-from pneuopt.cli.guard import run_guarded
-from pneuopt.cli.options import (
-    Accept,
-    Between,
-    CsvFile,
-    Draws,
-    ExecutorAt,
-    HeldOut,
-    Json,
-    LogFiles,
-    Plot,
-    Quiet,
-    ReportFile,
-    RigFile,
-    RunOf,
-    RunSampleTime,
-    RunSpeed,
-    SearchBudget,
-    Window,
-)
+from pneuopt.cli.run import run_guarded
 from pneuopt.quantities.errors import require
+
+
+class CommandHelp(NamedTuple):
+    """A line for the list of commands, lines to type, and where the result goes next."""
+
+    line: str
+    examples: tuple[str, ...]
+    pointer: str = ""
+
+
+COMMAND_HELP = {
+    "init": CommandHelp(
+        "Write the first files, every key explained.",
+        (
+            "pneuopt init pneumatic --cylinder 32 --valve 700",
+            "pneuopt init --from run_01.csv",
+            "pneuopt init --run drive.toml --between 20mm..180mm",
+        ),
+        "Then: pneuopt check drive.toml run_01.csv. What a key means: pneuopt keys KEY",
+    ),
+    "check": CommandHelp(
+        "Show what is read, assumed and wrong before a fit.",
+        ("pneuopt check drive.toml run_01.csv --plot check.png", "pneuopt check drive.toml run_*.csv --fix mended"),
+        "Then: pneuopt identify drive.toml run_01.csv -o fit.toml",
+    ),
+    "identify": CommandHelp(
+        "Fit parameters to logs, with confidence intervals.",
+        (
+            "pneuopt identify drive.toml run_01.csv -o fit.toml --plot fit.png",
+            "pneuopt identify drive.toml run_*.csv --select",
+        ),
+        "Then predict another log: pneuopt simulate fit.toml --log run_02.csv",
+    ),
+    "tune": CommandHelp(
+        "Tune PID and dither together, and certify them.",
+        (
+            "pneuopt tune fit.toml tuning.toml -o tuned.toml --plot tuned.png",
+            "pneuopt tune fit.toml tuning.toml --rig rig.toml --report tuned.html",
+        ),
+        "Then: pneuopt simulate fit.toml tuned.toml, pneuopt study, pneuopt export",
+    ),
+    "certify": CommandHelp(
+        "Certify gains as they are, or say what breaks.",
+        (
+            "pneuopt certify fit.toml edited.toml -o tuned.toml",
+            "pneuopt certify fit.toml edited.toml --rig rig.toml",
+        ),
+        "Then: pneuopt export fit.toml tuned.toml",
+    ),
+    "simulate": CommandHelp(
+        "Simulate a closed loop, or predict a log.",
+        (
+            "pneuopt simulate fit.toml tuned.toml -o steps.csv",
+            "pneuopt simulate fit.toml --log run_02.csv --plot prediction.png",
+        ),
+    ),
+    "study": CommandHelp(
+        "Certify or tune a loop over many plants.",
+        ("pneuopt study study.toml -o cases.csv --plot map.png", "pneuopt study study.toml --executor 8 --resume"),
+        "What a study.toml may ask: pneuopt keys study",
+    ),
+    "export": CommandHelp(
+        "Write the tuned controller for a PLC, or as C or Python.",
+        (
+            "pneuopt export fit.toml tuned.toml --to st -o plc",
+            "pneuopt export fit.toml tuned.toml --to siemens",
+        ),
+        "--to fmu writes the plant, to be simulated with it elsewhere",
+    ),
+    "next-experiment": CommandHelp(
+        "Plan the run that makes the estimates most certain.",
+        ("pneuopt next-experiment fit.toml --duration 10s --limit position=20mm..180mm",),
+        "-o run.csv writes what to play; then identify with its log, too",
+    ),
+    "track": CommandHelp(
+        "Tell whether parameters drift over dated logs.",
+        ("pneuopt track drive.toml logs/*.csv --tuned tuned.toml --plot drift.png",),
+    ),
+    "keys": CommandHelp(
+        "Show what may stand in the files.", ("pneuopt keys", "pneuopt keys dead_zone", "pneuopt keys --outputs")
+    ),
+    "info": CommandHelp("Show versions, compiler, cache and speed.", ("pneuopt info",), "Quote it in a bug report"),
+}
+
+
+def epilog(name: str) -> str:
+    r"""The lines below a command's help; \b keeps click from filling them into one paragraph."""
+    said = COMMAND_HELP[name]
+    lines = ["\b", "Examples:" if said.examples[1:] else "Example:", *(f"  {line}" for line in said.examples)]
+    return "\n".join([*lines, *([said.pointer] if said.pointer else [])])
+
+
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write all figures as JSON.")]
+Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw: .png, .pdf or .svg.")]
+ReportFile = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE", help="Write one page of HTML: verdict first, tables, figures, hashes."),
+]
+Window = Annotated[
+    float | None, typer.Option(metavar="SECONDS", help="Cut the logs into windows, each with a start of its own.")
+]
+Accept = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="CHECK",
+        help="Logs are right: motion, speed, work, command, scale, jumps, stops, mass, pressures; repeatable.",
+    ),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+RunOf = Annotated[
+    Path | None,
+    typer.Option("--run", metavar="DRIVE", help="Write a run of moves from whose log this drive is identified."),
+]
+Between = Annotated[
+    str, typer.Option(metavar="LOW..HIGH", help="Of --run: 20mm..180mm.", show_default="a tenth from either end stop")
+]
+RunSpeed = Annotated[
+    str, typer.Option(metavar="VALUE", help="Of --run, the largest: 0.3m/s.", show_default="half the drive's")
+]
+RunSampleTime = Annotated[str, typer.Option(metavar="TIME", help="Of --run, the controller's.")]
+RigFile = Annotated[
+    Path | None,
+    typer.Option("--rig", metavar="FILE", help="rig.toml: certify with its stick-slip, valve and sensors too."),
+]
+CsvFile = Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")]
+LogFiles = Annotated[
+    list[Path], typer.Argument(metavar="LOGS", help="Log files, each with its sidecar .toml if it has one.")
+]
+SearchBudget = Annotated[
+    float,
+    typer.Option(
+        metavar="SECONDS",
+        help="CPU time after which the search ends with the best values so far.",
+        show_default="none",
+    ),
+]
+Draws = Annotated[
+    int,
+    typer.Option(
+        "--bootstrap",
+        metavar="N",
+        help="Simulate the logs N times with the estimates, and with stick-slip if the fit misses them; fit again.",
+    ),
+]
+HeldOut = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="LOG", help="Predict this log, which the fit has not seen, in the report; repeatable."),
+]
+ExecutorAt = Annotated[
+    str,
+    typer.Option(
+        metavar="WHERE",
+        help="A number of processes, dask (a cluster on this machine), or the address of a dask scheduler, "
+        "tcp://host:8786.",
+        show_default="one process a CPU",
+    ),
+]
+
 
 app = typer.Typer(
     name="pneuopt",
@@ -90,7 +232,7 @@ def init_command(
     """Write a first drive.toml, tuning.toml, study.toml, rig.toml and log.toml, or a run to play."""
     with report_errors():
         if run is not None:
-            from pneuopt.cli.init_run import RunOptions, run_init_run
+            from pneuopt.cli.init import RunOptions, run_init_run
 
             unused = {"KIND": kind, "--size": size, "--cylinder": cylinder, "--valve": valve, "--from": log}
             raise typer.Exit(run_init_run(run, folder, RunOptions(between, speed, sample_time), force, unused))
@@ -259,9 +401,8 @@ def study_command(
 ) -> None:
     """Certify a loop over any plants, or tune it over a grid or along a Pareto front; status 1 if a case fails."""
     with report_errors():
-        from pneuopt.cli.computing import Computing
         from pneuopt.cli.shared import Outputs
-        from pneuopt.cli.study import run_study
+        from pneuopt.cli.study import Computing, run_study
 
         computing = Computing(executor, time_limit, memory_limit, resume)
         raise typer.Exit(run_study(file, Outputs(output, json, plot, report), quiet, computing))
@@ -331,8 +472,8 @@ def next_experiment_command(
 ) -> None:
     """Plan the run that shrinks the confidence intervals of a fit most, within limits."""
     with report_errors():
-        from pneuopt.cli.next_experiment import PlannedOptions, run_next_experiment
         from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.track import PlannedOptions, run_next_experiment
 
         targets = tuple(filter(None, (n.strip() for n in target.split(","))))
         lists = (tuple(limit), tuple(noise or ()), tuple(start or ()))
@@ -381,7 +522,7 @@ def keys_command(
 ) -> None:
     """Show what may stand in the files: each key, its unit, its default and what it means."""
     with report_errors():
-        from pneuopt.cli.keys import run_keys, run_outputs
+        from pneuopt.cli.info import run_keys, run_outputs
 
         require(not (outputs and word), "--outputs shows all outputs: give no WORD beside it")
         raise typer.Exit(run_outputs(markdown) if outputs else run_keys(word, markdown))

@@ -6,18 +6,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_SUCCESS
 from pneuopt.cli.init import write_files
-from pneuopt.cli.shared import Outputs, file_hashes, finish
-from pneuopt.cli.terminal import make_console, show_output_files, show_report, show_sentence
+from pneuopt.cli.run import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_SUCCESS
+from pneuopt.cli.shared import Outputs, file_hashes, finish, make_console, show_output_files, show_report, show_sentence
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_fit
-from pneuopt.identification.checks import check_logs
 from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check, finding_line
 from pneuopt.identification.mending import mend_findings
-from pneuopt.identification.problem import as_estimation_model
+from pneuopt.identification.problem import as_estimation_model, check_logs
 from pneuopt.logs.doctor import CHECKS
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.mending import MendedLog, mend_log, write_mended
 from pneuopt.logs.read_log import read_log
 from pneuopt.plotting import plot_finding, plot_logs
@@ -26,7 +24,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.report.fit_page import Source
 from pneuopt.report.page import Page, Picture
-from pneuopt.report.summary_page import summary_page, title_of
+from pneuopt.report.tuning_page import summary_page, title_of
 
 if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure

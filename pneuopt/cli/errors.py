@@ -6,10 +6,9 @@ from contextlib import contextmanager
 
 import typer
 
-from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED
-from pneuopt.cli.interruption import interruption_status
+from pneuopt.cli.run import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, interruption_status
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
-from pneuopt.quantities.source import read_once
+from pneuopt.quantities.output import read_once
 
 
 @contextmanager
@@ -33,7 +32,7 @@ def report_errors() -> Iterator[None]:
 
 def _say(sentence: str) -> None:
     """Say a sentence on standard error, on a terminal in lines that end between words."""
-    from pneuopt.cli.terminal import make_console, show_sentence
+    from pneuopt.cli.shared import make_console, show_sentence
 
     show_sentence(make_console(error=True), sentence)
 

@@ -7,10 +7,9 @@ from typing import Any
 
 import typer
 
-from pneuopt.cli.exit_status import EXIT_SUCCESS
 from pneuopt.cli.init import write_files
-from pneuopt.cli.shared import read_fit_and_tuning, warn
-from pneuopt.cli.terminal import make_console, show_output_files
+from pneuopt.cli.run import EXIT_SUCCESS
+from pneuopt.cli.shared import make_console, read_fit_and_tuning, show_output_files, warn
 from pneuopt.export.blocks import export_settings
 from pneuopt.export.fmu import export_fmu
 from pneuopt.export.languages import Language, export_controller
@@ -19,10 +18,8 @@ from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.output import write_bytes
-from pneuopt.quantities.source import read_toml_source
-from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import read_value
+from pneuopt.quantities.output import read_toml_source, write_bytes
+from pneuopt.quantities.units import difference_unit, read_value
 
 FMU = "fmu"  # the form that is the plant, not the controller
 SHOWN_METRICS = ("SettlingTime", "Overshoot", "MaxSensitivity")

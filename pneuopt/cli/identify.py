@@ -15,22 +15,20 @@ from pneuopt.cli.shared import (
     describe_status,
     file_hashes,
     finish,
+    progress,
     stats_and_provenance,
     warn,
     warn_of_status,
     write_csv,
 )
-from pneuopt.cli.terminal import progress
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, read_fit, write_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.identify import identify, predict, validate
-from pneuopt.identification.marks import Mark
-from pneuopt.identification.result import IdentificationResult, Verdict, report_agreement
+from pneuopt.identification.result import IdentificationResult, Mark, Verdict, report_agreement
 from pneuopt.identification.select_model import select_model
-from pneuopt.logs.checks.findings import LogFinding
-from pneuopt.logs.doctor import CHECKS
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.doctor import CHECKS, LogFinding
+from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import DRIVE_KINDS, stick_slip_drive
@@ -50,7 +48,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.report.fit_page import Source, fit_page, prediction_page, refusal_page
-from pneuopt.report.summary_page import summary_page, title_of
+from pneuopt.report.tuning_page import summary_page, title_of
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.studies.bootstrap import bootstrap
 

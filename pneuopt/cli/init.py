@@ -1,26 +1,41 @@
-"""The command `init`: the first files of a new user, each whole or not at all, none over an old one."""
+"""The command `init`: the first files of a new user, each whole or not at all, none over an old one.
+
+`pneuopt init --run`: a run of moves to play, from whose log a drive is identified.
+"""
 
 import os
 import sys
 import textwrap
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 
 import typer
 
-from pneuopt.cli.exit_status import EXIT_SUCCESS
-from pneuopt.files.first_files import first_channels, first_files, first_kinds, sidecar_name, unused_channels
+from pneuopt.cli.run import EXIT_SUCCESS
+from pneuopt.evaluation.moves import excitation_run
+from pneuopt.files.drive import read_drive
+from pneuopt.files.first_files import (
+    PLAYED_FILE,
+    RUN_FILE,
+    first_channels,
+    first_files,
+    first_kinds,
+    logged_channels,
+    run_files,
+    sidecar_name,
+    unused_channels,
+)
 from pneuopt.files.loop import SAMPLE_TIME
-from pneuopt.logs.budget import read_bytes
+from pneuopt.logs.foreign import read_table
 from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
-from pneuopt.logs.readers import read_table
-from pneuopt.logs.table import Table
+from pneuopt.logs.table import Table, read_bytes
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import check_output_paths, write_text
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.units import write_value
+from pneuopt.quantities.units import read_value, write_value
 
 USUAL_SIZE = "s32"  # of the catalogue: the middle one
 _PNEUMATIC = "pneumatic"  # the kind that has a catalogue, and its valve's centre as a parameter
@@ -220,3 +235,54 @@ def _advise_command(guess: LogGuess, unused: Container[str]) -> None:
 def say(text: str, indent: str = "") -> None:
     """Print a sentence in lines of the screen's width."""
     typer.echo("\n".join(textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")))
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Limits of a run as the command line says them, with their units; empty: as the drive has them."""
+
+    between: str
+    speed: str
+    sample_time: str
+
+
+def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, unused: Mapping[str, object]) -> int:
+    """Write the run's files and say what it is for, how long it takes and what to log.
+
+    Parameters
+    ----------
+    drive : Path
+        The drive's file.
+    folder : Path
+        Made where it is missing.
+    options : RunOptions
+    force : bool
+        Whether old files may be replaced.
+    unused : mapping of str to object
+        Options of `pneuopt init` that have no sense here, by their names; None where they are not given.
+    """
+    given = ", ".join(n for n, value in unused.items() if value is not None)
+    require(not given, f"--run reads the drive from its file: leave out {given}")
+    model, parameters = read_drive(drive)
+    speed = read_value(options.speed, "m/s", where="--speed") if options.speed else inf
+    sample_time = read_value(options.sample_time, "s", where="--sample-time")
+    require(sample_time > 0, f"--sample-time {options.sample_time}: give the controller's, such as 1ms")
+    between = _read_between(options.between) if options.between else None
+    run = excitation_run(model.system(), parameters, sample_time=sample_time, between=between, speed=speed)
+    write_files({folder / name: text for name, text in run_files(run, drive.name).items()}, force)
+    low, high, trail = (write_value(x, "m", 3) for x in (*run.between, run.following_error))
+    fast, gain = write_value(run.fastest, "m/s", 3), write_value(run.parameters.value("pid.Kp"), "V/m", 3)
+    place = "" if folder == Path() else f" in {folder}"
+    say(f"wrote {PLAYED_FILE}, which a position controller plays, and {RUN_FILE}, which pneuopt simulates{place}")
+    say(f"{run.duration:.3g} s between {low} and {high}, at {fast} at most; with a gain of {gain} it trails by {trail}")
+    say(f"Log {', '.join(logged_channels(run))} at the controller's samples, from before the first move on, then")
+    typer.echo(f"  pneuopt identify {drive} LOG -o fit.toml")
+    return EXIT_SUCCESS
+
+
+def _read_between(text: str) -> tuple[float, float]:
+    low, dots, high = text.partition("..")
+    require(bool(dots), f"--between {text}: give both ends, as in 20mm..180mm")
+    first, last = (read_value(end.strip(), "m", where="--between") for end in (low, high))
+    require(first < last, f"--between {text}: the first end must be below the second")
+    return first, last

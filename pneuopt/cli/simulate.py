@@ -26,8 +26,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.report.fit_page import Source
-from pneuopt.report.loop_figures import simulate_responses
-from pneuopt.report.page import Page
+from pneuopt.report.page import Page, simulate_responses
 from pneuopt.report.tuning_page import LoopView, simulation_page
 
 

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.cli.interruption import interruption_status
+from pneuopt.cli.run import interruption_status
 from pneuopt.cli.shared import (
     BEST_STEM,
     Outputs,
@@ -15,16 +15,20 @@ from pneuopt.cli.shared import (
     describe_status,
     file_hashes,
     finish,
+    make_console,
+    progress,
     read_fit_and_tuning,
+    show_output_files,
+    show_report,
+    show_sentence,
     stats_and_provenance,
     write_files,
 )
 from pneuopt.cli.simulate import loop_view
-from pneuopt.cli.terminal import make_console, progress, show_output_files, show_report, show_sentence
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
-from pneuopt.evaluation.dither_verdict import judge_dither
+from pneuopt.evaluation.dither import judge_dither
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.expected_plants import expected_plants
+from pneuopt.evaluation.plants import expected_plants
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.rig import read_rig
 from pneuopt.files.tuned import write_tuned
@@ -35,8 +39,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.status import Code
 from pneuopt.report.fit_page import Source
-from pneuopt.report.gains import report_exports
-from pneuopt.report.page import Page
+from pneuopt.report.page import Page, report_exports
 from pneuopt.report.tuning_page import LoopView, tuning_page
 from pneuopt.tuning.result import report_tuning
 from pneuopt.tuning.tune import TuningResult, certify, tune

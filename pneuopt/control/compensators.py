@@ -18,7 +18,7 @@ from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, with_prefix, without_prefix
-from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
+from pneuopt.quantities.units import difference_unit, unit_ratio
 
 LEAST_SMOOTHING = 1e-9  # [any unit] of a smooth sign: at zero it would jump, and a rest has no derivative
 

@@ -32,7 +32,7 @@ from pneuopt.dynamics.system import Symbols, stack
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, with_prefix, without_prefix
-from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
+from pneuopt.quantities.units import difference_unit, unit_ratio
 
 LARGEST_SIGNAL = 1e30
 """A signal beyond it, or that compares with nothing, is no number: larger than any reading, a literal everywhere."""

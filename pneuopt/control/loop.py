@@ -36,10 +36,9 @@ from pneuopt.dynamics.system import (
     stack,
     symbols,
 )
-from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, check_names, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
+from pneuopt.quantities.parameters import ParameterSet, Quantity, check_argument, without_prefix
 
 INTEGRAL_STATE = "pid.integral"
 

@@ -16,7 +16,7 @@ from pneuopt.control.reset_integral import RESET_STATES, reset_parameters, reset
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
+from pneuopt.quantities.units import difference_unit, unit_ratio
 
 UNUSED_FILTER_TIME = 0.01  # [s], the filter of a standard form's derivative that is switched off, Td = 0
 

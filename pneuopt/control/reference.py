@@ -8,9 +8,9 @@ from typing import Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.quantities.arguments import as_tuple
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import as_tuple
 from pneuopt.quantities.trajectories import Trajectory
 
 

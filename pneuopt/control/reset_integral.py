@@ -6,7 +6,7 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.unit_algebra import difference_unit
+from pneuopt.quantities.units import difference_unit
 
 RESET_RATIO = 1.0  # default: less brakes an overshoot less, more would make it swing
 SIDE, EXCURSION = "side", "excursion"

@@ -10,7 +10,7 @@ import casadi as ca
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
+from pneuopt.quantities.units import difference_unit, unit_ratio
 
 Signals = dict[str, ca.SX]
 """Symbolic values by name."""

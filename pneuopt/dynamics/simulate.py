@@ -15,16 +15,20 @@ from numpy.typing import ArrayLike
 
 from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.hooks import Contact
-from pneuopt.dynamics.ramps import slopes
 from pneuopt.dynamics.runnable import HasSystem, Runnable, as_runnable
 from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration, without_solver_warnings
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
-from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
-from pneuopt.quantities.arguments import check_argument, check_number, check_parameters
+from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector, slopes
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, require
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.parameters import (
+    Intersample,
+    ParameterSet,
+    Quantity,
+    check_argument,
+    check_number,
+    check_parameters,
+)
 from pneuopt.quantities.trajectories import Trajectory
 
 # Steps of a tight simulation, and the time that one takes, a pneumatic drive's with a compiler: 3e6 are five minutes.
@@ -135,7 +139,7 @@ def simulate_stick_slip(
 
     Examples
     --------
-    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.drives import ForceDrive
     >>> from pneuopt.models.friction import Coulomb
     >>> from pneuopt.models.karnopp import Karnopp
     >>> drive = ForceDrive(Karnopp(Coulomb())).system()

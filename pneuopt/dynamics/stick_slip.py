@@ -17,10 +17,8 @@ import numpy as np
 from scipy import integrate, optimize
 
 from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
-from pneuopt.dynamics.ramps import Ramp
-from pneuopt.dynamics.smooth import MAX_INTERNAL_STEPS, Recorder
-from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names
-from pneuopt.dynamics.work_arrays import WorkArrays
+from pneuopt.dynamics.smooth import MAX_INTERNAL_STEPS, Recorder, WorkArrays
+from pneuopt.dynamics.system import FRICTION_DIRECTION, Ramp, System, names
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
 from pneuopt.quantities.trajectories import Trajectory

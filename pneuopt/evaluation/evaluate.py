@@ -10,24 +10,26 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.simulate import MAX_STEPS, simulate
-from pneuopt.evaluation.band import Band
-from pneuopt.evaluation.budget import POINTS_PER_READING, check_steps
-from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
-from pneuopt.evaluation.meter import meter_metrics
-from pneuopt.evaluation.metric import Requirement
-from pneuopt.evaluation.metrics import Envelope
-from pneuopt.evaluation.operating_points import margin_rows, worst_margins
-from pneuopt.evaluation.record import record
+from pneuopt.evaluation.margins import margin_rows, worst_margins
+from pneuopt.evaluation.metric import Band, Requirement
+from pneuopt.evaluation.metrics import MAX_REFINEMENTS, Envelope, meter_metrics, refine_instants
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, percent_factor, user_limit
-from pneuopt.evaluation.resolution import MAX_REFINEMENTS, refine_instants
-from pneuopt.evaluation.response import loop_inputs, measure, readings_a_sample, sample_spacing
-from pneuopt.evaluation.rig import Rig
+from pneuopt.evaluation.response import (
+    POINTS_PER_READING,
+    TuningCase,
+    cases,
+    check_steps,
+    check_travel,
+    loop_inputs,
+    measure,
+    readings_a_sample,
+    sample_spacing,
+)
+from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
-from pneuopt.evaluation.travel import check_travel
-from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.errors import ModelError
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet, check_argument, check_parameters
 from pneuopt.quantities.report import TIED, Report, Table, format_number, number_columns, text_columns
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -106,7 +108,7 @@ def evaluate(
     >>> from pneuopt.control.pid import PID
     >>> from pneuopt.control.reference import Step
     >>> from pneuopt.evaluation.rig import Sensor
-    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.drives import ForceDrive
     >>> from pneuopt.models.friction import Viscous
     >>> loop = ClosedLoop(ForceDrive(Viscous()).system(), PID(sample_time=1e-3))
     >>> values = loop.parameters.with_values({"pid.Kp": 300.0, "pid.Ki": 4000.0})

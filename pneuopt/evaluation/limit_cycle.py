@@ -11,8 +11,7 @@ from math import log
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.evaluation.dither_mean import period_mean
-from pneuopt.evaluation.dither_ripple import remove_ripple
+from pneuopt.evaluation.metric import period_mean, remove_ripple
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 

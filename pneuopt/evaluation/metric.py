@@ -1,18 +1,232 @@
-"""`Metric`: a record for each figure of a loop, which requirements, searches, files and tables read; `Requirement`."""
+"""`Metric`: a record for each figure of a loop, which requirements, searches, files and tables read; `Requirement`.
 
-from collections.abc import Callable
-from dataclasses import dataclass
+`StepRecord`: responses to a step with their derivatives, and the rows of each metric, one for each instant.
+
+A metric is the largest of its rows. `evaluate` reads that largest value. A gradient search reads every row with its
+derivative, because the maximum of several rows is not smooth where another row becomes the largest.
+
+Mean of sampled signals over a dither period: along the record, and at its end.
+
+`period_mean` takes signals to be linear between samples and needs twenty samples a period. `DitherPeriodMean` takes
+signals with their integral, which is a state of the simulation, and is as exact as that state from ten samples on.
+
+`remove_ripple`: a response without the steady ripple of its dither, on which metrics under dither are read.
+
+The mean over a dither period is the wrong signal to read where the dither is small: it smooths the response itself, so
+a loop under a dither of a picovolt seems to settle earlier than the same loop without. So the mean counts only as far
+as the ripple explains its distance from the signal: the signal is moved towards its mean by at most `RIPPLE_ALLOWANCE`
+times the ripple's amplitude. Where the ripple is steady that gives the mean; without ripple it gives the signal.
+
+The ripple's amplitude is read at the end of the record, off the wave that repeats with the dither. A transient does not
+repeat, and an oscillation of the loop itself repeats with another period, so that neither counts as ripple. Where a
+loop hunts with a period of few dither periods, the last of these tell the two apart to about 1 % of the step only: the
+metrics of such a loop, which no certificate lets through, differ by that from those without dither.
+
+Instants at which responses cross a level.
+
+`SettlingBand`: whether a signal is in its band, and since when; `Band`: its half width as users state it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
-from math import inf
+from functools import cached_property
+from math import inf, isnan, nan
 from numbers import Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pneuopt.evaluation.step_record import RowReader, StepRecord
-from pneuopt.quantities.arguments import check_argument
-from pneuopt.quantities.arrays import Array
+from pneuopt.control.reference import Reference
+from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import check_argument
+from pneuopt.quantities.units import write_value
+
+ValuesAndSlopes = tuple[Array, Array]
+RowReader = Callable[["StepRecord"], ValuesAndSlopes]
+# Share of a controller's sample time after which an instant counts as one sample later: nearer 1, rounding of the
+# instants decides; well below 1, the command's change within a sample would count.
+SAMPLE_SHARE = 0.999
+
+
+def without_slopes(values: Array) -> ValuesAndSlopes:
+    """Values with derivatives to no unknowns, shape (..., 0)."""
+    return values, np.zeros((*values.shape, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class StepRecord:
+    """Responses of m loops to one step on one grid, and derivatives to N unknowns; N is 0 without a gradient search.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        Time since the step [s].
+    error : tuple of ndarray, shapes (m, K) and (m, K, N)
+        Distance of the signal without ripple from the reference at the K nodes, which are every `stride`-th sample, as
+        a fraction of the step; and its derivatives to the unknowns.
+    final_error : tuple of ndarray, shapes (m, 1) and (m, 1, N)
+        The same at the end of the record.
+    command : tuple of ndarray, shapes (m, n) and (m, n, C), optional
+        The command [its unit] and its derivatives to the C simulated columns, which `chain` maps to the unknowns.
+    meter : mapping of str to tuple of ndarray
+        The meter's channels by name, with derivatives as for the command.
+    chain : ndarray, shape (m, C, N)
+        Derivatives of the columns to the unknowns.
+    stride : int
+        Samples between two nodes.
+    sample_time : float, optional
+        Sample time of the controller that holds the command [s].
+    envelope : sequence of (float, float, float)
+        Instants after the step [s], each with the lower and upper bound from then on, as fractions of the step.
+    is_step : bool
+        False where the reference stays and a disturbance moves the signal.
+    size : float
+        What the errors are fractions of, with the sign of the reference's change [measured unit].
+    wanted : ndarray, shape (K,), optional
+        Distance of the reference from its end at the nodes, as a fraction of the size; without it there is none.
+    push : float
+        By how much the load's force steps [N].
+    """
+
+    t: Array
+    error: ValuesAndSlopes
+    final_error: ValuesAndSlopes
+    chain: Array
+    command: ValuesAndSlopes | None = None
+    meter: Mapping[str, ValuesAndSlopes] = field(default_factory=dict)
+    stride: int = 1
+    sample_time: float | None = None
+    envelope: Sequence[tuple[float, float, float]] = ()
+    is_step: bool = True
+    size: float = 1.0
+    wanted: Array | None = None
+    push: float = 0.0
+
+    @cached_property
+    def nodes(self) -> Array:
+        """Instants at which the error is known, shape (K,) [s]."""
+        return self.t[:: self.stride][: self.error[0].shape[1]]
+
+    def largest(self, values: Array, slopes: Array) -> ValuesAndSlopes:
+        """Largest absolute value between each two nodes; without derivatives, of the whole record."""
+        edges = np.arange(0, values.shape[1], max(1, self.stride)) if self.chain.shape[-1] else np.zeros(1, dtype=int)
+        parts = np.split(np.abs(values), edges[1:], axis=1)
+        k = np.array([edge + part.argmax(axis=1) for edge, part in zip(edges, parts, strict=True)]).T
+        rows = np.arange(len(values))[:, None]
+        return np.abs(values[rows, k]), np.sign(values[rows, k])[..., None] * self._to_unknowns(slopes[rows, k])
+
+    def integrate_meter(self, channel: str) -> ValuesAndSlopes:
+        """Integral of a channel of the meter over time, a row a response."""
+        (values, slopes), weights = self.meter[channel], trapezoidal_weights(self.t)
+        by_column = _sum_rows(np.broadcast_to(weights, values.shape), slopes)
+        return _integrate(weights, values), self._to_unknowns(by_column)
+
+    def error_integral(
+        self, weights: Array, of: Callable[[Array], Array], slope: Callable[[Array], Array]
+    ) -> ValuesAndSlopes:
+        """Weighted sum over the nodes of a function of the error, a row a response."""
+        error, slopes = self.error
+        return _integrate(weights, of(error)), _sum_rows(slope(error) * weights, slopes)
+
+    def error_between(self, begin: float, end: float) -> ValuesAndSlopes:
+        """Error at the nodes of a time span and at its ends, linear between nodes."""
+        (error, by_unknown), t = self.error, self.nodes
+        at = np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])
+        k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+        share = (at - t[k]) / (t[k + 1] - t[k])
+        slopes = by_unknown[:, k] * (1 - share)[:, None] + by_unknown[:, k + 1] * share[:, None]
+        return error[:, k] * (1 - share) + error[:, k + 1] * share, slopes
+
+    def _to_unknowns(self, by_column: Array) -> Array:
+        return np.asarray(by_column @ self.chain)
+
+
+def _integrate(weights: Array, values: Array) -> Array:
+    """Weighted sums, shape (m, 1), of values of shape (m, K), on one core.
+
+    BLAS would start a thread for a fine record, which then waits for more work for 20 ms of CPU time.
+    """
+    return np.asarray(np.einsum("k,mk->m", weights, values))[:, None]
+
+
+def _sum_rows(weights: Array, slopes: Array) -> Array:
+    """Weighted sums of slopes, shape (m, 1, N), of shapes (m, K) and (m, K, N).
+
+    Without unknowns, N = 0, they are not walked through: of a fine record that took a tenth of an evaluation.
+    """
+    m, _, count = slopes.shape
+    return np.asarray(np.einsum("mk,mkn->mn", weights, slopes))[:, None] if count else np.zeros((m, 1, 0))
+
+
+def trapezoidal_weights(t: Array) -> Array:
+    """Weights of samples with which a sum is the integral by the trapezoidal rule [s]."""
+    h = np.diff(t)
+    return np.asarray(0.5 * (np.append(h, 0.0) + np.append(0.0, h)))
+
+
+def overshoot_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The error beyond the reference; under a disturbance, where the signal should not move, on either side."""
+    error, slopes = record.error
+    if record.is_step:
+        return error, slopes
+    return np.concatenate([error, -error], axis=1), np.concatenate([slopes, -slopes], axis=1)
+
+
+def steady_state_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The absolute error at the end."""
+    error, slopes = record.final_error
+    return np.abs(error), np.sign(error)[..., None] * slopes
+
+
+def iae_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The integral of the absolute error."""
+    return record.error_integral(trapezoidal_weights(record.nodes), np.abs, np.sign)
+
+
+def ise_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The integral of the squared error."""
+    return record.error_integral(trapezoidal_weights(record.nodes), np.square, lambda error: 2 * error)
+
+
+def itae_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The integral of the absolute error times the time since the step."""
+    return record.error_integral(trapezoidal_weights(record.nodes) * record.nodes, np.abs, np.sign)
+
+
+def envelope_rows(record: StepRecord) -> ValuesAndSlopes:
+    """Distance from the middle of the envelope over its half width, a row each side."""
+    last, first = record.nodes[-1], record.error
+    values, slopes = [np.zeros((len(first[0]), 1))], [np.zeros((len(first[0]), 1, first[1].shape[-1]))]
+    ends = [*(begin for begin, _, _ in record.envelope[1:]), np.inf]
+    for (begin, lower, upper), end in zip(record.envelope, ends, strict=True):
+        if begin < last:
+            error, by_unknown = record.error_between(begin, min(end, last))
+            used, half = error + 1 - (lower + upper) / 2, (upper - lower) / 2
+            values += [used / half, -used / half]
+            slopes += [by_unknown / half, -by_unknown / half]
+    return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
+
+
+def peak_control_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The absolute command."""
+    assert record.command is not None
+    return record.largest(*record.command)
+
+
+def control_rate_rows(record: StepRecord) -> ValuesAndSlopes:
+    """Rate of change of the command from sample to sample; of a held command over the controller's sample time."""
+    assert record.command is not None
+    (u, slopes), t, h = record.command, record.t, record.sample_time
+    if h is None:
+        step = np.diff(t)
+        return record.largest(np.diff(u, axis=1) / step, np.diff(slopes, axis=1) / step[:, None])
+    begin = np.flatnonzero(t <= t[-1] - SAMPLE_SHARE * h)
+    require(len(begin) > 0, f"the record of {t[-1] - t[0]:g} s is shorter than the controller's sample time")
+    end = np.searchsorted(t, t[begin] + SAMPLE_SHARE * h)
+    return record.largest((u[:, end] - u[:, begin]) / h, (slopes[:, end] - slopes[:, begin]) / h)
 
 
 class Sense(Enum):
@@ -170,3 +384,448 @@ class AtLeast(Requirement):
     """
 
     min: float | None = None
+
+
+# Whole dither periods at the end of a record over which its final value is averaged: fewer average less noise, more
+# reach back into the transient.
+FINAL_PERIODS = 5
+# Share of a record that counts as its end, where ripple is read and a settling comes too late to count: a smaller one
+# sees less than a cycle of slow hunting, a larger one reaches back into the transient.
+TAIL_SHARE = 0.05
+
+
+def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
+    """Centred mean over one period of signals that are linear between samples and `initial` before the first.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+    y : ndarray, shape (m, n)
+    initial : float
+    period : float
+        [s]
+    at : ndarray, shape (k,)
+        Instants, at least half a period before the end [s].
+
+    Returns
+    -------
+    ndarray, shape (m, k)
+    """
+    steps = 0.5 * np.diff(t) * (y[:, 1:] + y[:, :-1])
+    whole = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
+    ends = (_integral(t, y, whole, initial, at + side * period / 2) for side in (1, -1))
+    mean: Array = (next(ends) - next(ends)) / period
+    return mean
+
+
+def end_mean(t: Array, y: Array, period: float) -> Array:
+    """Mean over the last five periods, or as many as the record has, of signals whose last axis is time."""
+    span = period * min(FINAL_PERIODS, int((t[-1] - t[0]) / period))
+    t, y = _cut_end(t, y, span)
+    return np.asarray(np.trapezoid(y, t, axis=-1) / (t[-1] - t[0]))
+
+
+def tail(t: Array, y: Array) -> Array:
+    """Signals in the last 5 % of a record, from an interpolated first value on."""
+    return _cut_end(t, y, TAIL_SHARE * (t[-1] - t[0]))[1]
+
+
+def _cut_end(t: Array, y: Array, span: float) -> tuple[Array, Array]:
+    begin = t[-1] - span
+    k = min(max(int(np.searchsorted(t, begin, side="right")) - 1, 0), len(t) - 2)
+    first = y[..., [k]] + (begin - t[k]) / (t[k + 1] - t[k]) * (y[..., [k + 1]] - y[..., [k]])
+    return np.append(begin, t[t > begin]), np.concatenate([first, y[..., t > begin]], axis=-1)
+
+
+@dataclass(frozen=True)
+class DitherPeriodMean:
+    """Centred mean over a period, from an integral that is taken as cubic between samples.
+
+    Parameters
+    ----------
+    period : float
+        [s]
+    spacing : float
+        Spacing of the samples [s].
+    """
+
+    period: float
+    spacing: float
+
+    @property
+    def half_period_samples(self) -> int:
+        """Number of whole samples in half a period."""
+        return int(self.period / 2 / self.spacing + 1e-9)
+
+    def mean_count(self, n: int) -> int:
+        """Number of samples, of n from the first on, that have a mean."""
+        return max(0, n - self.half_period_samples - 1)
+
+    def means(self, signal: Array, integral: Array, initial: float, stride: int = 1) -> Array:
+        """Return the means at every `stride`-th sample that has one.
+
+        Parameters
+        ----------
+        signal, integral : ndarray, shape (m, n)
+        initial : float
+            The signal before the first sample.
+
+        Returns
+        -------
+        ndarray, shape (m, ceil(mean_count(n) / stride))
+
+        Examples
+        --------
+        >>> t = np.linspace(0.0, 2.0, 21)[None]
+        >>> DitherPeriodMean(0.5, 0.1).means(3 * t**2, t**3, 0.0)[0, 5].round(9).item()  # (0.75^3 - 0.25^3)/0.5
+        0.8125
+        """
+        m, h, n = self.half_period_samples, self.spacing, signal.shape[1]
+        s = self.period / 2 / h - m
+        before = np.arange(-m - 1, 0) * (h * initial)
+        Y = np.concatenate([np.broadcast_to(before, (len(signal), m + 1)), integral - integral[:, :1]], axis=1)
+        y = np.concatenate([np.full((len(signal), m + 1), initial), signal], axis=1)
+        near, far = (1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s)
+        slope_near, slope_far = h * s * (1 - s) ** 2, h * s * s * (s - 1)
+
+        def shift(rows: Array, ahead: int) -> Array:
+            return rows[:, m + 1 + ahead : m + 1 + ahead + self.mean_count(n) : stride]
+
+        total = near * (shift(Y, m) - shift(Y, -m)) + far * (shift(Y, m + 1) - shift(Y, -m - 1))
+        total += slope_near * (shift(y, m) + shift(y, -m)) + slope_far * (shift(y, m + 1) + shift(y, -m - 1))
+        return np.asarray(total / self.period)
+
+
+def _integral(t: Array, y: Array, whole: Array, initial: float, at: Array) -> Array:
+    """Integral from the first sample to `at`, from the integrals `whole` up to each sample."""
+    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    ahead = at - t[k]
+    inside: Array = whole[:, k] + ahead * (y[:, k] + 0.5 * ahead * (y[:, k + 1] - y[:, k]) / (t[k + 1] - t[k]))
+    return np.where(at < t[0], initial * (at - t[0]), inside)
+
+
+# Largest distance by which the signal is moved towards its mean, in amplitudes of the ripple at the end. Below 1 some
+# of a steady ripple stays; at 1 all that it grows by does, where the stroke is passed or the valve is wide open; far
+# above it a small ripple lets the mean smooth the transient.
+RIPPLE_ALLOWANCE = 2.0
+# Least instants in a period at which the wave is read: fewer cut its peaks, more cost time.
+MIN_WAVE_PHASES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class RippleFree:
+    """Responses without their dither's ripple.
+
+    Attributes
+    ----------
+    signal : ndarray, shape (m, n)
+        The signal moved towards its mean over a dither period, by at most the allowance.
+    final : ndarray, shape (m,)
+        The last sample, moved likewise towards the mean over the last periods.
+    ripple : ndarray, shape (m,)
+        Peak to peak of the ripple [unit of the signal].
+    """
+
+    signal: Array
+    final: Array
+    ripple: Array
+
+
+def remove_ripple(t: Array, y: Array, means: Array, period: float) -> RippleFree:
+    """Move signals towards their means over a dither period, as far as their ripple at the end allows.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        [s]
+    y : ndarray, shape (m, n)
+    means : ndarray, shape (m, k)
+        Centred means over the period at the first k samples; those of the last half period have none.
+    period : float
+        [s]
+
+    Returns
+    -------
+    RippleFree
+
+    Examples
+    --------
+    >>> t = np.linspace(0.0, 2.0, 2001)
+    >>> y = np.array([1.0 + a * np.sin(20 * np.pi * t) for a in (0.3, 0.0)])
+    >>> found = remove_ripple(t, y, np.ones((2, 1950)), 0.1)
+    >>> found.ripple.round(3).tolist(), np.ptp(found.signal, axis=1).round(9).tolist()
+    ([0.6, 0.0], [0.0, 0.0])
+    """
+    k = means.shape[1]
+    ripple = measure_ripple(t[:k], y[:, :k] - means, period)
+    reach = RIPPLE_ALLOWANCE / 2 * ripple
+    signal = move_towards(
+        y, np.concatenate([means, extend_means(t, y, means[:, -1], k, period)], axis=1), reach[:, None]
+    )
+    return RippleFree(signal, move_towards(y[:, -1], end_mean(t, y, period), reach), ripple)
+
+
+def describe_ripple(metrics: Mapping[str, float], size: float, band: float) -> str | None:
+    """Sentence for a response of which only the mean over the dither's period settles; None for others.
+
+    Parameters
+    ----------
+    metrics : mapping of str to float
+        A column of `evaluate`.
+    size : float
+        The step's size [measured unit].
+    band : float
+        Half width of the settling band, a fraction of the step.
+
+    Examples
+    --------
+    >>> from math import nan
+    >>> print(describe_ripple({"SettlingTime": 0.0931, "SettlingTimeRaw": nan, "Ripple": 0.018}, 0.1, 0.02))
+    only the mean settles, in 0.0931 s: a ripple of 18 % of the step takes the signal itself out of the band of +-2 %
+    """
+    settled, raw, ripple = (metrics[n] for n in ("SettlingTime", "SettlingTimeRaw", "Ripple"))
+    if isnan(settled) or not isnan(raw):
+        return None
+    within = f"the band of +-{100 * band:.3g} %"
+    share = f"a ripple of {100 * ripple / abs(size):.2g} % of the step"
+    return f"only the mean settles, in {settled:.3g} s: {share} takes the signal itself out of {within}"
+
+
+def measure_ripple(t: Array, rest: Array, period: float) -> Array:
+    """Peak to peak of what repeats with the dither in the last whole periods of signals, shape (m,).
+
+    It is that of the mean over the periods, in which an oscillation with another period averages out, or that of the
+    calmest period, which a late transient leaves alone, whichever is smaller.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        [s]
+    rest : ndarray, shape (m, n)
+        Signals less their means over the period.
+    period : float
+        [s]
+    """
+    return ripple_and_slopes(t, (rest, np.zeros((len(rest), 0, len(t)))), *wave_instants(t, period))[0]
+
+
+def ripple_and_slopes(t: Array, rest: ValuesAndSlopes, at: Array, weights: Array) -> ValuesAndSlopes:
+    """`measure_ripple`, shape (m,), and its derivatives, shape (m, C).
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        Instants of a record, or of its end [s].
+    rest : tuple of ndarray, shapes (m, n) and (m, C, n)
+        Signals less their means, and the derivatives.
+    at, weights : ndarray
+        As `wave_instants` gives them for the whole record.
+    """
+    rows, slope_rows = (_interpolate(t, a, at).reshape(*a.shape[:-1], *weights.shape) for a in rest)
+    wave = np.einsum("mcp,cp->mp", rows, weights)
+    by_period, of_wave = np.ptp(rows, axis=2), np.ptp(wave, axis=1)
+    calmest, lane = by_period.argmin(axis=1), np.arange(len(rows))
+    shape = np.where((of_wave <= by_period.min(axis=1))[:, None], wave, rows[lane, calmest])
+    share = np.where((of_wave <= by_period.min(axis=1))[:, None, None], weights, 0.0)
+    share[lane, calmest] += (of_wave > by_period.min(axis=1))[:, None]
+    ends = [
+        np.einsum("mnc,mc->mn", slope_rows[lane, :, :, k], share[lane, :, k])
+        for k in (shape.argmax(axis=1), shape.argmin(axis=1))
+    ]
+    return np.asarray(np.ptp(shape, axis=1)), ends[0] - ends[1]
+
+
+def wave_instants(t: Array, period: float) -> tuple[Array, Array]:
+    """Instants in the last whole periods, and their weights in the mean over the periods, shape (periods, phases)."""
+    length = t[-1] - t[0]
+    count = max(1, min(int(max(FINAL_PERIODS, TAIL_SHARE * length / period)), int(length / period + 1e-9)))
+    phases = max(MIN_WAVE_PHASES, int(np.ceil(period / np.median(np.diff(t)) - 1e-9)))
+    at = t[-1] + period * count * (np.arange(1 - count * phases, 1) / (count * phases))
+    hann = np.sin(np.pi * (np.arange(count * phases) + 0.5) / (count * phases)).reshape(count, phases) ** 2
+    return at, hann / hann.sum(axis=0)
+
+
+def extend_means(t: Array, y: Array, last: Array, k: int, period: float) -> Array:
+    """Means from sample k on, in the last half period, with the slope that the mean has at `last`, sample k - 1."""
+    change = y[..., -1:] - _interpolate(t, y, np.array([t[-1] - period]))
+    return np.asarray(last[..., None] + change * ((t[k:] - t[k - 1]) / period))
+
+
+def move_towards(y: Array, mean: Array, reach: Array) -> Array:
+    """The mean where it is within reach of the signal, elsewhere the signal moved towards it by the reach."""
+    return np.asarray(np.clip(mean, y - reach, y + reach))
+
+
+def _interpolate(t: Array, rows: Array, at: Array) -> Array:
+    """Rows at other instants, linear between samples."""
+    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    share = (at - t[k]) / (t[k + 1] - t[k])
+    return np.asarray(rows[..., k] + share * (rows[..., k + 1] - rows[..., k]))
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples from the step on, a row a response; t is counted from the step."""
+
+    t: Array
+    y: Array
+
+
+def first_crossing_times(t: Array, z: Array, level: float) -> Array:
+    """Instants at which each row first reaches the level; meaningless in rows that never do."""
+    k = np.argmax(z >= level, axis=1)
+    before = np.maximum(k - 1, 0)
+    low, high = pick_samples(z, before), pick_samples(z, k)
+    with np.errstate(all="ignore"):
+        between = t[before] + (t[k] - t[before]) * (level - low) / (high - low)
+    return np.asarray(np.where(k == 0, t[0], between))
+
+
+def pick_samples(rows: Array, k: NDArray[np.intp]) -> Array:
+    """One sample of each row."""
+    return np.asarray(rows[np.arange(len(rows)), k], dtype=float)
+
+
+# Share of a band's half width by which a signal on its edge may lie outside by rounding, and still be in it. At 0 the
+# units decide whether a signal that ends on the edge has settled; far above, designs that leave the band have.
+EDGE_ROUNDING = 1e-9
+# Ratio of the time in the band at the record's end to any stay in it before, from which a response that came in late
+# counts as settled. With a lower one slow hunting settles whenever it is inside; with a higher one a stroke that ends
+# early makes creep of every response that once touched the band's edge.
+MIN_STAY_RATIO = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class SettlingBand:
+    """The one answer to "is it in the band": a signal is, up to and on the edge; NaN is not.
+
+    Parameters
+    ----------
+    centre, half_width : float or ndarray, shape (m,)
+        [unit of the signal]
+
+    Examples
+    --------
+    >>> SettlingBand(0.2, 0.004).contains(np.array([0.19, 0.196, 0.2, 0.204, 0.20401, np.nan])).tolist()
+    [False, True, True, True, False, False]
+    """
+
+    centre: float | Array
+    half_width: float | Array
+
+    def contains(self, y: Array) -> Mask:
+        """Which values are in the band, shape (n,) or (m, n) as y."""
+        centre, reach = (np.expand_dims(a, -1) for a in (self.centre, self.half_width))
+        return np.asarray(np.abs(y - centre) <= (1 + EDGE_ROUNDING) * reach)
+
+    def settling_times(self, t: Array, y: Array) -> Array:
+        """Instants from which responses stay in the band, linear between samples, shape (m,) [s].
+
+        NaN where one ends outside, or comes in for good only in the record's last share, where it may just pass.
+        The instants t, shape (n,), begin at the step; y has the shape (m, n).
+        """
+        outside = ~self.contains(y)
+        k = len(t) - 1 - np.argmax(outside[:, ::-1], axis=1)
+        after = np.minimum(k + 1, len(t) - 1)
+        last, following = pick_samples(y, k), pick_samples(y, after)
+        edge = self.centre + self.half_width * np.sign(last - self.centre)
+        with np.errstate(all="ignore"):
+            settled = t[k] + (t[after] - t[k]) * (edge - last) / (following - last)
+        settled = np.where(outside[:, -1] | ~(settled <= (1 - TAIL_SHARE) * t[-1]), nan, settled)
+        return np.where(outside.any(axis=1), settled, 0.0)
+
+
+def entry_for_good(t: Array, inside: Mask) -> float:
+    """Last instant outside the band of a response that was continued [s]; inf where it may leave the band again.
+
+    It may where it came in at the record's very end, or has been inside for hardly longer than ever before.
+    """
+    outside, end = np.flatnonzero(~inside), float(t[-1])
+    last = float(t[outside[-1]]) if len(outside) else 0.0
+    late = last > end / 2 and end - last < MIN_STAY_RATIO * longest_stay(t, inside)
+    return inf if late or last > (1 - TAIL_SHARE) * end else last
+
+
+def longest_stay(t: Array, inside: Mask) -> float:
+    """The longest time in the band before it is left for the last time [s]; 0 where it never is."""
+    padded = np.concatenate([[False], inside, [False]])
+    enters, leaves = np.flatnonzero(~padded[:-1] & padded[1:]), np.flatnonzero(padded[:-1] & ~padded[1:])
+    ended = leaves < len(t)
+    return float(np.max(t[leaves[ended]] - t[enters[ended]], initial=0.0))
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """A settling band as wide for every reference: the accuracy that a positioning task asks for.
+
+    Parameters
+    ----------
+    half_width : float
+        [measured unit]
+
+    Raises
+    ------
+    InputError
+        If it is not positive and finite.
+    """
+
+    half_width: float
+
+    def __post_init__(self) -> None:
+        require(0 < self.half_width < inf, f"Tolerance: half_width must be positive and finite, got {self.half_width}")
+
+    def __mul__(self, factor: float) -> "Tolerance":
+        return Tolerance(self.half_width * factor)
+
+
+Band: TypeAlias = float | Tolerance
+
+
+def band_unit(band: Band, reference: Reference) -> float:
+    """Ratio of what a band's number counts to the reference's size: 1 of a fraction."""
+    return 1 / abs(reference.nominal_size) if isinstance(band, Tolerance) else 1.0
+
+
+def band_number(band: Band) -> float:
+    """The number of a band: a fraction, or the half width of a tolerance [measured unit]."""
+    return band.half_width if isinstance(band, Tolerance) else band
+
+
+def band_share(band: Band, reference: Reference) -> float:
+    """Half width of a band as a fraction of the reference's size.
+
+    Raises
+    ------
+    InputError
+        If it is no fraction between 0 and 1, so that the response would begin settled or never settle.
+
+    Examples
+    --------
+    >>> from pneuopt.control.reference import Step
+    >>> band_share(0.02, Step(0.2)), band_share(Tolerance(1e-3), Step(0.2))
+    (0.02, 0.005)
+    """
+    if not isinstance(band, Tolerance):
+        require(0 < band < 1, f"band is a fraction between 0 and 1, got {band:g}; 2 % is 0.02")
+        return band
+    size = abs(reference.nominal_size)
+    told = f"reference {reference.label}: its size of {size:g} lies within the tolerance of +-{band.half_width:g}"
+    require(band.half_width < size, f"{told}; narrow the tolerance, or leave the reference out")
+    return band.half_width / size
+
+
+def describe_band(band: Band, unit: str) -> str:
+    """Write a band with its unit.
+
+    Parameters
+    ----------
+    band : Band
+    unit : str
+        The measured one.
+
+    Examples
+    --------
+    >>> describe_band(0.02, "m"), describe_band(Tolerance(1e-4), "m")
+    ('2 % of the step', '0.1 mm')
+    """
+    return write_value(band.half_width, unit, 3) if isinstance(band, Tolerance) else f"{100 * band:g} % of the step"

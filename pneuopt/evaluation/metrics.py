@@ -1,21 +1,42 @@
-"""Metrics of a step response, with python-control's keys, relative to the step's size."""
+"""Metrics of a step response, with python-control's keys, relative to the step's size.
+
+Metrics that are read off a plant's meter: air consumption, valve travel, energy.
+
+Instants at which a response is read, so close that its settling time, peaks and integrals are right.
+
+A horizon may be hundreds of times as long as the response: then readings at even distances miss what happens. From a
+first reading, `refine_instants` finds where the signal bends between readings, or where an integral of the error is not
+exact, and adds instants there.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from enum import Enum
 from math import nan
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.evaluation.band import SettlingBand
-from pneuopt.evaluation.crossings import Samples, first_crossing_times, pick_samples
-from pneuopt.evaluation.dither_mean import period_mean, tail
-from pneuopt.evaluation.dither_ripple import remove_ripple
-from pneuopt.evaluation.metric import Source
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.compiled.functions import compile_rows
+from pneuopt.dynamics.system import System, names
+from pneuopt.evaluation.metric import (
+    Samples,
+    SettlingBand,
+    Source,
+    StepRecord,
+    first_crossing_times,
+    period_mean,
+    pick_samples,
+    remove_ripple,
+    tail,
+    without_slopes,
+)
 from pneuopt.evaluation.requirements import METRICS, StepEnvelope
-from pneuopt.evaluation.step_record import StepRecord, without_slopes
-from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import require
+from pneuopt.quantities.arrays import Array, Indices, Mask
+from pneuopt.quantities.errors import InputError, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 
 # Dither periods that a response must stay in its band to count as settled where its ripple does not: with fewer, one
 # that just passes through the band counts too; more ask for longer records.
@@ -382,3 +403,194 @@ def _deviation_metrics(record: Samples, reference: float, size: float) -> dict[s
     beyond = 100 * np.abs(peak - reference) / abs(size)
     found = {"OvershootFinal": beyond, "Peak": peak, "PeakTime": record.t[k]}
     return found | {"RiseTime": none, "Undershoot": none}
+
+
+def meter_channels(plant: System) -> tuple[str, ...]:
+    """Channels of a plant's meter: "air" [kg/s], "spool" [half travels], "power" [W]; none without a meter."""
+    return () if plant.meter is None else tuple(plant.meter.name_out())
+
+
+def needed_channels(metrics: Collection[str]) -> tuple[str, ...]:
+    """Channels of a meter that these metrics need."""
+    return tuple(dict.fromkeys(c for name in metrics if name in METRICS for c in METRICS[name].channels))
+
+
+def check_channels(plant: System, metrics: Collection[str]) -> None:
+    """Refuse a metric whose channel the plant's meter lacks.
+
+    Raises
+    ------
+    InputError
+        It names the metric and the channel.
+    """
+    shown = meter_channels(plant)
+    for name in metrics:
+        for channel in needed_channels([name]):
+            if channel not in shown:
+                reason = f"its meter shows only {', '.join(shown)}" if shown else "it has no meter"
+                raise InputError(f"this plant does not show {name}: {reason}, not {channel!r}; leave {name} out")
+
+
+def meter_outputs(
+    loop: ClosedLoop, channels: Collection[str], x: ca.SX, u: ca.SX, p: ca.SX, control: ca.SX
+) -> list[ca.SX]:
+    """Symbolic outputs of the plant's meter in terms of the loop's states, inputs, parameters and command."""
+    plant = loop.plant
+    if plant.meter is None:
+        return []
+    order, signals = list(loop.parameters), names(loop.inputs)
+    inputs = [control if q.name == loop.command.name else u[signals.index(q.name)] for q in plant.inputs]
+    plant_parameters = ca.vertcat(*(p[order.index(n)] for n in plant.parameters))
+    found = plant.meter.call([0, x[: len(plant.states)], ca.vertcat(*inputs), plant_parameters])
+    shown = dict(zip(meter_channels(plant), found, strict=True))
+    return [ca.SX(shown[channel]) for channel in channels]
+
+
+def meter_record(t: Array, channels: Mapping[str, Array], start: float) -> StepRecord:
+    """Record of the meter's channels alone, for many responses on one grid, from `start` on.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        [s]
+    channels : mapping of str to ndarray, shape (m, n)
+    start : float
+        [s]
+    """
+    kept = t >= start
+    shown = {n: without_slopes(np.asarray(values)[:, kept]) for n, values in channels.items()}
+    m = len(next(iter(channels.values())))
+    none = without_slopes(np.zeros((m, 0)))
+    return StepRecord(t[kept], none, none, np.zeros((m, 0, 0)), meter=shown)
+
+
+def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory, start: float) -> dict[str, float]:
+    """Metrics of one response that the plant's meter shows, AirUse [l(ANR)] for example; none without a meter.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+    response : Trajectory
+        The plant's states, "control", and the loop's inputs where the plant has more than the command.
+    start : float
+        The instant from which the metrics count [s].
+    """
+    plant, shown = loop.plant, meter_channels(loop.plant)
+    if plant.meter is None:
+        return {}
+    p = loop.parameter_vector(parameters)[[list(loop.parameters).index(n) for n in plant.parameters]]
+    given = {q.name: response[q.name] if q.name in response else np.zeros(len(response)) for q in plant.inputs}
+    inputs = np.column_stack([*(given | {loop.command.name: response["control"]}).values()])
+    rows = compile_rows(plant.meter)([0.0], response.matrix(names(plant.states)), inputs, p)
+    record = meter_record(response.t, {n: row.T for n, row in zip(shown, rows, strict=True)}, start)
+    readable = (m for m in METRICS.values() if m.channels and set(m.channels) <= set(shown))
+    return {metric.name: float(metric.largest(record)[0]) for metric in readable}
+
+
+# Largest distance of a signal between two readings from the straight line that joins them, a share of the step: with a
+# larger one settling times and overshoots are off; a smaller one adds readings that change no digit shown.
+LINE_TOLERANCE = 1e-4
+# Relative error of the integrals over the error that readings may cause: with a larger one a search compares reading
+# errors; a smaller one adds readings that change no digit shown.
+INTEGRAL_TOLERANCE = 1e-3
+# Parts into which a distance between readings is divided at a time: fewer take more simulations; more add readings
+# where they are not needed.
+PARTS_AT_A_TIME = 8
+# Times that points are added where a response changes fast: each brings them eight times as close. Fewer leave the peak
+# of a fast response in a long horizon unread; more cost a simulation each.
+MAX_REFINEMENTS = 4
+# Factor on the time after a step within which responses of different gains are taken to change equally fast: a smaller
+# one misses those that are faster than the first; a larger one adds readings where nothing happens.
+SPREAD = 3.0
+# Readings of a response, at most: fewer leave a fast response in a long horizon unresolved; more take seconds to read.
+MAX_INSTANTS = 60_000
+
+
+def refine_instants(
+    t: Array, signal: Array, target: float, size: float, start: float, tolerance: float = 1.0
+) -> Array | None:
+    """Instants with others added where readings are too far apart; None where they are close enough.
+
+    Parameters
+    ----------
+    t, signal : ndarray, shape (n,)
+        Readings of the signal [s, its unit].
+    target, size : float
+        The reference and the step's size [the signal's unit].
+    start : float
+        When the step begins [s].
+    tolerance : float
+        Multiple of `LINE_TOLERANCE` and `INTEGRAL_TOLERANCE` that counts as close enough.
+
+    Returns
+    -------
+    ndarray or None
+
+    Examples
+    --------
+    >>> t = np.linspace(0.0, 10.0, 101)
+    >>> finer = refine_instants(t, 1 - np.exp(-5 * t), 1.0, 1.0, 0.0)
+    >>> bool(finer[1] < t[1] and finer[-2] == t[-2])
+    True
+    >>> refine_instants(t, np.zeros(101), 1.0, 1.0, 0.0) is None
+    True
+    """
+    after, error = np.maximum(t - start, 0.0), np.where(t < start - 1e-12, 0.0, signal - target) / abs(size)
+    coarse = np.diff(t) ** 2 / 8 * _curvatures(t, signal / abs(size)) > tolerance * LINE_TOLERANCE
+    for integrand in (error, error**2, after * error):
+        coarse |= _is_inexact(t, integrand, tolerance)
+    fine = np.diff(t) > 8 * np.spacing(t[-1])
+    chosen = np.flatnonzero(coarse & fine)
+    if not len(chosen) or len(t) + (PARTS_AT_A_TIME - 1) * len(chosen) > MAX_INSTANTS:
+        return None
+    return _divide(t, chosen)
+
+
+def spread_instants(even: Array, needed: Array, start: float) -> Array:
+    """Instants for the responses of other gains, which are as fast as one's, but not at the same instants.
+
+    They are as close as those needed at a third to three times their time after the step.
+
+    Parameters
+    ----------
+    even : ndarray, shape (n,)
+        Readings before any were added [s].
+    needed : ndarray, shape (m,)
+        Instants of `refine_instants`, of one response or of several together [s].
+    start : float
+        When the step begins [s].
+    """
+    t, begin, width = even, needed[:-1], np.diff(needed)
+    closest = width.min()
+    while True:
+        low, high = start + (t[:-1] - start) / SPREAD, start + (t[1:] - start) * SPREAD
+        first, last = np.searchsorted(begin, low, side="right") - 1, np.searchsorted(begin, high)
+        finest = [width[max(a, 0) : max(b, a + 1)].min() for a, b in zip(first.tolist(), last.tolist(), strict=True)]
+        chosen = np.flatnonzero((np.diff(t) > 1.5 * np.maximum(finest, closest)) & (t[:-1] >= start - 1e-12))
+        if not len(chosen):
+            return t
+        t = _divide(t, chosen)
+
+
+def _divide(t: Array, chosen: Indices) -> Array:
+    """Instants with those added that divide the chosen intervals."""
+    added = t[chosen, None] + np.diff(t)[chosen, None] * np.arange(1, PARTS_AT_A_TIME) / PARTS_AT_A_TIME
+    return np.sort(np.concatenate([t, added.ravel()]))
+
+
+def _is_inexact(t: Array, integrand: Array, tolerance: float) -> Mask:
+    """Intervals whose share of the trapezoidal rule's error is too large, shape (n - 1,).
+
+    All intervals together may contribute `INTEGRAL_TOLERANCE` of the integral of its size, times `tolerance`. Where the
+    integrand changes its sign, its size has a corner, which is a small part of it all.
+    """
+    most = tolerance * INTEGRAL_TOLERANCE * float(np.trapezoid(np.abs(integrand), t)) / (len(t) - 1)
+    return np.asarray(np.diff(t) ** 3 / 12 * _curvatures(t, integrand) > most)
+
+
+def _curvatures(t: Array, y: Array) -> Array:
+    """The size of the second derivative in each interval, the larger of those at its ends, shape (n - 1,)."""
+    inside = np.abs(np.diff(np.diff(y) / np.diff(t))) / (t[2:] - t[:-2]) * 2
+    ends = np.concatenate([[0.0], inside, [0.0]])
+    return np.asarray(np.maximum(ends[:-1], ends[1:]))

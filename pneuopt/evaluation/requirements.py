@@ -6,6 +6,15 @@ loop that state moves, and friction counts with its slope at that speed. A gain 
 its reciprocal is minimised.
 
 A new requirement is a class with its `Metric`, in a file of its own or here, and a row of `REQUIREMENT_KINDS`.
+
+Requirements on a positioning axis in the units of its user: how far beyond the end, off the path, and under a load.
+
+Each is a length where a position is controlled. With `SettlingTime` of a `Tolerance`, `AirUse` and `EnergyUse` they say
+what a move takes.
+
+`EnergyUse`: the energy that a drive draws from its supply or motor while it follows a step.
+
+Air consumption of a response, in normal litres.
 """
 
 from collections.abc import Mapping
@@ -17,14 +26,15 @@ from typing import Any, TypeVar, final
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.evaluation.air import AIR_CHANNEL, air_rows
-from pneuopt.evaluation.band import Band, Tolerance
-from pneuopt.evaluation.energy import EnergyUse
-from pneuopt.evaluation.metric import AtLeast, AtMost, Metric, Sense, Source
-from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
-from pneuopt.evaluation.motion_requirements import Compliance, FollowingError, FollowingErrorRMS, OvershootDistance
-from pneuopt.evaluation.step_record import (
+from pneuopt.evaluation.metric import (
+    AtLeast,
+    AtMost,
+    Band,
+    Metric,
+    Sense,
+    Source,
     StepRecord,
+    Tolerance,
     ValuesAndSlopes,
     control_rate_rows,
     envelope_rows,
@@ -34,9 +44,183 @@ from pneuopt.evaluation.step_record import (
     overshoot_rows,
     peak_control_rows,
     steady_state_rows,
+    trapezoidal_weights,
     without_slopes,
 )
+from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
 from pneuopt.quantities.errors import require
+
+PUSH = "load.force"
+"""The disturbance against which a loop is stiff."""
+FOLLOWING_METRICS = frozenset({"FollowingError", "FollowingErrorRMS"})
+"""What needs the reference at every instant."""
+LEAST_ROOT = 1e-300  # keeps the derivative of a root finite where nothing is off: 0/0 otherwise
+
+
+def overshoot_distance_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The distance beyond the reference's end; under a disturbance alone on either side."""
+    values, slopes = overshoot_rows(record)
+    return abs(record.size) * values, abs(record.size) * slopes
+
+
+def following_error_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The distance from the reference at that instant, a row each side."""
+    error, slopes = _following_error(record)
+    return np.concatenate([error, -error], axis=1), np.concatenate([slopes, -slopes], axis=1)
+
+
+def following_rms_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The root of the mean square of the distance from the reference."""
+    (error, slopes), weights = _following_error(record), trapezoidal_weights(record.nodes)
+    weights = weights / weights.sum()
+    root = np.sqrt(np.einsum("k,mk->m", weights, error**2))
+    by_unknown = np.einsum("mk,mkn->mn", weights * error, slopes) / np.maximum(root, LEAST_ROOT)[:, None]
+    return root[:, None], by_unknown[:, None]
+
+
+def compliance_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The distance from the reference, either side, over the force that pushes; zero where none does."""
+    error, slopes = record.error
+    share = abs(record.size / record.push) if record.push else 0.0
+    return share * np.concatenate([error, -error], axis=1), share * np.concatenate([slopes, -slopes], axis=1)
+
+
+def _following_error(record: StepRecord) -> ValuesAndSlopes:
+    """Signal less reference at the nodes [measured unit]."""
+    error, slopes = record.error
+    wanted = 0.0 if record.wanted is None else record.wanted
+    return record.size * (error - wanted), record.size * slopes
+
+
+@final
+class OvershootDistance(AtMost):
+    """How far the response passes the reference's end [measured unit]; under a disturbance alone, either side.
+
+    Parameters
+    ----------
+    max : float, optional
+        [measured unit]
+    """
+
+    metric = Metric(
+        "OvershootDistance",
+        "{measured}",
+        Source.RESPONSE,
+        floor=0.0,
+        resolution=1e-8,
+        slope=overshoot_distance_rows,
+        positions=True,
+    )
+
+
+@final
+class FollowingError(AtMost):
+    """Largest distance from the reference at any instant [measured unit]; of a step it is the step at least.
+
+    Parameters
+    ----------
+    max : float, optional
+        [measured unit]
+    """
+
+    metric = Metric(
+        "FollowingError",
+        "{measured}",
+        Source.RESPONSE,
+        resolution=1e-8,
+        slope=following_error_rows,
+        positions=True,
+    )
+
+
+@final
+class FollowingErrorRMS(AtMost):
+    """Root of the mean square distance from the reference, from its beginning to the horizon [measured unit].
+
+    Parameters
+    ----------
+    max : float, optional
+        [measured unit]
+    """
+
+    metric = Metric(
+        "FollowingErrorRMS", "{measured}", Source.RESPONSE, resolution=1e-8, slope=following_rms_rows, positions=True
+    )
+
+
+@final
+class Compliance(AtMost):
+    """Largest deviation over the load force that steps, as ``Step(0.0, ..., disturbance={"load.force": 50.0})`` has it.
+
+    Its reciprocal is the dynamic stiffness. References without that disturbance have none: 0.
+
+    Parameters
+    ----------
+    max : float, optional
+        [measured unit/N]
+    """
+
+    metric = Metric(
+        "Compliance", "{measured}/N", Source.RESPONSE, resolution=1e-10, slope=compliance_rows, positions=True
+    )
+
+
+POWER_CHANNEL = "power"  # the meter's channel with the power drawn from the plant's source [W]
+
+
+def energy_rows(record: StepRecord) -> ValuesAndSlopes:
+    """Integral of the power from the step to the end of the record [J]."""
+    return record.integrate_meter(POWER_CHANNEL)
+
+
+@final
+class EnergyUse(AtMost):
+    """Energy that the plant draws from its source, from the step to the end of the horizon [J].
+
+    Which power counts is what the plant's meter shows. Of a pneumatic drive it is the air power: the work that the air
+    drawn could do in an isothermal expansion from supply to ambient pressure. An ideal gas of mass m with p V = m R T
+    does ``integral of p dV = m R T ln(p_s/p_o)`` on that way, which is p_s V ln(p_s/p_o) for its volume V at the
+    supply's state, both pressures absolute; at ambient temperature it is the exergy of the compressed air. A compressor
+    takes more by its own losses. Of an axis pushed by a force it is the motor's mechanical power where the motor
+    drives, ``max(F v, 0)``: braking power goes into the brake resistor and counts nothing, as in drives that cannot
+    feed back.
+
+    Parameters
+    ----------
+    max : float, optional
+        [J]
+
+    References
+    ----------
+    M. J. Moran, H. N. Shapiro: Fundamentals of Engineering Thermodynamics, Wiley: work of an ideal gas at constant
+    temperature, and flow exergy.
+    """
+
+    metric = Metric("EnergyUse", "J", Source.METER, slope=energy_rows, channels=(POWER_CHANNEL,))
+
+
+ANR_DENSITY = 1.185  # density of air in the standard state of ISO 8778 (ANR: 100 kPa, 20 degC, 65 % humidity) [kg/m^3]
+LITRES_PER_CUBIC_METRE = 1e3
+AIR_CHANNEL = "air"  # the meter's channel with the mass flow drawn from the supply [kg/s]
+
+
+def air_rows(record: StepRecord) -> ValuesAndSlopes:
+    """Volume of the air that is drawn from the step to the end of the record [l(ANR)].
+
+    Examples
+    --------
+    A gram a second for two seconds:
+
+    >>> import numpy as np
+    >>> from pneuopt.evaluation.metrics import meter_record
+    >>> run = meter_record(np.array([0.0, 1.0, 2.0]), {"air": np.full((1, 3), 1e-3)}, 0.0)
+    >>> round(air_rows(run)[0].item(), 4)
+    1.6878
+    """
+    mass, slopes = record.integrate_meter(AIR_CHANNEL)
+    factor = LITRES_PER_CUBIC_METRE / ANR_DENSITY
+    return factor * mass, factor * slopes
+
 
 Value = TypeVar("Value", float, NDArray[np.float64])
 EnvelopeBounds = tuple[tuple[float, float, float], ...]

@@ -1,17 +1,33 @@
-"""A loop's response to a reference: its inputs, its sampling and its metrics."""
+"""A loop's response to a reference: its inputs, its sampling and its metrics.
+
+Cases of a tuning: every reference on every plant that the design must suit, the nominal plant first.
+
+`check_steps`: refuse simulations that take more steps than a budget, before they begin, and name the key.
+
+`check_travel`: refuse a reference that leads a piston into its end stops, before anything is simulated.
+"""
 
 import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Reference
+from pneuopt.control.reference import Reference, Step
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
-from pneuopt.evaluation.band import Band, band_share
+from pneuopt.dynamics.simulate import MAX_STEPS, SECONDS_A_STEP
+from pneuopt.evaluation.metric import Band, band_share
 from pneuopt.evaluation.metrics import BandCentre, Envelope, step_metrics
-from pneuopt.evaluation.motion_requirements import PUSH
+from pneuopt.evaluation.requirements import PUSH
+from pneuopt.evaluation.scenarios import Factor, Scenarios, apply_scenario
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
 
 # Samples of a response of a loop without sample time: fewer blur a settling time, more cost time in proportion.
 RESPONSE_SAMPLES = 1000
@@ -106,3 +122,248 @@ def command_range(loop: ClosedLoop, p: ParameterSet) -> tuple[float, float, str]
     if element is not None and (limit := p.value(element.limit)) < min(-low, high):
         low, high, whose = -limit, limit, f"the {element.name}"
     return low, high, whose
+
+
+@dataclass(frozen=True, eq=False)
+class TuningCase:
+    """One reference on one plant.
+
+    Parameters
+    ----------
+    reference : Reference
+    scenario : str
+        Its name; empty for the nominal plant.
+    values : mapping of str to float or Factor
+        The parameter values that differ from the nominal plant.
+    """
+
+    reference: Reference
+    scenario: str = ""
+    values: Mapping[str, float | Factor] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """Heading of its column in a table: "0 to 0.2 [load.mass high]"."""
+        return f"{self.reference.label} [{self.scenario}]" if self.scenario else self.reference.label
+
+    def case_parameters(self, parameters: ParameterSet) -> ParameterSet:
+        """Parameters of this case: its plant and gains."""
+        return apply_scenario(parameters, self.values)
+
+    def case_vectors(self, p: Array, order: Sequence[str]) -> Array:
+        """Copy of parameter vectors, shape (m, n_parameters), with this case's values in place."""
+        out = p.copy()
+        for n, value in self.values.items():
+            k = order.index(n)
+            out[:, k] = p[:, k] * value.share if isinstance(value, Factor) else value
+        return out
+
+    def slopes(self, names: Sequence[str]) -> Array:
+        """Derivatives of this case's parameters to the candidate's, shape (n,); 0 where the scenario fixes a value."""
+        values = (self.values.get(n, Factor(1.0)) for n in names)
+        return np.array([v.share if isinstance(v, Factor) else 0.0 for v in values])
+
+    def initial(self, loop: ClosedLoop, parameters: ParameterSet) -> Array:
+        """State in which the loop waits for the step.
+
+        Raises
+        ------
+        InputError, ConvergenceError
+            As from `ClosedLoop.initial`; the message names the scenario.
+        """
+        values, step = self.case_parameters(parameters), self.reference
+        try:
+            return loop.initial(values, reference=step.origin, start=step.start)
+        except ConvergenceError as error:
+            raise ConvergenceError(f"{self._message_prefix}{error}", error.solution) from None
+        except HardwareError as error:
+            raise HardwareError(f"{self._message_prefix}{error}", error.parameter, error.remedy) from None
+        except InputError as error:
+            raise InputError(f"{self._message_prefix}{error}") from None
+
+    @property
+    def _message_prefix(self) -> str:
+        return f"scenario {self.scenario!r}: " if self.scenario else ""
+
+
+def cases(
+    references: Sequence[Reference], scenarios: Scenarios, parameters: ParameterSet, tuned: Collection[str] = ()
+) -> tuple[TuningCase, ...]:
+    """Cases of every reference on the nominal plant, then on each scenario's plant.
+
+    Parameters
+    ----------
+    references : sequence of Reference
+    scenarios : mapping of str to mapping
+    parameters : ParameterSet
+        The parameters that a scenario may change.
+    tuned : collection of str
+        Names of tuned parameters, which a scenario may change by a `Factor` only.
+
+    Raises
+    ------
+    InputError
+        If two references have one label, or a scenario names an unknown parameter, or gives a tuned one a value.
+    """
+    labels = [r.label for r in references]
+    twice = next((n for n in labels if labels.count(n) > 1), "")
+    require(not twice, f"two references are {twice!r}, and tables name them by that label; leave one out")
+    for name, values in scenarios.items():
+        require(bool(name), "a scenario needs a name: {'heavy load': {'load.mass': 8.0}}")
+        _check_scenario(name, values, parameters, tuned)
+    nominal = [TuningCase(r) for r in references]
+    return (*nominal, *(TuningCase(r, name, values) for name, values in scenarios.items() for r in references))
+
+
+def _check_scenario(
+    name: str, values: Mapping[str, float | Factor], parameters: ParameterSet, tuned: Collection[str]
+) -> None:
+    check_names("parameter", values, parameters, f"scenario {name!r}")
+    for n, value in values.items():
+        require(
+            isinstance(value, Factor) or n not in tuned,
+            f"scenario {name!r}: {n} is tuned, so no scenario can fix its value; for a tolerance around it write "
+            f"tolerances(parameters, {{{n!r}: 0.01}})",
+        )
+
+
+# Points of the simulated record for each reading of a search: with one, the record would miss what happens between the
+# search's readings just as the search does; more cost time in proportion.
+POINTS_PER_READING = 4
+
+
+def check_steps(
+    loop: ClosedLoop,
+    references: Sequence[Reference],
+    parameters: ParameterSet,
+    *,
+    plants: int = 1,
+    max_steps: float = MAX_STEPS,
+) -> None:
+    """Refuse references whose responses take more steps than a budget.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : sequence of Reference
+    parameters : ParameterSet
+        Every parameter of the loop.
+    plants : int
+        On how many plants each reference is followed.
+    max_steps : float
+        The budget, for all responses together.
+
+    Raises
+    ------
+    InputError
+        With the steps, the minutes that they take, what makes them so many, and how to raise the budget.
+    """
+    needed = [plants * simulation_steps(loop, reference, parameters) for reference in references]
+    if sum(needed) <= max_steps:
+        return
+    longest = references[needed.index(max(needed))]
+    on_plants = f" on {plants} plants" if plants > 1 else ""
+    many = f" (one of {len(references)} references)" if len(references) > 1 else ""
+    key = _finest_key(loop, longest, parameters)
+    require(
+        False,
+        f"reference {longest.label}{many}{on_plants} takes {max(needed):.2g} steps, about "
+        f"{_duration(max(needed) * SECONDS_A_STEP)}: {key} over a horizon of {write_value(longest.horizon, 's', 7)}; "
+        f"change that, shorten the horizon, or raise the budget of {max_steps:.2g} steps: "
+        f"max_steps={_round_up(sum(needed)):.0e}, in a tuning's file steps under [budget]",
+    )
+
+
+def simulation_steps(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> float:
+    """How many steps the independent simulation of a response takes, at least."""
+    spacing = sample_spacing(loop, reference, parameters)
+    points = POINTS_PER_READING * readings_a_sample(loop, reference) * reference.horizon / spacing
+    return max(points, SAMPLES_A_DITHER_PERIOD * _analogue_frequency(loop, parameters) * reference.horizon)
+
+
+def _analogue_frequency(loop: ClosedLoop, parameters: ParameterSet) -> float:
+    """Frequency of a dither that the integration itself resolves [Hz]; 0 for one that is sampled, and without one."""
+    sampled = loop.dither is not None and loop.pid.sample_time is not None and not loop.dither.analogue
+    return 0.0 if sampled else highest_dither_frequency(loop, parameters)
+
+
+def _finest_key(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> str:
+    """What sets the steps of a response, with its value: the dither, the sample time, or the step's instant."""
+    h, rate = loop.pid.sample_time, _analogue_frequency(loop, parameters)
+    if rate and (h is None or SAMPLES_A_DITHER_PERIOD * rate * h > POINTS_PER_READING):
+        return f"dither.frequency is {write_value(rate, 'Hz', 7)}"
+    if h is not None:
+        return f"pid.sample_time is {write_value(h, 's', 4)}"
+    return f"the step is at {write_value(reference.at, 's', 4)}"
+
+
+def _round_up(value: float) -> float:
+    """A number rounded up to one digit."""
+    digit = 10.0 ** math.floor(math.log10(value))
+    return math.ceil(value / digit) * digit
+
+
+def _duration(seconds: float) -> str:
+    """Minutes, or hours, in words."""
+    if not math.isfinite(seconds) or seconds > 72 * 3600:
+        return f"{seconds / 86400:.2g} days"
+    return f"{seconds / 3600:.2g} hours" if seconds > 7200 else f"{seconds / 60:.2g} minutes"
+
+
+# Instants over a horizon at which a reference is read: fewer miss a turn by more of its way, more take longer.
+TRAVEL_SAMPLES = 2001
+
+
+def check_travel(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> None:
+    """Refuse a reference that a piston cannot follow over its horizon without reaching an end stop.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    case : TuningCase
+    parameters : ParameterSet
+        Every parameter of the loop, without this case's values.
+
+    Raises
+    ------
+    InputError
+        With the way that the reference leads, the way that there is, and what to change.
+    """
+    stops = [g for g in loop.plant.validity_limits if g.state == "position"]
+    states = [q.name for q in loop.plant.states]
+    if not stops or "position" not in states or loop.feedback.name not in ("position", "speed"):
+        return
+    reference, own = case.reference, case.case_parameters(parameters)
+    begin = float(case.initial(loop, parameters)[states.index("position")])
+    for stop in stops:
+        room = stop.side * (stop.limit(own) - begin)
+        if loop.feedback.name == "position":
+            far = float((stop.side * (_values(reference)[1] - begin)).max())
+            remedy = "take a smaller step" if isinstance(reference, Step) else "take a shorter way"
+        elif isinstance(reference, Step):
+            far, remedy = _step_of_speed(reference, stop.side, room)
+        else:
+            far = float((stop.side * cumulative_trapezoid(*_values(reference)[::-1])).max())
+            remedy = "take less speed, or start elsewhere"
+        where = "front" if stop.side > 0 else "rear"
+        require(
+            far <= room,
+            f"reference {case.label}: it leads the piston over {write_value(far, 'm', 4)}, but from position "
+            f"{write_value(begin, 'm', 4)} to the {where} end stop there are {write_value(max(room, 0.0), 'm', 4)}; "
+            f"{remedy}",
+        )
+
+
+def _values(reference: Reference) -> tuple[Array, Array]:
+    """Instants over the horizon, and the reference there."""
+    t = np.linspace(0.0, reference.horizon, TRAVEL_SAMPLES)
+    return t, reference.values(t)
+
+
+def _step_of_speed(reference: Step, side: int, room: float) -> tuple[float, str]:
+    """How far a step of the speed leads to a side [m], and what to change where that is too far."""
+    lead, rest = side * reference.initial * reference.at, reference.horizon - reference.at
+    far = max(lead, lead + side * reference.final * rest)
+    fits = (room - lead) / (side * reference.final) if reference.final else inf
+    early = f"end it by horizon = {reference.at + fits:.3g} s"
+    return far, f"{early}, or start elsewhere, start={{'position': ...}}" if fits > 0 else "start elsewhere"

@@ -17,17 +17,14 @@ from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.simulate import simulate_stick_slip
 from pneuopt.dynamics.stick_slip import Event, EventKind
-from pneuopt.evaluation.cases import TuningCase, cases
-from pneuopt.evaluation.record import record
-from pneuopt.evaluation.response import loop_inputs, sample_spacing
-from pneuopt.evaluation.rig import Rig
+from pneuopt.evaluation.response import TuningCase, cases, loop_inputs, sample_spacing
+from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
-from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ModelError, require
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet, check_argument
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
-from pneuopt.quantities.shown import Result
+from pneuopt.quantities.results import Result
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
 
@@ -219,7 +216,7 @@ def check_rest(
 
     >>> from pneuopt.control.pid import PID
     >>> from pneuopt.control.reference import Step
-    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.drives import ForceDrive
     >>> from pneuopt.models.friction import Stribeck
     >>> from pneuopt.models.karnopp import Karnopp
     >>> loop = ClosedLoop(ForceDrive(Karnopp(Stribeck())).system(), PID(dead_band=True), measured="position")

@@ -6,8 +6,7 @@ from math import inf
 from types import MappingProxyType
 from typing import Any
 
-from pneuopt.evaluation.band import Band, Tolerance
-from pneuopt.evaluation.dither_mean import TAIL_SHARE
+from pneuopt.evaluation.metric import TAIL_SHARE, Band, Tolerance
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     EnvelopeBounds,

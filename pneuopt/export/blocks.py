@@ -24,8 +24,7 @@ from pneuopt.export.program import check_sampled
 from pneuopt.export.writer import check_name, comment_text
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import write_value
+from pneuopt.quantities.units import difference_unit, write_value
 
 COMPARED_METRICS = {"SettlingTime": "s", "Overshoot": "%", "SteadyStateError": "%"}
 """What the two are compared by, and its unit."""

@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 from pneuopt.control.pid import ParallelForm
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import write_value
+from pneuopt.quantities.units import difference_unit, write_value
 
 BEHIND_OFFSET = "Behind the block: offset"
 BEHIND_FACTOR = "Behind the block: factor"

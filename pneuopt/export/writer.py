@@ -23,9 +23,8 @@ from pneuopt.export.identifiers import Identifiers
 from pneuopt.export.program import C_NAMES, ControllerProgram
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.provenance import provenance
-from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
-from pneuopt.quantities.units import write_value
+from pneuopt.quantities.status import provenance
+from pneuopt.quantities.units import difference_unit, unit_ratio, write_value
 
 MAX_INLINE = 70
 """Length of an expression that stands within another [character]: a longer one gets a name of its own; below some 40

@@ -37,8 +37,7 @@ from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning_table
 from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
-from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import is_unit, read_unit, read_value, si_conversion, write_value
+from pneuopt.quantities.units import difference_unit, is_unit, read_unit, read_value, si_conversion, write_value
 
 if TYPE_CHECKING:
     pass

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import System
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.identification.assumptions import AMBIENT_PRESSURE, DRIVE_FILE, Assumption
+from pneuopt.identification.checkup import AMBIENT_PRESSURE, DRIVE_FILE, Assumption
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.models.declaration import Alias, Drive, DriveKind, DriveSections, Sections
 from pneuopt.models.drive_kinds import DRIVE_KINDS

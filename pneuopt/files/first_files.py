@@ -9,9 +9,9 @@ from pathlib import Path
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
-from pneuopt.dynamics.excitation import DEFAULT_WIDTH
+from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.excitation_run import ExcitationRun
+from pneuopt.evaluation.moves import ExcitationRun
 from pneuopt.files.drive import FIT_SECTIONS, default_parameters, drive_keys
 from pneuopt.files.keys import Template, json_schema
 from pneuopt.files.loop import SAMPLE_TIME, signal_units, tuning_keys
@@ -19,9 +19,7 @@ from pneuopt.files.outputs import output_schema
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
 from pneuopt.files.tuning import TUNED_SECTIONS
-from pneuopt.logs.columns import CHANNELS
-from pneuopt.logs.plant_channels import plant_channels
-from pneuopt.logs.sidecar_keys import SIDECAR_KEYS
+from pneuopt.logs.columns import CHANNELS, SIDECAR_KEYS, plant_channels
 from pneuopt.models.catalog import CATALOGUE_SOURCE
 from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drive_kinds import DRIVE_KINDS

@@ -12,7 +12,7 @@ from pneuopt.files.drive import drive_keys
 from pneuopt.files.loop import tuning_keys
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
-from pneuopt.logs.sidecar_keys import SIDECAR_KEYS
+from pneuopt.logs.columns import SIDECAR_KEYS
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.keys import PARAMETER_KEYS, Key, Takes, table

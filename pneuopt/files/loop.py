@@ -24,14 +24,11 @@ from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.certificate import Defect
-from pneuopt.evaluation.distributions import DISTRIBUTIONS, Distribution
-from pneuopt.evaluation.metric import Requirement
+from pneuopt.evaluation.metric import Band, Requirement, Tolerance
 from pneuopt.evaluation.requirements import REQUIREMENT_KINDS, SettlingTime, StepEnvelope
 from pneuopt.evaluation.rest_check import NoHunting
-from pneuopt.evaluation.sampling import Sampling
-from pneuopt.evaluation.scenarios import TOGETHER, Spread
+from pneuopt.evaluation.scenarios import DISTRIBUTIONS, TOGETHER, Distribution, Sampling, Spread
 from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.toml import construct_at, read_parameter
 from pneuopt.quantities.errors import InputError, UnitError, check_names, require
@@ -48,10 +45,9 @@ from pneuopt.quantities.keys import (
     table,
 )
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import count_gauge_from, read_value, write_value
+from pneuopt.quantities.units import count_gauge_from, difference_unit, read_value, write_value
 from pneuopt.tuning.method import Method
-from pneuopt.tuning.methods import METHODS
+from pneuopt.tuning.tune import METHODS
 
 MAX_CASES = 20_000
 """Plants or cells that a file may ask for [1]: more take days and gigabytes; fewer refuse a map of 100 by 100."""
@@ -73,7 +69,7 @@ def bound_units(loop: ClosedLoop) -> dict[str, str]:
     Examples
     --------
     >>> from pneuopt.control.pid import PID
-    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.drives import ForceDrive
     >>> from pneuopt.models.friction import Viscous
     >>> units = bound_units(ClosedLoop(ForceDrive(Viscous()).system(), PID()))
     >>> units["peak_control"], units["ripple"], units["overshoot"]

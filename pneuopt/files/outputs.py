@@ -10,9 +10,9 @@ from enum import Enum
 from types import NoneType
 from typing import Any, get_args
 
-from pneuopt.evaluation.dither_verdict import DitherVerdict
+from pneuopt.evaluation.dither import DitherVerdict
 from pneuopt.files.certificate import CertificateCheck
-from pneuopt.identification.assumptions import Assumption
+from pneuopt.identification.checkup import Assumption
 from pneuopt.identification.result import (
     AgreementRow,
     ChosenWidth,
@@ -21,7 +21,7 @@ from pneuopt.identification.result import (
     IdentifiableRow,
     Verdict,
 )
-from pneuopt.logs.checks.findings import LogFinding
+from pneuopt.logs.doctor import LogFinding
 from pneuopt.quantities.keys import argument_meanings, first_sentence
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.quantities.status import Status

@@ -4,14 +4,13 @@ from pathlib import Path
 from typing import Any
 
 from pneuopt.evaluation.certificate import Certificate
-from pneuopt.evaluation.compensator_verdict import CompensatorVerdict
-from pneuopt.evaluation.dither_verdict import DitherVerdict
+from pneuopt.evaluation.dither import CompensatorVerdict, DitherVerdict
 from pneuopt.evaluation.rest_check import RestCheck
+from pneuopt.experiments.design import ExperimentDesign
 from pneuopt.identification.compare_logs import LogComparison
-from pneuopt.identification.experiment_design import ExperimentDesign
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.select_model import ModelSelection
-from pneuopt.quantities.result_file import read_result
+from pneuopt.quantities.results import read_result
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.validation import DesignValidation
 

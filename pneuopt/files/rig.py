@@ -27,7 +27,7 @@ from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import stick_slip_drive
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.keys import Key, check_sections, read_table, table
-from pneuopt.quantities.unit_algebra import difference_unit
+from pneuopt.quantities.units import difference_unit
 
 Part = TypeVar("Part", Actuator, Sensor, Encoder)
 _SENSOR = table(

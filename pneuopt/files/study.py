@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.evaluation.monte_carlo import monte_carlo
+from pneuopt.evaluation.plants import monte_carlo
 from pneuopt.evaluation.scenarios import SampleSpreads, corners
 from pneuopt.files.drive import ambient_pressure, read_fit
 from pneuopt.files.loop import (
@@ -27,7 +27,7 @@ from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, check_sections, flag, read_table, table
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import count_gauge_from, read_unit, read_value, si_conversion, write_value
-from pneuopt.studies.cases import read_cases
+from pneuopt.studies.sweep import read_cases
 
 Cases = dict[str, dict[str, float]]
 CASE_KEYS: Mapping[str, Key] = {

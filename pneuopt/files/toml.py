@@ -15,9 +15,8 @@ from tomlkit.items import InlineTable, Table
 
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import PARAMETER_KEYS, Takes
-from pneuopt.quantities.output import plain_value
+from pneuopt.quantities.output import MAX_REASON, plain_value, read_toml_source
 from pneuopt.quantities.parameters import Parameter
-from pneuopt.quantities.source import MAX_REASON, read_toml_source
 from pneuopt.quantities.units import read_value, write_value
 
 Made = TypeVar("Made")

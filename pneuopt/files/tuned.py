@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import tomlkit
 
-from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.evaluate import metric_limits
+from pneuopt.evaluation.response import cases
 from pneuopt.files.certificate import CHECKSUM, checksum_section
 from pneuopt.files.drive import StoredFit, read_fit
 from pneuopt.files.loop import TUNABLE_SECTIONS

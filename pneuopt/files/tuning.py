@@ -10,15 +10,14 @@ from typing import Any
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.moves import MotionPath, Move, MoveSequence
 from pneuopt.control.reference import Reference, Step
-from pneuopt.dynamics.centre import command_centre
+from pneuopt.dynamics.runnable import command_centre
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.certificate import Defect
-from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
+from pneuopt.evaluation.plants import PLANT_COUNT
 from pneuopt.evaluation.rest_check import NoHunting
-from pneuopt.evaluation.sampling import further
-from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, samples, tolerances
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, further, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.loop import (
     ACCEPT_KEY,

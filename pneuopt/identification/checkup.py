@@ -1,4 +1,7 @@
-"""`check`: everything about logs before a fit, in seconds: what was read, assumed and found, and what logs identify."""
+"""`check`: everything about logs before a fit, in seconds: what was read, assumed and found, and what logs identify.
+
+`list_assumptions`: the values that a fit uses and that nobody has stated, with the keys that state them.
+"""
 
 import itertools
 import math
@@ -11,34 +14,149 @@ from typing import Any
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
-from pneuopt.identification.assumptions import Assumption, list_assumptions
-from pneuopt.identification.checks import (
+from pneuopt.identification.examination import (
+    QUIET_CHECKS,
+    accept_remedy,
+    find_exchange,
+    is_accepted,
+    is_refused,
+    stated_axis,
+)
+from pneuopt.identification.identifiability import verdict_from_sensitivities
+from pneuopt.identification.problem import (
+    EstimationProblem,
+    as_estimation_model,
     as_experiments,
     check_free,
     check_logs,
+    find_centre,
     find_log_warnings,
+    input_behaviour,
     log_remarks,
     outputs_in_log,
 )
-from pneuopt.identification.command_centre import find_centre
-from pneuopt.identification.examination import QUIET_CHECKS, accept_remedy, is_accepted, is_refused
-from pneuopt.identification.exchange import find_exchange
-from pneuopt.identification.identifiability import verdict_from_sensitivities
-from pneuopt.identification.marks import UNIDENTIFIABLE_NOTE
-from pneuopt.identification.problem import EstimationProblem, as_estimation_model
-from pneuopt.identification.result import Verdict
-from pneuopt.identification.stated_axis import stated_axis
-from pneuopt.logs.checks.findings import LogFinding, Severity, evidence
-from pneuopt.logs.doctor import examine
-from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arguments import check_parameters
+from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, Verdict
+from pneuopt.logs.doctor import LogFinding, Severity, evidence, examine
+from pneuopt.logs.experiment import Experiment
+from pneuopt.logs.noise import estimate_noise
 from pneuopt.quantities.errors import ModelError, PhysicsWarning
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet, check_parameters
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, text_columns
-from pneuopt.quantities.shown import Shown
-from pneuopt.quantities.units import write_value
+from pneuopt.quantities.results import Shown
+from pneuopt.quantities.units import ATMOSPHERE, write_value
 from pneuopt.shooting.least_squares import LeastSquares
+
+AMBIENT_PRESSURE = "ambient.pressure"  # the parameter of a drive that its gauge pressures count from
+SIDECAR = "the log's sidecar"
+DRIVE_FILE = "the drive's file"
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """A value that stands in no file.
+
+    Attributes
+    ----------
+    name : str
+        A parameter, an option, or "noise of position".
+    value : float, str or bool
+        [unit]; a word; a flag.
+    unit : str
+    key : str
+        What states it: "[noise] position".
+    file : str
+        Where: `SIDECAR` or `DRIVE_FILE`.
+    reason : str
+        What it is, or where it comes from.
+    """
+
+    name: str
+    value: float | str | bool
+    unit: str
+    key: str
+    file: str
+    reason: str
+
+    @property
+    def text(self) -> str:
+        """The value with its unit, as a file has it."""
+        if isinstance(self.value, bool):
+            return str(self.value).lower()
+        return f'"{self.value if isinstance(self.value, str) else write_value(self.value, self.unit, 6)}"'
+
+
+def list_assumptions(
+    system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
+) -> tuple[Assumption, ...]:
+    """The noise, the behaviour between samples and the fixed parameters that nobody has stated.
+
+    Parameters
+    ----------
+    system : Fittable
+    given, checked : sequence of Experiment
+        The logs as read, and as `check_logs` returns them, with all noise levels.
+    parameters : ParameterSet
+        As the user gives them; what is free is no assumption.
+
+    Returns
+    -------
+    tuple of Assumption
+        The logs' first.
+    """
+    logs = (*_noise_levels(system, given, checked), *_behaviour(system, given), *_gauge_zero(system, given))
+    return (*logs, *_defaults(system.parameters, parameters))
+
+
+def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> Iterator[Assumption]:
+    units = {q.name: q.unit.partition("(")[0] for q in system.outputs}
+    found: dict[str, float] = {}
+    for log, full in zip(given, checked, strict=True):
+        for channel in outputs_in_log(system, full):
+            if channel not in log.noise and channel not in found:
+                found[channel] = float(f"{full.noise[channel]:.3g}")
+                shown = estimate_noise(full.trajectory[channel], full.trajectory.t)
+                how = "its resolution, as the logs show" if shown.is_quantisation else "white, as the logs show"
+                yield Assumption(
+                    f"noise of {channel}", found[channel], units[channel], f"[noise] {channel}", SIDECAR, how
+                )
+
+
+def _behaviour(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
+    said: dict[str, str] = {}
+    for log in given:
+        for channel, kind in input_behaviour(system, log).items():
+            if channel not in log.intersample:
+                said[channel] = kind.value
+    for channel, word in said.items():
+        why = "as a command runs between samples" if word == "held" else "as a measured channel runs between samples"
+        yield Assumption(f"{channel} between samples", word, "", f"[intersample] {channel}", SIDECAR, why)
+
+
+def _gauge_zero(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
+    """The zero of gauge pressures in logs of a drive that has no ambient pressure."""
+    if AMBIENT_PRESSURE in system.parameters:
+        return
+    columns = [column for log in given if log.source for column in log.source.columns.values()]
+    if any("(g)" in column.unit for column in columns):
+        yield Assumption("zero of gauge pressures", ATMOSPHERE, "Pa(a)", "bar(a)", "the log's units", "the standard's")
+
+
+def _defaults(defaults: ParameterSet, given: ParameterSet) -> Iterator[Assumption]:
+    for name, usual in defaults.items():
+        used = given.get(name, usual)
+        if used.free or used.stated or used != usual:
+            continue
+        section, _, key = name.partition(".")
+        yield Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, _reason(used))
+
+
+def _reason(p: Parameter) -> str:
+    if p.source == DEFAULT_WIDTH:
+        return f"{p.meaning}; identify chooses it by the logs"
+    return f"{p.meaning} ({p.source})" if p.source else p.meaning
+
 
 MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
 """Names of findings that no check of the log doctor makes: by the model's equations, of what was mended in a log, of

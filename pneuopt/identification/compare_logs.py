@@ -9,16 +9,15 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import HasSystem
-from pneuopt.identification.checks import as_experiments, check_logs
-from pneuopt.identification.clusters import t_quantile
 from pneuopt.identification.identify import identify
-from pneuopt.identification.problem import as_estimation_model
+from pneuopt.identification.misfit import t_quantile
+from pneuopt.identification.problem import as_estimation_model, as_experiments, check_logs
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
-from pneuopt.quantities.shown import Result
+from pneuopt.quantities.results import Result
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:

@@ -13,16 +13,22 @@ import numpy as np
 from scipy.stats import chi2
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.excitation import Lack
-from pneuopt.dynamics.hooks import Start
+from pneuopt.dynamics.hooks import Lack, Start
 from pneuopt.dynamics.runnable import HasSystem, check_smooth
 from pneuopt.identification.examination import pose_problem
-from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion, with_values_in_words
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.profiles import Profile
-from pneuopt.identification.result import IdentifiableRow, Verdict, join_names
+from pneuopt.identification.result import (
+    IdentifiableRow,
+    Verdict,
+    join_names,
+    missing_excitation,
+    remedy,
+    summarise_motion,
+    with_values_in_words,
+)
 from pneuopt.identification.widths import excerpts
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.shooting.least_squares import Fit, LeastSquares

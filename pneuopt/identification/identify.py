@@ -1,6 +1,8 @@
 """`identify`: parameters with confidence intervals, from logs, by lifted multiple shooting; `validate`: held-out runs.
 
 The system is any ODE with named signals that proposes its own starts (`System.starts`).
+
+`fit_table`, `agreement_rows`, `residual_diagnosis`: how well runs agree with logs, and what is left of these.
 """
 
 import math
@@ -15,48 +17,59 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identification.agreement_rows import agreement_rows, fit_table, residual_diagnosis
-from pneuopt.identification.checks import (
+from pneuopt.dynamics.system import names
+from pneuopt.identification.examination import check_content
+from pneuopt.identification.identifiability import foresee_unidentifiable, leans_on_prior, rests_on_prior
+from pneuopt.identification.losses import Loss, fit_robustly
+from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, suspect_widths
+from pneuopt.identification.problem import (
+    EstimationProblem,
+    apply_conditions,
+    as_estimation_model,
     as_experiments,
     check_free,
     check_logs,
     emit_log_warnings,
+    find_centre,
+    input_behaviour,
+    known_runs,
     log_remarks,
     outputs_in_log,
+    window_runs,
 )
-from pneuopt.identification.closed_gaps import fit_with_closed_gaps
-from pneuopt.identification.command_centre import find_centre
-from pneuopt.identification.examination import check_content
-from pneuopt.identification.identifiability import foresee_unidentifiable, leans_on_prior, rests_on_prior
-from pneuopt.identification.long_logs import fit_logs
-from pneuopt.identification.losses import Loss, fit_robustly
-from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit
-from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
-from pneuopt.identification.order import hold_order, mark_order
-from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
-from pneuopt.identification.profiled_optimum import fit_from_profiles
-from pneuopt.identification.repairs import input_behaviour, known_runs, window_runs
 from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult
-from pneuopt.identification.review import review_fit
-from pneuopt.identification.statistics import confidence_interval
-from pneuopt.identification.width_bias import suspect_widths
+from pneuopt.identification.review import FixedValueTest, review_fit
+from pneuopt.identification.search import (
+    fit_from_profiles,
+    fit_from_starts,
+    fit_holding_unidentifiable,
+    fit_logs,
+    fit_with_closed_gaps,
+    hold_order,
+    mark_order,
+)
+from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
 from pneuopt.identification.widths import choose_widths
-from pneuopt.identification.windows import check_window, fit_in_windows
-from pneuopt.identification.wrong_values import FixedValueTest
-from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arguments import as_tuple, check_argument, check_number, wrong_argument
+from pneuopt.identification.windows import check_window, fit_in_windows, run_freely
+from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
-from pneuopt.quantities.blas_threads import one_blas_thread
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
-from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.quantities.provenance import provenance
-from pneuopt.quantities.status import Code, Status
+from pneuopt.quantities.output import one_blas_thread
+from pneuopt.quantities.parameters import (
+    Parameter,
+    ParameterSet,
+    as_tuple,
+    check_argument,
+    check_number,
+    wrong_argument,
+)
+from pneuopt.quantities.status import Code, Progress, ProgressReporter, Status, provenance
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, CpuBudget, Fit, LeastSquares, solve_least_squares
 
 if TYPE_CHECKING:
     import pandas as pd
+
 
 ESTIMATE_COLUMNS = [n for n in EstimateRow.__annotations__ if n != "note"]  # a note comes with the review
 NOTHING_IDENTIFIABLE = Status(
@@ -411,3 +424,38 @@ def _covariance_frame(free: Sequence[str], covariance: Array | None) -> "pd.Data
 
     values = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
     return pd.DataFrame(values, index=list(free), columns=list(free))
+
+
+def fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":
+    """A row a log and channel of a fit (`IdentificationResult.fit`)."""
+    from pneuopt.quantities.frames import WideFrame
+
+    runs = zip(problem.experiments, fit.trajectories, run_freely(problem, fit), strict=True)
+    rows = [row for e, run, free in runs for row in agreement_rows(problem.system, e, run, free)]
+    return WideFrame(rows).set_index(["log", "channel"])
+
+
+def agreement_rows(
+    system: Fittable, experiment: Experiment, run: Trajectory, free_run: Trajectory
+) -> list[dict[str, object]]:
+    """A row a channel of a log: how well a run agrees with it, and a simulation from end to end."""
+    units = {q.name: q.unit for q in system.outputs}
+    rows: list[dict[str, object]] = []
+    for channel in outputs_in_log(system, experiment):
+        figures, measured = agreement(experiment.trajectory[channel], run[channel]), experiment.trajectory[channel]
+        free = agreement(measured, free_run[channel])
+        free_figures = {f"free_run_{n}": free[n] for n in ("rmse", "nrmse")}
+        known = {"noise": experiment.noise[channel], "unit": units[channel]}
+        rows.append({"log": experiment.name, "channel": channel, **figures, **free_figures, **known})
+    return rows
+
+
+def residual_diagnosis(system: Fittable, experiment: Experiment, run: Trajectory, channel: str) -> dict[str, object]:
+    """Whiteness of a channel's residuals, and their correlation with each input."""
+    log = experiment.trajectory
+    residuals = log[channel] - run[channel]
+    found: dict[str, object] = {"whiteness_p": ljung_box(residuals)[1]}
+    for name in (n for n in names(system.inputs) if n in log):
+        size, lag = cross_correlation(residuals, log[name])
+        found |= {f"correlation[{name}]": size, f"lag[{name}]": lag}
+    return found

@@ -11,9 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from pneuopt.identification.checks import outputs_in_log
-from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
-from pneuopt.logs.experiments import Experiment
+from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem, outputs_in_log
+from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import noise_level
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require

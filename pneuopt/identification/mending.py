@@ -8,13 +8,10 @@ from collections.abc import Callable
 import numpy as np
 
 from pneuopt.dynamics.runnable import Fittable
-from pneuopt.identification.checks import check_logs
-from pneuopt.identification.examination import is_accepted
-from pneuopt.identification.exchange import exchange, find_exchange
-from pneuopt.identification.stated_axis import stated_axis
-from pneuopt.logs.checks.findings import LogFinding
-from pneuopt.logs.doctor import examine
-from pneuopt.logs.experiments import Experiment
+from pneuopt.identification.examination import exchange, find_exchange, is_accepted, stated_axis
+from pneuopt.identification.problem import check_logs
+from pneuopt.logs.doctor import LogFinding, examine
+from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.mending import MendedLog, convert, empty_cells, leave_out
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet

@@ -1,26 +1,44 @@
-"""`EstimationProblem`: logs, conditions and parameters of an identification, as a multiple-shooting `Transcription`."""
+"""`EstimationProblem`: logs, conditions and parameters of an identification, as a multiple-shooting `Transcription`.
 
+Checks that logs, a system and parameters fit together, before anything is solved; each refusal names the remedy.
+
+Holes of a log's inputs: a short one is bridged, at a long one the log is cut; `repair_log` says which and where.
+
+`find_centre`: the centre of a valve whose command was logged from 0 to 10 V, to be estimated with the rest.
+
+A command that stays between 0 and twice the valve's span, and rests near the span, is that of a valve which is closed
+there. Taken as a command about 0 V, it would show a valve that is fully open while the drive rests.
+"""
+
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.hooks import Log, Start
-from pneuopt.dynamics.ramps import add_slopes, append_slopes
-from pneuopt.dynamics.runnable import Fittable, HasSystem, as_runnable
-from pneuopt.dynamics.system import DiscreteSystem, names
-from pneuopt.identification.checks import outputs_in_log
+from pneuopt.dynamics.hooks import FinalElement, Log, Start
+from pneuopt.dynamics.runnable import Fittable, HasSystem, as_runnable, centre_name
+from pneuopt.dynamics.system import DiscreteSystem, add_slopes, append_slopes, names
 from pneuopt.identification.logged_loop import LoggedLoop
-from pneuopt.identification.repairs import input_behaviour, window_runs
-from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
+from pneuopt.identification.result import MOVING_SPEED_SHARE, IdentificationResult
+from pneuopt.logs.doctor import CHECKS
+from pneuopt.logs.experiment import Experiment
+from pneuopt.logs.noise import estimate_noise, noise_level
 from pneuopt.quantities.arrays import Array, Mask
-from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_names, require
+from pneuopt.quantities.parameters import (
+    Intersample,
+    Parameter,
+    ParameterSet,
+    as_tuple,
+    check_parameters,
+    usual_intersample,
+)
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import Fit, LeastSquares
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
@@ -187,3 +205,401 @@ def apply_conditions(parameters: ParameterSet, experiment: Experiment) -> Parame
         return parameters.with_values(experiment.conditions).fixed(*experiment.conditions)
     except InputError as error:
         raise InputError(f"{experiment.name}: condition {error}") from None
+
+
+# Factor [1] between a stated noise level and the one that the log shows: a smaller one doubts good estimates of short
+# logs and of noise that is not white, a larger one lets intervals through that are too narrow.
+MAX_NOISE_FACTOR = 3.0
+FOREIGN_CHANNELS = "channels"  # the name by which channels that no plant reads are accepted, and left out
+# What a fit cannot do without, by the names of the checks, and why no user can accept it.
+NEEDED = {
+    "length": "fewer hold no start state beside a parameter",
+    "inputs": "without it the equations cannot be computed",
+    "outputs": "without one there is nothing to compare",
+    "noise": "a constant channel shows none; state its [noise] in the sidecar",
+}
+SETPOINT_CHANNELS = (
+    "speed_reference",
+    "position_reference",
+)  # a loop's set-points may stay in a log; no plant reads them
+
+
+def as_experiments(experiments: Experiment | Iterable[Experiment]) -> tuple[Experiment, ...]:
+    """One log as well as several, as a tuple; an `InputError` where something else came."""
+    return as_tuple("experiments", experiments, Experiment, "an Experiment or several, as read_log(path) gives them")
+
+
+def check_logs(
+    system: Fittable, experiments: Experiment | Iterable[Experiment], parameters: ParameterSet
+) -> list[Experiment]:
+    """Check that logs, system and parameters fit together; give every log a name of its own and noise levels."""
+    experiments = as_experiments(experiments)
+    check_parameters(parameters)
+    require(len(experiments) > 0, "no experiments: give at least one log", LogError)
+    check_names("parameter", parameters, system.parameters)
+    system.check(parameters)
+    signals = {*names(system.inputs), *names(system.outputs)}
+    known = {*signals, *SETPOINT_CHANNELS, *(f"{n}_reference" for n in names(system.outputs))}
+    taken: set[str] = set()
+    out = []
+    for number, experiment in enumerate(experiments, 1):
+        name = experiment.name or f"log {number}"
+        name = name if name not in taken else f"{name} ({number})"
+        taken.add(name)
+        check_accept(experiment, name)
+        system.check_log(experiment.trajectory, name)
+        read = experiment.trajectory.names
+        if FOREIGN_CHANNELS in experiment.accept:
+            read = tuple(n for n in read if n in known)
+        own = replace(experiment.select(read), name=name)
+        _check_channels(system, own, name, known)
+        _check_conditions(system, own, parameters, name)
+        out.append(repair_log(system, own)[0])
+    return _fill_noise(system, out)
+
+
+def check_accept(experiment: Experiment, name: str) -> None:
+    """Check the names of what a log need not pass: each is a check, and one without which a fit is possible."""
+    for check in experiment.accept:
+        if check in NEEDED:
+            raise LogError(f"{name}: accept: {check!r} cannot be accepted: {NEEDED[check]}")
+    check_names("check", experiment.accept, (*CHECKS, FOREIGN_CHANNELS), f"{name}: accept")
+
+
+def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> None:
+    """Check that a parameter is free, and that no free parameter is known in every log."""
+    free = parameters.free_names
+    require(len(free) > 0, "no parameter is free; mark what to estimate, as parameters.freed('friction.*')", ModelError)
+    for name in free:
+        known = all(name in e.conditions for e in experiments)
+        message = f"{name} is free, but every log's conditions give its value; fix it, or drop the condition"
+        require(not known, message, ModelError)
+
+
+def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
+    """Warn of faults that only the model can find in logs, as a gauge pressure read as absolute.
+
+    The warnings are returned, too.
+    """
+    found = find_log_warnings(system, experiments, parameters)
+    for sentence in found:
+        warnings.warn(sentence, PhysicsWarning, stacklevel=3)
+    return found
+
+
+def find_log_warnings(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
+    """What the model finds in logs; see `emit_log_warnings`."""
+    every = system.parameters | parameters
+    known = {e.name: every.with_values(e.conditions).fixed(*e.conditions) for e in experiments}
+    return tuple(system.log_warnings({e.name: Log(e.trajectory, known[e.name]) for e in experiments}))
+
+
+def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> tuple[str, ...]:
+    """What was mended in logs, and stated noise levels that the logs themselves do not show; a sentence each."""
+    out: list[str] = []
+    for log, named in zip(given, checked, strict=True):
+        if ignored := [n for n in log.trajectory if n not in named.trajectory]:
+            out.append(f"{named.name}: accepted: {', '.join(ignored)}, which the model does not read")
+        out += repair_log(system, replace(log.select(named.trajectory), name=named.name))[1]
+        for channel in (n for n in outputs_in_log(system, named) if n in log.noise):
+            stated, found = log.noise[channel], estimate_noise(named.trajectory[channel], named.trajectory.t)
+            shown, least = found.level, found.level / MAX_NOISE_FACTOR if found.is_white else 0.0
+            if not least <= stated <= shown * MAX_NOISE_FACTOR:
+                unit = next(q.unit for q in system.outputs if q.name == channel)
+                levels = f"stated as {stated:.2g} {unit}, the log itself shows {shown:.2g} {unit}"
+                out.append(f"{named.name}: the noise of {channel} is {levels}; leave it out to have it estimated")
+    return tuple(out)
+
+
+def _check_conditions(system: Fittable, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
+    """Check the parameters under the conditions of a log."""
+    check_names("parameter", experiment.conditions, system.parameters, f"{name}: condition")
+    try:
+        system.check((system.parameters | parameters).with_values(experiment.conditions))
+    except InputError as error:
+        raise InputError(f"{name}: condition {error}") from None
+
+
+def _check_channels(system: Fittable, experiment: Experiment, name: str, known: set[str]) -> None:
+    trajectory = experiment.trajectory
+    short = f"{name}: {len(trajectory)} samples are too short a log; at least 10, for {NEEDED['length']}"
+    require(len(trajectory) >= 10, short, LogError)
+    for q in system.inputs:
+        needed = f"{name}: the model needs the channel {q.name!r} [{q.unit}] as input; the log has "
+        require(q.name in trajectory, f"{needed}{', '.join(trajectory.names)}; {NEEDED['inputs']}", LogError)
+    for channel in trajectory:
+        out = f"{channel} = false under [columns] of the log's sidecar, or Experiment.select"
+        remedy = f"leave it out ({out}), or accept = ['channels']"
+        reads = ", ".join(sorted(n for n in known if not n.endswith("_reference")))
+        message = f"{name}: the model cannot use channel {channel!r}, it reads {reads}; {remedy}"
+        require(channel in known, message, LogError)
+    outputs = ", ".join(names(system.outputs))
+    missing = f"{name}: none of the outputs is logged: {outputs}; {NEEDED['outputs']}"
+    require(bool(outputs_in_log(system, experiment)), missing, LogError)
+    for channel in outputs_in_log(system, experiment):
+        empty = f"{name}: channel {channel!r} holds no sample; leave it out"
+        require(bool(np.isfinite(trajectory[channel]).any()), empty, LogError)
+
+
+def _fill_noise(system: Fittable, experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Add noise levels where a log declares none: each channel's median over all logs, for they share their sensors."""
+    found: dict[str, dict[str, float]] = {}
+    for experiment in experiments:
+        for channel in outputs_in_log(system, experiment):
+            if channel not in experiment.noise:
+                found.setdefault(channel, {})[experiment.name] = noise_level(
+                    experiment.trajectory[channel], experiment.trajectory.t
+                )
+    pooled = {}
+    for channel, levels in found.items():
+        shown = [level for level in levels.values() if not math.isnan(level)]
+        constant = f"{next(iter(levels))}: channel {channel!r} is constant; leave it out, or state its [noise]"
+        require(len(shown) > 0, constant, LogError)
+        pooled[channel] = float(np.median(shown))
+        silent = f"{next(iter(levels))}: channel {channel!r} shows no noise, not even rounding; state its [noise]"
+        require(pooled[channel] > 0, silent, LogError)
+    return [
+        e.with_noise({n: s for n, s in pooled.items() if n in e.trajectory and n not in e.noise}) for e in experiments
+    ]
+
+
+def outputs_in_log(system: Fittable, experiment: Experiment) -> tuple[str, ...]:
+    """The names of the system's outputs that a log holds; an output that is an input, too, is left out."""
+    inputs = names(system.inputs)
+    return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)
+
+
+# Missing samples in a row that are bridged: with more an input that swings is wrong between its ends; with fewer a log
+# that loses a block now and then falls apart, and each part has a start state to be found.
+MAX_BRIDGE = 10
+MIN_RUN = 10  # samples with an output between two holes: fewer hardly find the start state of a part, more lose data
+
+
+def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Intersample]:
+    """How each of the system's inputs runs between two samples of a log: as the log says, or as is usual."""
+    said = experiment.intersample
+    return {q.name: said.get(q.name) or usual_intersample(q.name, q.unit) for q in system.inputs}
+
+
+def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tuple[str, ...]]:
+    """Bridge the short holes of a log's inputs and cut it at the long ones, for want of rows or of single samples.
+
+    Parameters
+    ----------
+    system : Fittable
+    experiment : Experiment
+        With a name, and with every input of the system.
+
+    Returns
+    -------
+    experiment : Experiment
+        With every sample of every input. Where it is cut, `holes` names the samples whose inputs nobody knows; what was
+        measured there is left out.
+    sentences : tuple of str
+        What was done, with figures.
+
+    Raises
+    ------
+    LogError
+        If a long hole cuts the log of a sampled loop, whose controller goes on meanwhile, or leaves nothing of a log.
+    """
+    log, inputs = experiment.trajectory, names(system.inputs)
+    known: Mask = np.asarray(np.isfinite(log.matrix(inputs)).all(axis=1))
+    holes = _find_holes(log, known, system) if system.states else []
+    lost = ~known if not system.states else _inside(holes, len(log))
+    everything = (
+        f"{experiment.name}: no part holds {', '.join(inputs)} and {MIN_RUN} samples of an output; log them together"
+    )
+    require(not lost.all(), everything, LogError)
+    where = ", ".join(f"from {log.t[max(a - 1, 0)]:g} s to {log.t[min(b, len(log) - 1)]:g} s" for a, b in holes[:3])
+    where += ", ..." if len(holes) > 3 else ""
+    if holes and system.motion().sample_time is not None:
+        message = f"{experiment.name}: inputs are unknown {where}, and a sampled controller goes on meanwhile"
+        raise LogError(f"{message}; cut the log in two there")
+    short = ~known & ~lost
+    sentences = [f"{experiment.name}: inputs are unknown {where}; the log is cut there"] if holes else []
+    if short.any():
+        gaps = f"{experiment.name}: {int(short.sum())} samples lack an input, {_longest_run(short)} in a row at most"
+        sentences.append(f"{gaps}; they are bridged")
+    if not (sentences or lost.any()):
+        return experiment, ()
+    values = _bridge(log, input_behaviour(system, experiment), lost)
+    return replace(experiment, trajectory=log.with_columns(values), holes=tuple(holes)), tuple(sentences)
+
+
+def known_runs(experiment: Experiment) -> list[tuple[int, int]]:
+    """Begin and end of each part of a repaired log, as a range of samples, that no hole interrupts."""
+    edges = [0, *(edge for hole in experiment.holes for edge in hole), len(experiment.trajectory)]
+    return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+
+
+def window_runs(experiment: Experiment, window: float) -> list[tuple[int, int]]:
+    """Begin and end of each window of a repaired log; what is left of a part joins its last one if below half of one.
+
+    Examples
+    --------
+    >>> log = Experiment(Trajectory(np.arange(11) * 0.1, {"speed": np.zeros(11)}))
+    >>> window_runs(log, 0.4), window_runs(log, 0.3)
+    ([(0, 4), (4, 8), (8, 11)], [(0, 3), (3, 6), (6, 9), (9, 11)])
+    """
+    n = max(1, round(window / float(np.median(np.diff(experiment.trajectory.t)))))
+    out: list[tuple[int, int]] = []
+    for begin, end in known_runs(experiment):
+        edges = [begin, *range(begin + n, end - (n + 1) // 2 + 1, n), end]
+        out += itertools.pairwise(edges)
+    return out
+
+
+def _find_holes(log: Trajectory, known: Mask, system: Fittable) -> list[tuple[int, int]]:
+    """Begin and end of each long hole, as a range of samples: an empty one where only rows are missing."""
+    at = np.flatnonzero(known)
+    far = np.flatnonzero(np.diff(log.t[at]) > (MAX_BRIDGE + 1.5) * float(np.median(np.diff(log.t))))
+    begins, ends = [*at[:1], *at[far + 1]], [*(at[far] + 1), *(at[-1:] + 1)]
+    outputs = log.matrix(n for n in names(system.outputs) if n in log)
+    measured: Mask = np.asarray(np.isfinite(outputs).any(axis=1))
+    runs = [(int(a), int(b)) for a, b in zip(begins, ends, strict=True) if measured[a:b].sum() >= MIN_RUN]
+    edges = [0, *(edge for run in runs for edge in run), len(log)]
+    inner = range(2, len(edges) - 2, 2)
+    outer = [(edges[k], edges[k + 1]) for k in (0, len(edges) - 2) if edges[k + 1] > edges[k]]
+    return sorted({*outer, *((edges[k], edges[k + 1]) for k in inner)})
+
+
+def _inside(holes: Sequence[tuple[int, int]], n: int) -> Mask:
+    inside = np.zeros(n, dtype=bool)
+    for begin, end in holes:
+        inside[begin:end] = True
+    return inside
+
+
+def _bridge(log: Trajectory, behaviour: dict[str, Intersample], lost: Mask) -> dict[str, Array]:
+    """The columns of a log without holes in its inputs, and without outputs where the inputs are lost."""
+    out = {}
+    for name in log:
+        column, kind = log[name], behaviour.get(name)
+        known = np.isfinite(column)
+        if kind is None:
+            out[name] = np.where(lost, np.nan, column)
+        elif kind is Intersample.LINEAR:
+            out[name] = np.interp(log.t, log.t[known], column[known])
+        else:
+            last = np.maximum.accumulate(np.where(known, np.arange(len(log)), 0))
+            out[name] = np.where(known[last], column[last], column[np.argmax(known)])
+    return out
+
+
+def _longest_run(mask: Mask) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return int(np.max(edges[1::2] - edges[::2]))
+
+
+# distance of the resting command from the middle of its range, over half the range [1]: higher takes a valve that holds
+# a load for one with another centre, lower misses a wide dead zone
+MAX_REST_DISTANCE = 0.2
+RANGE_TOLERANCE = 0.02  # by which noise may leave the range, over half the range [1]; higher takes other ranges for it
+MIN_EXCURSION = 0.02  # to both sides of the middle, over half the range [1]; lower takes one-way logs for two-way ones
+
+
+def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> ParameterSet:
+    """Free the centre of a plant's valve, with a warning, where logs count its command from 0 and nobody has stated it.
+
+    Parameters
+    ----------
+    system : Fittable
+    experiments : sequence of Experiment
+        Each with a name.
+    parameters : ParameterSet
+
+    Returns
+    -------
+    ParameterSet
+        The same where a centre is stated, where no log shows one, or where the plant has none.
+
+    Raises
+    ------
+    LogError
+        If the logs, or a log and a stated centre, count the command from different voltages.
+    """
+    name, element = centre_name(system.plant), system.plant.axis.final_element if system.plant.axis else None
+    if name is None or element is None:
+        return parameters
+    every = system.parameters | parameters
+    stated = every[name]
+    commands = [c for e in experiments if name not in e.conditions for c in _commands(system, element, e, every)]
+    shown = [c for c in commands if c.is_counted_from(0.0)]
+    about = [c for c in commands if c.is_counted_from(-c.half)]
+    if stated.value:
+        _check_stated(name, stated.value, about)
+        return parameters
+    if not shown:
+        return parameters
+    if about:
+        message = f"{shown[0]}, but {about[0]}; subtract the valve's centre in the sidecars of all logs, or of none"
+        raise LogError(message)
+    rest, most = float(np.median([c.rest for c in shown])), MAX_REST_DISTANCE * shown[0].half
+    found = replace(stated, value=rest, lower=rest - most, upper=rest + most, free=True, source="where the log rests")
+    warnings.warn(
+        f"{shown[0]}: the {element.name} is closed near {shown[0].half:g} {stated.unit}; {name} is estimated with the "
+        f'rest, or state it, centre = "{shown[0].half:g} {stated.unit}", under [{name.partition(".")[0]}]',
+        PhysicsWarning,
+        stacklevel=3,
+    )
+    return parameters | ParameterSet({name: found})
+
+
+class _Command(NamedTuple):
+    """A valve's command in a log: its range and where it rests, and the size of the valve's own half range."""
+
+    log: str
+    channel: str
+    unit: str
+    low: float
+    high: float
+    rest: float
+    half: float
+
+    def is_counted_from(self, zero: float) -> bool:
+        """Whether the command runs from a voltage to both sides of half the range above it, and rests near there."""
+        low, high, rest = ((v - zero) / self.half for v in (self.low, self.high, self.rest))
+        is_within = low >= -RANGE_TOLERANCE and high <= 2 + RANGE_TOLERANCE
+        is_two_way = low < 1 - MIN_EXCURSION and high > 1 + MIN_EXCURSION
+        return is_within and is_two_way and abs(rest - 1) < MAX_REST_DISTANCE
+
+    def __str__(self) -> str:
+        run = f"runs from {self.low:.3g} to {self.high:.3g} {self.unit}"
+        return f"{self.log}: {self.channel} {run} and rests at {self.rest:.3g} {self.unit}"
+
+
+def _check_stated(name: str, value: float, about: Sequence[_Command]) -> None:
+    """Refuse a centre where a log's command has been counted from it already."""
+    for command in about:
+        message = f"{command}, which is no command of a valve with {name} = {value:g} {command.unit}; leave that out"
+        remedy = "of the drive, or of the log's sidecar (or Python) what has subtracted it"
+        require(abs(value) < MAX_REST_DISTANCE * command.half, f"{message} {remedy}", LogError)
+
+
+def _commands(
+    system: Fittable, element: FinalElement, experiment: Experiment, parameters: ParameterSet
+) -> list[_Command]:
+    """The command of a log; none where its channel is missing or empty."""
+    limit = parameters[element.limit]
+    half, log = experiment.conditions.get(element.limit, limit.value), experiment.trajectory
+    channels = [q.name for q in system.plant.inputs if q.unit == limit.unit and q.name in log]
+    if not channels or not np.isfinite(log[channels[0]]).any():
+        return []
+    ends = float(np.nanmin(log[channels[0]])), float(np.nanmax(log[channels[0]]))
+    rest = _resting_command(experiment, channels[0])
+    return [_Command(experiment.name, channels[0], limit.unit, *ends, rest, half)]
+
+
+def _resting_command(experiment: Experiment, channel: str) -> float:
+    """Median of the command where the drive stands; over the whole log where that is not to be seen."""
+    log = experiment.trajectory
+    if "speed" in log:
+        speed = np.abs(log["speed"])
+    elif "position" in log:
+        speed = np.abs(np.gradient(log["position"], log.t))
+    else:
+        return float(np.nanmedian(log[channel]))
+    known = speed[np.isfinite(speed)]
+    still = speed <= MOVING_SPEED_SHARE * float(np.quantile(known, 0.99)) if known.size else np.zeros(len(log), bool)
+    return float(np.nanmedian(log[channel][still] if still.any() else log[channel]))

@@ -1,31 +1,411 @@
-"""`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs."""
+"""`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs.
+
+`fit_candidates`: fits of several models to the same logs, made alike so that their residuals can be compared.
+
+Residuals compare where the models run alike: whole logs, or windows of one length, without gaps that take a misfit in
+their place. And they compare at common widths: a width is a means of integration, and one that each candidate has
+chosen for itself would be a hidden parameter, which Coulomb friction can use to imitate presliding or the Stribeck
+curve. A width that is a property of the friction is freed, in a candidate of its own.
+
+Windows and widths are those of the leader, the simplest of the candidates that follow the logs best in short searches
+with loose gaps; a model that is too simple would cut the logs into windows so short that nothing tells the others
+apart. Candidates that such searches show to be hopeless beside the leader's are not searched any longer. In windows the
+others begin where the leader has ended, if they have its states.
+
+`try_candidate`: a short search of a model with loose gaps, which ranks it, or shows that no search can save it.
+
+Gaps between segments only relax a fit: with any gaps allowed the squares are less than without. So where short searches
+with loose gaps have ended, and their squares exceed those of another model's whole fit many times, the model
+cannot explain the logs, and minutes of search would show only that.
+"""
 
 import fnmatch
+import itertools
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.runnable import HasSystem, as_system
 from pneuopt.dynamics.system import System, names
-from pneuopt.identification.candidates import Candidate, Refutation, fit_candidates
-from pneuopt.identification.checks import as_experiments
-from pneuopt.identification.excitation import remedy
-from pneuopt.identification.identify import check_options, validate
-from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult
+from pneuopt.identification.examination import pose_problem
+from pneuopt.identification.identify import check_options, identify, validate
+from pneuopt.identification.problem import EstimationProblem, as_experiments
+from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult, remedy
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
-from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arguments import as_tuple, check_argument, check_parameters
-from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.progress import Progress, ProgressReporter
+from pneuopt.identification.widths import COMMON_WIDTH
+from pneuopt.logs.experiment import Experiment
+from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, UnknownNameError, require
+from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_argument, check_parameters
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
-from pneuopt.quantities.shown import Result
-from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.quantities.results import Result
+from pneuopt.quantities.status import Code, Progress, ProgressReporter, Status
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+# gaps and iterations of a trial: with tighter gaps, or more iterations, it takes as long as a search; with looser ones
+# a wrong model looks as good as a right one
+TRIAL_STAGES = (Stage(3e-3, 12), Stage(1e-3, 8), Stage(1e-4, 12))
+MAX_TRIALS = 3  # starts of a model that are tried: fewer may miss the right basin, more take as long as a search
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The best short search of a model.
+
+    Parameters
+    ----------
+    squares : float
+        Squared residuals and gaps, in noise variances; infinite where no start is finite, or none was searched to the
+        end.
+    least : float
+        What these would still fall to, by the linearised equations; zero where these say nothing.
+    by_stage : tuple of float
+        The squares after each stage, at least the noise's.
+    ratio : float
+        The least squares over those that were allowed after the same stage, where no start kept within these; else 0.
+    """
+
+    squares: float = math.inf
+    least: float = math.inf
+    by_stage: tuple[float, ...] = ()
+    ratio: float = 0.0
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether each start was left for its squares, or is not finite."""
+        return math.isinf(self.squares)
+
+    def better(self, other: "Trial") -> "Trial":
+        """The one of fewer squares; of two that were left, the one that was nearer."""
+        return min(self, other, key=lambda trial: (trial.squares, trial.ratio or math.inf))
+
+
+def try_candidate(
+    system: System,
+    experiments: Sequence[Experiment],
+    parameters: ParameterSet,
+    method: LeastSquares,
+    *,
+    window: float = math.inf,
+    near: IdentificationResult | None = None,
+    known: Trial | None = None,
+    allowed: Sequence[float] = (),
+) -> Trial:
+    """Search shortly from a model's first starts.
+
+    Parameters
+    ----------
+    system : System
+    experiments : sequence of Experiment
+    parameters : ParameterSet
+    method : LeastSquares
+    window : float
+        Time after which a log starts anew [s].
+    near : IdentificationResult, optional
+        A fit with another model of the same states, from which a search begins, too, where the model's starts guess.
+    known : Trial, optional
+        Of the first start, which is not tried again; the other starts are tried where it is hopeless.
+    allowed : sequence of float
+        Squares after each stage beyond which a start is left, by default none; one that keeps within them is the last.
+
+    Returns
+    -------
+    Trial
+
+    Raises
+    ------
+    InputError
+        If logs, system and parameters do not fit together.
+    KeyboardInterrupt
+        If a search is interrupted.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PhysicsWarning)  # a fit says them
+        problem = replace(pose_problem(system, experiments, parameters, method), window=window)
+    candidates, best = problem.candidates(), known or Trial()
+    others = [problem.start_from(near)] if near and candidates[0].trial_parameters else []
+    for start in itertools.chain(others, itertools.islice(candidates, 1 if known else 0, MAX_TRIALS)):
+        best = best.better(_try_start(problem, start, allowed))
+        if not (allowed and best.is_hopeless):
+            break
+    return best
+
+
+def _try_start(problem: EstimationProblem, start: Start, allowed: Sequence[float]) -> Trial:
+    """The trial from one start, until its squares exceed what is allowed."""
+    stages = TRIAL_STAGES if problem.has_gaps else TRIAL_STAGES[-1:]
+    trial = Trial(0.0, 0.0)
+    for stage, enough in itertools.zip_longest(stages, allowed[: len(stages)], fillvalue=math.inf):
+        assert isinstance(stage, Stage)
+        # an empty last stage: the last one of a method would iterate to its end
+        method = replace(problem.method, stages=(stage, replace(stage, iterations=0)))
+        fit = solve_least_squares(problem.transcription(start), method)
+        if fit.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        squares, optimum = 2 * fit.stats["cost"], fit.optimum
+        if not squares < math.inf:
+            return Trial()
+        least = max(0.0, optimum.equations.promised_squares(optimum.keep)) if optimum else 0.0
+        trial = Trial(squares, least, (*trial.by_stage, max(squares, fit.count)))
+        if least > enough:
+            return replace(trial, squares=math.inf, ratio=least / enough)
+        start = problem.start_from(fit)
+    return trial
+
+
+# samples of a window where candidates jump from segment to segment and none has chosen one: fewer hardly tell models
+# apart, with more all gather so much misfit that no search settles
+JUMPING_WINDOW_SAMPLES = 20
+# squares of a trial over the least of all [1], up to which the simplest candidate leads: lower lets idle terms lead,
+# higher a model that does not follow the logs
+LEADER_RATIO = 1.1
+# squares that a short search promises over the leader's [1] above which a candidate is hopeless: lower gives up models
+# that a whole search may save, higher searches for minutes what comes out last
+HOPELESS_RATIO = 4.0
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model and its parameters, of which the free ones are estimated."""
+
+    system: System
+    parameters: ParameterSet
+
+    def extends(self, other: "Candidate") -> bool:
+        """Whether the other has the same states, and a part of this one's free parameters."""
+        return self.has_states_of(other) and set(other.parameters.free_names) < set(self.parameters.free_names)
+
+    def has_states_of(self, other: "Candidate") -> bool:
+        """Whether a start of the other's states is one of this one's."""
+        return names(other.system.states) == names(self.system.states)
+
+
+@dataclass(frozen=True)
+class Refutation:
+    """Why a candidate was not fitted: its squares over the leader's in short searches, and a few words.
+
+    Parameters
+    ----------
+    leader : str
+    ratio : float
+    free : tuple of str
+        The parameters that it would estimate.
+    reason : str
+    """
+
+    leader: str
+    ratio: float
+    free: tuple[str, ...]
+    reason: str
+
+
+Fits = dict[str, IdentificationResult | Refutation]
+Trials = dict[str, Trial]
+
+
+def fit_candidates(
+    candidates: Mapping[str, Candidate],
+    experiments: tuple[Experiment, ...],
+    method: LeastSquares | None,
+    window: float | None,
+) -> Fits:
+    """Fit every candidate alike, or refute it.
+
+    Parameters
+    ----------
+    candidates : mapping of str to Candidate
+    experiments : tuple of Experiment
+    method : LeastSquares or None
+    window : float or None
+        As of `identify`; None: whole logs, or the windows of the leader if it needs some.
+
+    Returns
+    -------
+    dict of str to IdentificationResult or Refutation
+        The results whatever their status. One that did not converge by itself has begun again at the richest one
+        within it.
+    """
+    alike = _Alike(experiments, method or LeastSquares(), window)
+    trials, out = _try_all(candidates, alike), Fits()
+    for name in _by_rank(candidates, trials):
+        alike.announce("fitting", name, len(out), len(candidates))
+        out[name] = fit = alike.fit(candidates[name])
+        if fit.status.converged:
+            out = _fit_beside(name, fit, candidates, trials, alike)
+            break
+    return {n: out[n] for n in candidates}
+
+
+def _try_all(candidates: Mapping[str, Candidate], alike: "_Alike") -> Trials:
+    """A trial of each candidate's first start, the richest first, which leaves the others the fewest squares."""
+    trials, allowed = Trials(), tuple[float, ...]()
+    for name in _richest_first(candidates):
+        alike.announce("trying", name, len(trials), len(candidates))
+        trials[name] = alike.try_shortly(candidates[name], allowed=allowed)
+        allowed = _hopeless_squares(min(trials.values(), key=lambda trial: trial.squares))
+    return trials
+
+
+def _richest_first(candidates: Mapping[str, Candidate]) -> list[str]:
+    return sorted(candidates, key=lambda n: -len(candidates[n].parameters.free_names))
+
+
+def _hopeless_squares(best: Trial) -> tuple[float, ...]:
+    """The squares after each stage beyond which another candidate is hopeless."""
+    return tuple(HOPELESS_RATIO * squares for squares in best.by_stage)
+
+
+def _by_rank(candidates: Mapping[str, Candidate], trials: Mapping[str, Trial]) -> list[str]:
+    """The candidates' names, the leader first: the simplest near the least squares, the others by their squares."""
+    least = min(trial.squares for trial in trials.values())
+    near = [n for n, trial in trials.items() if trial.squares <= LEADER_RATIO * least]
+    leader = min(near or trials, key=lambda n: len(candidates[n].parameters.free_names))
+    return sorted(trials, key=lambda n: (n != leader, trials[n].squares))
+
+
+def _fit_beside(
+    leader: str,
+    fit: IdentificationResult,
+    candidates: Mapping[str, Candidate],
+    trials: Trials,
+    alike: "_Alike",
+) -> Fits:
+    """The fit of the leader and those of the others, as alike to it as can be, the simplest first."""
+    widths, out = {width.name: width.value for width in fit.widths}, Fits({leader: fit})
+    out |= _refute_hopeless(leader, fit, candidates, trials, alike)
+    others = sorted(candidates.keys() - out.keys(), key=lambda n: (len(candidates[n].parameters.free_names), n))
+    if others and alike.window is None:
+        alike = alike.with_window_of(fit)
+        if fit.window is None and alike.window != math.inf:
+            out[leader] = alike.fit(candidates[leader], fit)
+    for name in others:
+        alike.announce("fitting", name, len(out), len(candidates))
+        out[name] = found = _fit_one(_with_widths(candidates[name], widths), leader, candidates, alike, out)
+        widths = {**{width.name: width.value for width in found.widths}, **widths}
+    return out
+
+
+def _refute_hopeless(
+    leader: str, fit: IdentificationResult, candidates: Mapping[str, Candidate], trials: Trials, alike: "_Alike"
+) -> dict[str, Refutation]:
+    """The refutations of candidates beside the leader's fit; a case of a refuted one needs no more than its own trial.
+
+    A static map is always fitted, for that is as short.
+    """
+    out, widths = dict[str, Refutation](), {width.name: width.value for width in fit.widths}
+    for name in _richest_first({n: c for n, c in candidates.items() if n != leader and c.system.states}):
+        candidate, trial = _with_widths(candidates[name], widths), trials[name]
+        is_tried = candidate == candidates[name] and bool(trial.by_stage)
+        if is_tried and not trial.is_hopeless:
+            continue
+        if not (is_tried and any(candidates[n].extends(candidate) for n in out)):
+            near = fit if candidate.has_states_of(candidates[leader]) else None
+            trial = alike.try_shortly(candidate, near, trial if is_tried else None, _hopeless_squares(trials[leader]))
+        if trial.ratio:
+            ratio = HOPELESS_RATIO * trial.ratio
+            words = f"short searches with loose gaps leave {ratio:.3g} times the squares of {leader}"
+            out[name] = Refutation(leader, ratio, candidate.parameters.free_names, words)
+    return out
+
+
+def _fit_one(
+    candidate: Candidate, leader: str, candidates: Mapping[str, Candidate], alike: "_Alike", fits: Fits
+) -> IdentificationResult:
+    """The fit of a candidate, from the leader's where one is nested in the other, or else from its own starts."""
+    within = {
+        n: fit
+        for n, fit in fits.items()
+        if isinstance(fit, IdentificationResult) and fit.status.converged and candidate.extends(candidates[n])
+    }
+    own = fits[leader]
+    assert isinstance(own, IdentificationResult)
+    is_near = candidate.has_states_of(candidates[leader]) and (
+        leader in within or candidates[leader].extends(candidate) or math.isfinite(alike.length)
+    )
+    fit = alike.fit(candidate, own) if is_near else alike.fit(candidate)
+    if is_near and not fit.status.converged:
+        fit = alike.fit(candidate)
+    if within and not fit.status.converged:
+        richest = max(within, key=lambda n: len(candidates[n].parameters.free_names))
+        again = alike.fit(candidate, within[richest])
+        fit = again if again.status.converged else fit
+    return fit
+
+
+@dataclass(frozen=True)
+class _Alike:
+    """How all candidates are fitted."""
+
+    experiments: tuple[Experiment, ...]
+    method: LeastSquares
+    window: float | None
+
+    @property
+    def length(self) -> float:
+        """The duration of a window [s]; infinite for whole logs."""
+        return math.inf if self.window is None else self.window
+
+    @property
+    def _own_method(self) -> LeastSquares:
+        """The method, with windows in one segment each, which a start follows well."""
+        return self.method if math.isinf(self.length) else replace(self.method, segment_time=self.length)
+
+    def fit(self, candidate: Candidate, start: IdentificationResult | None = None) -> IdentificationResult:
+        """The fit of a candidate; one whose states jump within whole logs has not converged."""
+        given, logs, method = candidate.parameters, self.experiments, self._own_method
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="before the search")  # the table says what is unidentifiable
+            fit = identify(candidate.system, logs, given, method=method, window=self.window, start=start, throw=False)
+        if self.window == math.inf and fit.status.converged and _has_jumps(fit, self.method):
+            words = "it follows whole logs only with jumps of its states", *fit.status.sentences
+            fit = replace(fit, status=Status(Code.NOT_CONVERGED, words))
+        return fit
+
+    def try_shortly(
+        self,
+        candidate: Candidate,
+        near: IdentificationResult | None = None,
+        known: Trial | None = None,
+        allowed: Sequence[float] = (),
+    ) -> Trial:
+        """The short search of a candidate."""
+        given = candidate.system, self.experiments, candidate.parameters, self._own_method
+        return try_candidate(*given, window=self.length, near=near, known=known, allowed=allowed)
+
+    def announce(self, action: str, name: str, done: int, count: int) -> None:
+        """Say whose search begins."""
+        if self.method.progress is not None:
+            self.method.progress(f"{action} {name}, {done + 1} of {count} candidates")
+
+    def with_window_of(self, fit: IdentificationResult) -> "_Alike":
+        """The same with the window that a fit has needed, or whole logs; a fit whose states jump needs one, too."""
+        if _has_jumps(fit, self.method):
+            step = max(float(np.median(np.diff(e.trajectory.t))) for e in self.experiments)
+            return replace(self, window=JUMPING_WINDOW_SAMPLES * step)
+        return replace(self, window=fit.window.duration if fit.window else math.inf)
+
+
+def _has_jumps(fit: IdentificationResult, method: LeastSquares) -> bool:
+    """Whether gaps stand for noise of the states in a fit of whole logs."""
+    return fit.window is None and fit.stats["gap_deviation"] > method.stages[-1].gap
+
+
+def _with_widths(candidate: Candidate, widths: Mapping[str, float]) -> Candidate:
+    """The candidate with the common widths, where the user has stated none."""
+    own, known = candidate.parameters, candidate.system.excitation.widths
+    every = {name for width in known for name in (width.name, *width.follows)} & own.keys() & widths.keys()
+    edits = {n: replace(own[n], value=widths[n], source=COMMON_WIDTH) for n in every}
+    return replace(candidate, parameters=own | ParameterSet(edits))
+
 
 # probability [1] below which a likelihood-ratio test rejects the simpler model: higher keeps terms that are chance,
 # lower drops weak true ones

@@ -15,12 +15,11 @@ from math import inf, sqrt
 
 import numpy as np
 
-from pneuopt.dynamics.excitation import Width
-from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
-from pneuopt.identification.problem import EstimationProblem
-from pneuopt.identification.repairs import known_runs
+from pneuopt.dynamics.hooks import Width
+from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
+from pneuopt.identification.problem import EstimationProblem, known_runs
 from pneuopt.identification.result import ChosenWidth
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.equations import weigh_gaps

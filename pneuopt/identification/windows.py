@@ -15,12 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.checks import outputs_in_log
-from pneuopt.identification.clusters import t_quantile
-from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit
-from pneuopt.identification.multistart import fit_holding_unidentifiable
-from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, t_quantile
+from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.result import ChosenWindow
+from pneuopt.identification.search import fit_holding_unidentifiable
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code

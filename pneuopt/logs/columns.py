@@ -1,16 +1,22 @@
-"""What the columns of a log mean, whatever its file format: channels, their units, centres and scales, and checks."""
+"""What the columns of a log mean, whatever its file format: channels, their units, centres and scales, and checks.
+
+The channels that the log of a plant may hold beside the usual ones.
+
+The keys of a log's sidecar, by which it is read.
+"""
 
 import difflib
 import re
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from pneuopt.logs.table import EMPTY_CELL, Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_names, require
-from pneuopt.quantities.keys import Key, Takes
+from pneuopt.quantities.keys import Key, Takes, table
+from pneuopt.quantities.parameters import Intersample, Quantity
 from pneuopt.quantities.units import read_value, si_conversion
 
 CHANNELS: Mapping[str, str] = {
@@ -325,3 +331,66 @@ def _list_rows(rows: Sequence[int]) -> str:
     shown = ", ".join(str(row) for row in rows[:MAX_ROWS_SHOWN])
     more = f", ... ({len(rows)} in all)" if len(rows) > MAX_ROWS_SHOWN else ""
     return f"row {shown}" if len(rows) == 1 else f"rows {shown}{more}"
+
+
+class Plant(Protocol):
+    """What a log's reader asks of a plant, say a `System`."""
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """Signals that drive it."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """Signals that sensors show."""
+        ...
+
+
+def plant_channels(plant: Plant) -> dict[str, str]:
+    """The channels that a plant's log may hold: its signals, and the references of its outputs."""
+    references = {f"{q.name}_reference": q.unit for q in plant.outputs}
+    return {**{q.name: q.unit for q in (*plant.inputs, *plant.outputs)}, **references}
+
+
+ACCEPTED_CHECKS = "accept"  # the checks that the log need not pass
+DATE = "date"  # when the log was taken
+
+
+def _column_key(channel: str, unit: str) -> Key:
+    meaning = f"column of the {channel.replace('_', ' ')}"
+    return Key(meaning, Takes.COLUMN, unit, keys=COLUMN_KEYS, example=f'"{channel} [{unit}]"')
+
+
+INTERSAMPLE_KEY = Key(
+    "by default a command is held", Takes.TEXT, choices={kind.value: kind for kind in Intersample}, example='"held"'
+)
+SIDECAR_KEYS: Mapping[str, Key] = {
+    ACCEPTED_CHECKS: Key("checks that this log need not pass", Takes.LIST, usual=[], example='["work"]'),
+    DATE: Key("when this log was taken, for track; before its stamps and its name", Takes.TEXT, example='"2026-03-12"'),
+    "columns": table(
+        "which column is which channel; false leaves one out; the header says the others",
+        {channel: _column_key(channel, unit) for channel, unit in CHANNELS.items()},
+        others=Key("column of another signal of the drive", Takes.COLUMN, "{own}", keys=COLUMN_KEYS),
+        named="signal",
+    ),
+    "noise": table(
+        "standard deviations; by default as the log shows",
+        {},
+        others=Key("of that channel", unit="{own}", example='"20 um"'),
+        named="channel",
+    ),
+    "conditions": table(
+        "known values that hold in this log only",
+        {},
+        others=Key("its value in this log", unit="{own}", example='"6.3 bar(g)"'),
+        named="parameter",
+    ),
+    "intersample": table(
+        "how channels run between two samples",
+        {},
+        others=INTERSAMPLE_KEY,
+        named="channel",
+    ),
+}
+"""The sections of a sidecar, and what stands before them."""

@@ -1,21 +1,1057 @@
-"""`examine`: faults that a log shows without a model: units, signs, zero points, sampling, missing motion."""
+"""`examine`: faults that a log shows without a model: units, signs, zero points, sampling, missing motion.
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+`check_mass`, `check_offset`: what a log says of the force balance, beside the mass and the forces that are stated.
+
+Newton's law holds under every weight: with a hat function w of half width H the mean of the acceleration is a second
+difference of the position, so that no noise is differentiated. Over the windows that move one way,
+
+    mean(w F) = M (x(t + H) - 2 x(t) + x(t - H)) / H^2 + F_c sign(v) + b mean(w v) + F_0
+
+is linear in the mass M, friction F_c and b, and the offset F_0. The sensors may come late against each other, so that
+each alternative has the lag that suits it best.
+
+`check_dwells`: a log of a positioning axis, which stands still most of the time; what its moves and dwells show.
+
+`check_end_stops`: a body that rests at an end of its way while the drive pushes it on.
+
+`LogFinding`: one thing about a log, with the signals that show it; `StatedAxis`: what is known of the axis.
+
+`check_jumps`: a position that jumps from one sample to the next, as where a counter loses steps.
+
+The motion of a log as closely as its noise allows, and how two sensors of it agree at a lag.
+
+Single sensors: a pressure's zero and unit, jitter, clipping, resolution.
+
+Signs and units: position and speed, what drives the motion and its work, the command and what follows it.
+
+`check_has_motion`, `check_scale`: a log in which nothing moves, or faster than any drive.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pneuopt.logs.checks.balance import check_mass, check_offset
-from pneuopt.logs.checks.dwells import check_dwells
-from pneuopt.logs.checks.end_stops import check_end_stops
-from pneuopt.logs.checks.findings import PISTON, LogFinding, StatedAxis
-from pneuopt.logs.checks.jumps import check_jumps
-from pneuopt.logs.checks.sensors import check_pressures, check_sampling
-from pneuopt.logs.checks.signs import check_command, check_position_speed, check_work_sign
-from pneuopt.logs.checks.standstill import check_has_motion, check_scale
-from pneuopt.logs.experiments import Experiment
-from pneuopt.logs.noise import noise_level
+from pneuopt.logs.experiment import Experiment
+from pneuopt.logs.noise import find_resolution, noise_level
 from pneuopt.quantities.arrays import Array, Mask
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import ATMOSPHERE, write_value
+
+LARGE_SHARE = 0.1
+"""Share of a signal's largest value [1] beyond which its sign counts: lower counts noise, higher misses reversals."""
+VIEW_STROKES = 1.0
+"""Strokes to either side of an instant that a figure shows: with fewer a wrong sign looks like a lag, more blur it."""
+MIN_VIEW_SAMPLES = 25
+"""Samples to either side of an instant that its figure shows: fewer look like noise."""
+
+
+class StatedAxis(NamedTuple):
+    """What is known of the axis that a log is of: a piston's channels unless a plant names its own (angle, torque).
+
+    Attributes
+    ----------
+    push : str
+        The force or torque that drives the axis, positive in the direction of positive speed.
+    forces : mapping of str to float
+        The force on the body per unit of each channel that pushes it; empty where a channel is not logged, or a factor
+        is not known.
+    constant : float
+        The force that no channel gives, as of a weight; NaN where a free parameter stands in it.
+    inertia : float
+        As stated; NaN where it is free.
+    offset_parameter : str
+        The parameter that takes a constant force.
+    stops : tuple of float
+        Positions at which the model has end stops.
+    """
+
+    position: str = "position"
+    speed: str = "speed"
+    push: str = "force"
+    forces: Mapping[str, float] = {"force": 1.0}
+    constant: float = math.nan
+    inertia: float = math.nan
+    inertia_name: str = "mass"
+    inertia_unit: str = "kg"
+    force_unit: str = "N"
+    offset_parameter: str = ""
+    stops: tuple[float, ...] = ()
+
+    def net_force(self, channels: Mapping[str, Array]) -> Array:
+        """The force on the body without friction, from channels; the constant counts as zero where it is unknown."""
+        total = sum((weight * channels[n] for n, weight in self.forces.items()), np.zeros(1))
+        return np.asarray(total + (0.0 if math.isnan(self.constant) else self.constant))
+
+
+PISTON = StatedAxis()
+
+
+class Panel(NamedTuple):
+    """Curves over one axis of a figure: by name, in one SI unit."""
+
+    unit: str
+    curves: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The signals that contradict each other, over time.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        [s]
+    contradiction : ndarray of bool, shape (n,)
+        Where they contradict each other.
+    view : tuple of (float, float)
+        Begin and end of the time [s] in which this is plainest.
+    label : str
+        What is seen where they contradict each other.
+    """
+
+    t: Array
+    panels: tuple[Panel, ...]
+    contradiction: Mask
+    view: tuple[float, float]
+    label: str = "they contradict each other"
+
+
+class Severity(StrEnum):
+    """What a finding means for a fit.
+
+    Attributes
+    ----------
+    FAULT
+        A fit refuses the logs.
+    DOUBT
+        A fit takes the logs, and its estimates may be wrong.
+    NOTE
+        It is worth knowing.
+    """
+
+    FAULT = "fault"
+    DOUBT = "doubt"
+    NOTE = "note"
+
+
+@dataclass(frozen=True, eq=False)
+class LogFinding:
+    """One thing about a log.
+
+    Attributes
+    ----------
+    message : str
+        What is found, with figures, and the remedy.
+    fault : bool
+        The log cannot be used so; otherwise it is worth knowing.
+    check : str
+        The name of the check that found it, by which a user accepts it.
+    log : str
+        The log's name.
+    evidence : Evidence, optional
+        What `plotting.plot_finding` draws.
+    severity : Severity
+        Of all logs together; a log alone knows faults and notes.
+    rows : (int, int), optional
+        First and last row of the log's file that show it; none where the whole log does, or comes from no file.
+    """
+
+    channel: str
+    message: str
+    fault: bool
+    check: str = ""
+    log: str = ""
+    evidence: Evidence | None = None
+    severity: Severity = Severity.NOTE
+    rows: tuple[int, int] | None = None
+
+
+def evidence(
+    experiment: Experiment,
+    *channels: str | Panel,
+    where: Mask | None = None,
+    at: int | None = None,
+    motion: Array | None = None,
+    label: str = "they contradict each other",
+) -> Evidence:
+    """The evidence of a finding.
+
+    Parameters
+    ----------
+    *channels : str or Panel
+        Each in a panel of its own.
+    where : ndarray of bool, optional
+        Where they contradict each other; by default everywhere.
+    at : int, optional
+        The sample about which to look; by default all are seen.
+    motion : ndarray, optional
+        The speed, whose strokes say how much is to be seen.
+    label : str
+        What is seen there.
+    """
+    log = experiment.trajectory
+    panels = [c if isinstance(c, Panel) else Panel(experiment.unit(c), {c: log[c]}) for c in channels if c]
+    everywhere = np.ones(len(log), dtype=bool)
+    view = (float(log.t[0]), float(log.t[-1])) if at is None else view_about(log.t, at, motion)
+    return Evidence(log.t, tuple(panels), everywhere if where is None else where, view, label)
+
+
+def is_opposed(a: Array, b: Array) -> Mask:
+    """Where two signals have opposite signs, both beyond a tenth of their largest value."""
+    return np.asarray(np.sign(a) * np.sign(b) < 0) & _is_large(a) & _is_large(b)
+
+
+def _is_large(a: Array) -> Mask:
+    return np.asarray(np.abs(a) > LARGE_SHARE * np.nanmax(np.abs(a), initial=0.0))
+
+
+def view_about(t: Array, at: int, motion: Array | None = None) -> tuple[float, float]:
+    """Begin and end of a few strokes of the motion about a sample [s]; of an eighth of the log without motion."""
+    duration = float(t[-1] - t[0])
+    half = duration / 16
+    if motion is not None and np.isfinite(motion).any():
+        level = LARGE_SHARE * float(np.nanmax(np.abs(motion)))
+        side = np.sign(motion[np.abs(motion) > level])
+        half = VIEW_STROKES * duration / (1 + int(np.count_nonzero(np.diff(side))))
+    half = max(half, MIN_VIEW_SAMPLES * float(np.median(np.diff(t))))
+    return max(float(t[0]), float(t[at]) - half), min(float(t[-1]), float(t[at]) + half)
+
+
+MIN_RESIDUAL_FACTOR = 2.0
+"""Residual with the stated value over that with the log's own [1]: lower blames values for what no model has, higher
+leaves wrong ones to the fit, which ends in a misfit."""
+MAX_UNEXPLAINED = 0.15
+"""Residual of the balance over the spread of the force [1] up to which it says something: higher lets a balance speak
+that holds for nothing, lower skips noisy forces."""
+MIN_CONTRADICTION = 0.1
+"""Residual with the stated value over the spread of the force [1] that is worth a word: lower blames a light mass whose
+force the sensors' lags hide, and a right one that sticks and slips, as its friction falls while it speeds up (6 % of
+the force); higher passes wrong ones in slow motion."""
+MAX_MASS_FACTOR = 1.5
+"""Factor [1] by which a stated mass may be off: lower blames what lags of sensors do, higher passes a lost carriage."""
+MIN_OFFSET_SHARE = 0.2
+"""Offset over friction [1] that is worth a word: lower speaks of every sensor, higher passes what moves estimates."""
+MAX_ATMOSPHERE_ERROR = 0.2
+"""Share [1] by which an offset may miss one atmosphere on the difference of a piston's areas: lower forgets gauge
+pressures on a log with noise, higher blames their unit for another force."""
+MAX_NOISE_SHARE = 2e-3
+"""Share of the accelerations' variance [1] that noise may have: higher makes masses small, lower blurs fast motion."""
+MIN_HATS = 30
+"""Windows each way [1] that a balance needs: fewer fit any mass."""
+MAX_PHASE_STEP = 0.25
+"""Phase of the motion from sample to sample [rad]: higher leaves lags of a part of a sample, which look like a mass."""
+LAG_STEPS = 20
+"""Lags each way that are tried: fewer leave a lag of milliseconds, which looks like a mass under viscous friction."""
+MAX_HATS = 2000
+"""Windows that are used of a log [1]: more cost time and say the same."""
+
+
+class Balance(NamedTuple):
+    """What windows of a log say of its forces.
+
+    Attributes
+    ----------
+    mass, offset : float
+        [kg], [N]: what the log itself shows.
+    friction : float
+        Coulomb's part [N].
+    residual : float
+        Root mean square of what is left [N].
+    with_stated_mass, without_offset : float
+        The same with the stated mass; without an offset [N].
+    spread : float
+        Standard deviation of the force [N].
+    """
+
+    mass: float
+    offset: float
+    friction: float
+    residual: float
+    with_stated_mass: float
+    without_offset: float
+    spread: float
+
+    def holds(self) -> bool:
+        """Whether the balance explains the forces, with friction that brakes."""
+        return self.residual < MAX_UNEXPLAINED * self.spread and self.friction > 0
+
+    def contradicts(self, residual: float) -> bool:
+        """Whether the log contradicts what leaves this residual."""
+        return residual > max(MIN_RESIDUAL_FACTOR * self.residual, MIN_CONTRADICTION * self.spread)
+
+
+_LAST_BALANCES: WeakKeyDictionary[Experiment, tuple[StatedAxis, Balance | None]] = WeakKeyDictionary()
+
+
+def check_mass(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find a stated mass that force and acceleration contradict by a factor."""
+    found = None if math.isnan(axis.inertia) else force_balance(experiment, axis)
+    if found is None or not found.holds() or found.mass <= 0:
+        return
+    factor = found.mass / axis.inertia
+    if 1 / MAX_MASS_FACTOR < factor < MAX_MASS_FACTOR:
+        return
+    if found.contradicts(found.with_stated_mass):
+        left = [f"{100 * r / found.spread:.3g} %" for r in (found.residual, found.with_stated_mass)]
+        message = f"force and acceleration are those of {found.mass:.3g} {axis.inertia_unit}, {factor:.3g} times the "
+        message += f"stated {axis.inertia_name} of {axis.inertia:.3g} {axis.inertia_unit}"
+        message += f" (of the force {left[0]} remain unexplained with the one, {left[1]} with the other)"
+        remedy = f"correct {axis.inertia_name}, or the unit of the force, or free {axis.inertia_name}"
+        yield LogFinding(
+            axis.inertia_name, f"{message}: {remedy}", True, evidence=_accelerations(experiment, axis, found)
+        )
+
+
+def check_offset(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find a constant by which the forces do not balance in either direction: a sensor's zero, or a load."""
+    found = None if math.isnan(axis.constant) else force_balance(experiment, axis)
+    if found is None or not found.holds():
+        return
+    is_large = abs(found.offset) > MIN_OFFSET_SHARE * abs(found.friction)
+    if is_large and found.contradicts(found.without_offset):
+        more = "more" if found.offset > 0 else "less"
+        message = (
+            f"the drive pushes with {abs(found.offset):.3g} {axis.force_unit} {more} than the motion needs both ways"
+        )
+        message += (
+            f" (friction is {found.friction:.3g} {axis.force_unit}), as where {_offset_cause(axis, found.offset)}"
+        )
+        yield LogFinding(axis.push, message, False, evidence=_forces(experiment, axis, found))
+
+
+def _offset_cause(axis: StatedAxis, offset: float) -> str:
+    """What shifts the forces by this much, and the remedy: pressures that are one atmosphere off, or some zero."""
+    atmosphere = ATMOSPHERE * sum(weight for n, weight in axis.forces.items() if n.startswith("pressure_"))
+    if abs(abs(offset) - abs(atmosphere)) < MAX_ATMOSPHERE_ERROR * abs(atmosphere):
+        taken, meant, unit = (
+            ("absolute", "gauge", "bar(g)") if offset * atmosphere < 0 else ("gauge", "absolute", "bar(a)")
+        )
+        return f"{meant} pressures are taken for {taken} ones: write {unit} if they are, in the header or the sidecar"
+    remedy = f"free {axis.offset_parameter}, which takes it" if axis.offset_parameter else "take it off"
+    return f"a sensor's zero is off: {remedy}"
+
+
+def force_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
+    """The balance of forces over the windows of a log that move one way; None where motion or forces are not known.
+
+    Two checks ask for that of one log, one after the other.
+    """
+    axis_then, found = _LAST_BALANCES.get(experiment, (None, None))
+    if axis_then is not axis:
+        found = _fit_balance(experiment, axis)
+        _LAST_BALANCES[experiment] = axis, found
+    return found
+
+
+def _fit_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
+    rows = _weigh(experiment, axis)
+    if rows is None:
+        return None
+    lags = [(lag, *_columns(rows, lag)) for lag in sensor_lags(rows.t, LAG_STEPS)]
+    if min(min(int((s > 0).sum()), int((s < 0).sum())) for _, _, s, _, _ in lags) < MIN_HATS:
+        return None
+    if _rms(rows.acceleration) * (rows.t[1] - rows.t[0]) > MAX_PHASE_STEP * _rms(rows.speed):
+        return None
+    mass = 0.0 if math.isnan(axis.inertia) else axis.inertia
+    one = [_factor(np.column_stack([s, v, np.ones(v.size), a, f])) for _, a, s, v, f in lags]
+    left = [abs(R[4, 4]) for R in one]
+    # a lag turns speed into acceleration: where the log hardly tells lags apart, the least one is assumed
+    told = [k for k in range(len(one)) if left[k] <= MIN_RESIDUAL_FACTOR * min(left)]
+    chosen = min(told, key=lambda k: (abs(lags[k][0]), left[k]))
+    friction, _, offset, own_mass = np.linalg.lstsq(one[chosen][:, :4], one[chosen][:, 4])[0].tolist()
+    stated = min(math.hypot(R[3, 4] - mass * R[3, 3], R[4, 4]) for R in one)
+    centred = min(_rms_left(R[:, [0, 1, 3]], R[:, 4]) for R in one)
+    return Balance(own_mass, offset, friction, left[chosen], stated, centred, float(lags[chosen][4].std()))
+
+
+class _Rows(NamedTuple):
+    """A log under hat functions: time, position's second difference, mean speed, mean force, direction (0: mixed)."""
+
+    t: Array
+    acceleration: Array
+    speed: Array
+    force: Array
+    direction: Array
+
+
+def _weigh(experiment: Experiment, axis: StatedAxis) -> _Rows | None:
+    """The log under the narrowest hat functions whose second differences are motion and hardly noise."""
+    log = experiment.trajectory
+    moved = axis.position if axis.position in log else axis.speed
+    if moved not in log or not axis.forces or any(n not in log for n in axis.forces):
+        return None
+    step = float(np.median(np.diff(log.t)))
+    t = log.t[0] + step * np.arange(math.floor(float(log.t[-1] - log.t[0]) / step) + 1)
+    x, force = _on_grid(log.t, log[moved], t), axis.net_force({n: _on_grid(log.t, log[n], t) for n in axis.forces})
+    noise = experiment.noise[moved] if moved in experiment.noise else noise_level(log[moved], log.t)
+    if moved == axis.speed:
+        x, noise = np.append(0.0, np.cumsum((x[1:] + x[:-1]) * step / 2)), noise * step
+    half = 1
+    while 8 * half < t.size:
+        a = (x[2 * half :] - 2 * x[half:-half] + x[: -2 * half]) / (half * step) ** 2
+        if 6 * (noise / (half * step) ** 2) ** 2 < MAX_NOISE_SHARE * float(np.nanmean(a**2)):
+            return _rows(t, x, a, force, half)
+        half *= 2
+    return None
+
+
+def _rows(t: Array, x: Array, a: Array, force: Array, half: int) -> _Rows:
+    step = float(t[1] - t[0])
+    hat = (half - np.abs(np.arange(1 - half, half))) / half**2
+    speed = (x[2 * half :] - x[: -2 * half]) / (2 * half * step)
+    # by quarters: where a part of a window rests, friction is what holds the body there, and looks like a mass
+    each, count = max(1, half // 2), speed.size
+    edges = range(0, 2 * half, each)
+    parts = np.array([x[k + each : k + each + count] - x[k : k + count] for k in edges]) / (each * step)
+    least = LARGE_SHARE * float(np.nanquantile(np.abs(speed), 0.99))
+    direction = np.where((parts > least).all(axis=0), 1.0, np.where((parts < -least).all(axis=0), -1.0, 0.0))
+    mean = np.convolve(force, hat, "same")[half:-half]
+    return _Rows(t[half:-half], a, speed, mean, direction)
+
+
+def _on_grid(t: Array, y: Array, grid: Array) -> Array:
+    """A column on an even grid; NaN beside missing samples."""
+    return np.asarray(np.interp(grid, t, y))
+
+
+def _columns(rows: _Rows, lag: int) -> tuple[Array, Array, Array, Array]:
+    """Acceleration, direction, speed, and the force earlier by a lag, of the windows that move one way."""
+    n = rows.t.size
+    late, early = slice(max(lag, 0), n + min(lag, 0)), slice(max(-lag, 0), n - max(lag, 0))
+    a, s, v, f = rows.acceleration[late], rows.direction[late], rows.speed[late], rows.force[early]
+    used = np.flatnonzero((s != 0) & np.isfinite(a) & np.isfinite(v) & np.isfinite(f))
+    used = used[:: max(1, used.size // MAX_HATS)]
+    return a[used], s[used], v[used], f[used]
+
+
+def _factor(columns: Array) -> Array:
+    """The triangular factor of columns over the root of their length: root mean squares of regressions stand in it."""
+    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=float) / math.sqrt(len(columns))
+
+
+def _rms_left(A: Array, f: Array) -> float:
+    return float(np.linalg.norm(f - A @ np.linalg.lstsq(A, f)[0]))
+
+
+def _rms(e: Array) -> float:
+    return math.sqrt(float(np.nanmean(e**2)))
+
+
+def _accelerations(experiment: Experiment, axis: StatedAxis, found: Balance) -> Evidence | None:
+    """What the force leaves behind friction, beside the stated mass times the acceleration."""
+    rows = _weigh(experiment, axis)
+    if rows is None:
+        return None
+    A = np.column_stack([rows.direction, rows.speed, np.ones(rows.t.size)])
+    used = (rows.direction != 0) & np.isfinite(A).all(axis=1) & np.isfinite(rows.force)
+    rest = rows.force - found.mass * rows.acceleration
+    left = rows.force - A @ np.linalg.lstsq(A[used], rest[used])[0]
+    needed = axis.inertia * rows.acceleration
+    curves = {"force without friction": left, f"stated {axis.inertia_name} times acceleration": needed}
+    shown = {n: np.where(used, curve, np.nan) for n, curve in curves.items()}
+    differs = used & (np.abs(left - needed) > LARGE_SHARE * np.nanmax(np.abs(needed[used])))
+    part = Experiment(Trajectory(rows.t, shown), name=experiment.name)
+    at = int(np.nanargmax(np.abs(shown["force without friction"])))
+    speed = Panel(experiment.unit(axis.speed), {"mean speed": rows.speed})
+    return evidence(part, Panel(axis.force_unit, shown), speed, where=differs, at=at, motion=rows.speed)
+
+
+def _forces(experiment: Experiment, axis: StatedAxis, found: Balance) -> Evidence | None:
+    """The force beside its mean in either direction, which friction makes opposite."""
+    rows = _weigh(experiment, axis)
+    if rows is None:
+        return None
+    force, centre = rows.force, np.full(rows.t.size, found.offset)
+    curves = {"force of the drive": force, "middle between both directions": centre, "where it should be": 0 * centre}
+    part = Experiment(Trajectory(rows.t, {"force": force}), name=experiment.name)
+    at = int(np.argmax(np.abs(rows.speed)))
+    speed = Panel(experiment.unit(axis.speed), {"mean speed": rows.speed})
+    return evidence(part, Panel(axis.force_unit, curves), speed, at=at, motion=rows.speed)
+
+
+MOST_MOTION = 0.5
+"""Share of a log in motion [1] below which it is one of moves and dwells: higher notes every log that pauses."""
+LEAST_SPEED, LEAST_WAY = 0.01, 0.002
+"""Speed and way over the log's largest [1] of a move: lower counts flicker, higher loses slow, short ones."""
+NOISE_WIDTHS, LOWER_QUARTILE = 4.0, 0.3186
+"""Standard deviations of noise beyond which a speed is motion [1], fewer find moves in noise; and how many of them the
+lower quartile of noise alone is."""
+FAST_PERCENTILE, LARGEST_NOISE = 98, 0.1
+"""Percentile of the speeds that is fast motion, and share of it [1] that noise may have: a higher percentile takes two
+jumps of a sensor for moves, a larger share motion of all speeds for noise."""
+SHORTEST_DWELL = 0.05
+"""Rest [s] during which a move goes on: a shorter one counts a move that sticks on its way as two."""
+
+
+def check_dwells(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Note a log that stands still most of the time: which share is motion, and what is identified from it."""
+    t, motion = experiment.trajectory.t, motion_speed(experiment, axis)
+    if motion is None or not np.isfinite(motion).any():
+        return
+    known = np.isfinite(motion)
+    moves = _find_moves(t[known], np.abs(motion[known]))
+    moving = np.zeros(int(known.sum()), dtype=bool)
+    for first, last in moves:
+        moving[first:last] = True
+    share = float(moving.mean())
+    if len(moves) < 2 or share > MOST_MOTION:
+        return
+    signal, whole = axis.position if axis.position in experiment.trajectory else axis.speed, float(t[-1] - t[0])
+    told = f"{signal!r} moves in {share:.0%} of the log, {share * whole:.3g} of {whole:.3g} s, in {len(moves)} moves"
+    these = "mass, Coulomb and viscous friction are identified from these moves, static friction from how each begins"
+    still = np.zeros(len(t), dtype=bool)
+    still[known] = ~moving
+    shown = evidence(experiment, signal, where=still, label="it stands still")
+    yield LogFinding(signal, f"{told}, and stands still between them: {these}", False, evidence=shown)
+
+
+def _find_moves(t: Array, size: Array) -> list[tuple[int, int]]:
+    """First sample of each move and that after its last, from the speed's size."""
+    noise, fast = float(np.percentile(size, 25)) / LOWER_QUARTILE, float(np.percentile(size, FAST_PERCENTILE))
+    moving = np.flatnonzero(size > max(LEAST_SPEED * fast, NOISE_WIDTHS * noise))
+    if noise > LARGEST_NOISE * fast or not moving.size:
+        return []
+    breaks = np.flatnonzero(np.diff(t[moving]) > SHORTEST_DWELL)
+    spans = list(zip(moving[np.r_[0, breaks + 1]], moving[np.r_[breaks, moving.size - 1]] + 1, strict=True))
+    travelled = size * np.gradient(t)  # in the time of each sample
+    ways = [float(travelled[first:last].sum()) for first, last in spans]
+    return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > LEAST_WAY * max(ways)]
+
+
+MIN_STOP_FORCE_RATIO = 2.5
+"""Push at rest at an end over what holds or moves the body elsewhere [1]: lower takes static friction for a stop,
+higher misses stops under a weak push."""
+MIN_STOP_TIME = 0.05
+"""Time [s] of pushing against a stop: shorter takes a reversal for one, longer misses a bounce."""
+MIN_STOP_SAMPLES = 10
+"""Samples of the same: fewer take noise for a stop, more miss stops in logs of 100 Hz."""
+STOP_WIDTH = 6.0
+"""Noise [1] within which positions at a stop lie: lower cuts a stop in pieces, higher takes slow reversals for one."""
+STOP_SHARE = 2e-3
+"""Share of the way [1] by which a stop gives in: lower misses soft stops, higher takes slow reversals for them."""
+STATED_STOP_SHARE = 0.05
+"""Share of the way [1] by which a stated stop may be off: lower blames a sensor's zero, higher a wrong stroke."""
+
+
+def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find rests at an extreme position under a push that moves the body everywhere else."""
+    log, motion = experiment.trajectory, motion_speed(experiment, axis)
+    if motion is None or axis.position not in log or not axis.forces or any(n not in log for n in axis.forces):
+        return
+    x, push, unit = log[axis.position], axis.net_force({n: log[n] for n in axis.forces}), experiment.unit(axis.position)
+    way = float(np.nanmax(x) - np.nanmin(x))
+    noise = experiment.noise[axis.position] if axis.position in experiment.noise else noise_level(x, log.t)
+    width = max(STOP_WIDTH * noise, STOP_SHARE * way)
+    inside = (x > np.nanmin(x) + width) & (x < np.nanmax(x) - width)
+    middle, level = _usual_push(inside, motion, push)
+    for side, end in ((1, float(np.nanmax(x))), (-1, float(np.nanmin(x)))):
+        held = (np.abs(x - end) < width) & (side * (push - middle) > MIN_STOP_FORCE_RATIO * level)
+        begin, last = _longest_run(held)
+        is_long = last - begin >= MIN_STOP_SAMPLES and log.t[last] - log.t[begin] >= MIN_STOP_TIME
+        if not is_long or _is_stated(end, axis):
+            continue
+        force = float(np.median(push[begin : last + 1]))
+        times = f"from {log.t[begin]:.4g} s to {log.t[last]:.4g} s"
+        ratio = abs(force - middle) / level
+        pushed = f"{force:.3g} {axis.force_unit} push it on, {ratio:.2g} times what moves it elsewhere"
+        message = f"{axis.position!r} stays at {write_value(end, unit, 4)} {times} while {pushed}, as at an end stop"
+        message += " that the model has not: leave these rows out, the log is cut there"
+        panel, at = Panel(axis.force_unit, {"force of the drive": push}), (begin + last) // 2
+        shown = evidence(experiment, axis.position, panel, where=held, at=at, motion=motion, label="stop")
+        yield LogFinding(axis.position, message, True, evidence=shown)
+
+
+def _usual_push(inside: Mask, motion: Array, push: Array) -> tuple[float, float]:
+    """The middle of the pushes that move the body each way, and how far from it a push moves or holds it."""
+    fast = LARGE_SHARE * float(np.nanquantile(np.abs(motion), 0.99))
+    moving = [side * motion > fast for side in (1, -1)]
+    ways = [push[each] for each in moving]
+    known = [float(np.nanmedian(way)) for way in ways if way.size >= MIN_STOP_SAMPLES]
+    travels = [float(np.sum(np.abs(motion[each]))) for each in moving]
+    # noise in rest goes either way: a body that only advances has no middle
+    goes_back = min(travels) > LARGE_SHARE * max(travels)
+    middle = sum(known) / 2 if len(known) == 2 and goes_back else 0.0
+    pushes = np.abs(np.concatenate(ways) - middle)
+    held = np.abs(push[(np.abs(motion) < fast) & inside] - middle)
+    holding = float(np.nanquantile(held, 0.99)) if held.size >= MIN_STOP_SAMPLES else 0.0
+    return middle, max(float(np.nanmedian(pushes)), holding)
+
+
+def _is_stated(end: float, axis: StatedAxis) -> bool:
+    """Whether the model has a stop near this position."""
+    return any(abs(end - stop) < STATED_STOP_SHARE * float(np.ptp(axis.stops)) for stop in axis.stops)
+
+
+def _longest_run(mask: Mask) -> tuple[int, int]:
+    """First and last sample of the longest run; (0, 0) without one."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    if not edges.size:
+        return 0, 0
+    longest = int(np.argmax(edges[1::2] - edges[::2]))
+    return int(edges[2 * longest]), int(edges[2 * longest + 1]) - 1
+
+
+MIN_JUMP_NOISE = 30.0
+"""Jump over the noise [1]: lower takes outliers and steps of an encoder for jumps, higher misses small ones."""
+MIN_JUMP_SPEED_RATIO = 5.0
+"""Speed of a jump over that of the motion around it, and of most of the log [1]: lower takes short strokes in coarse
+logs for jumps, higher misses jumps of fast motion."""
+MIN_JUMP_ACCELERATION = 500.0
+"""Acceleration [m/s^2] that a jump needs at least, to start and to stop within a sample: short-stroke cylinders reach
+less, higher misses jumps in logs of 100 Hz."""
+NEIGHBOURS = 3
+"""Samples beside a jump that show the motion around it: with fewer an outlier is one, more miss short ones."""
+USUAL_SPEED_QUANTILE = 0.98
+"""Share of a log's samples [1] that move no faster than its usual speed: higher counts the jumps among them."""
+
+
+Indices = NDArray[np.intp]
+
+
+def check_jumps(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find jumps of the position that no motion explains."""
+    log = experiment.trajectory
+    if axis.position not in log or axis.position != PISTON.position:
+        return
+    known = np.flatnonzero(np.isfinite(log[axis.position]))
+    t, x = log.t[known], log[axis.position][known]
+    if known.size < 4 * NEIGHBOURS:
+        return
+    jumps = np.flatnonzero(_is_abrupt(t, x))
+    if jumps.size:  # few logs have abrupt steps, and only theirs need a level of the noise
+        noise = max(experiment.noise.get(axis.position, 0.0), noise_level(x, t))
+        jumps = jumps[np.abs(np.diff(x))[jumps] > MIN_JUMP_NOISE * noise]
+    if jumps.size:
+        shown = _evidence(experiment, axis, known, jumps)
+        yield LogFinding(axis.position, _sentence(t, x, jumps, axis.position), True, evidence=shown)
+
+
+def _is_abrupt(t: Array, x: Array) -> Mask:
+    """Which steps are far larger than those around them, and than those of most of the log."""
+    time = np.diff(t)
+    speed = np.abs(np.diff(x)) / time
+    padded = np.pad(speed, NEIGHBOURS)
+    shifts = [k for k in range(2 * NEIGHBOURS + 1) if k != NEIGHBOURS]
+    around = np.max([padded[k : k + speed.size] for k in shifts], axis=0)
+    is_fast = speed > MIN_JUMP_SPEED_RATIO * np.maximum(around, _usual_speed(t, x))
+    return np.asarray(is_fast & (4 * speed / time > MIN_JUMP_ACCELERATION))
+
+
+def _usual_speed(t: Array, x: Array) -> float:
+    return float(np.quantile(np.abs(np.diff(x) / np.diff(t)), USUAL_SPEED_QUANTILE))
+
+
+def _sentence(t: Array, x: Array, jumps: Indices, name: str) -> str:
+    first = int(jumps[0])
+    size, speed = 1e3 * (x[first + 1] - x[first]), abs(x[first + 1] - x[first]) / (t[first + 1] - t[first])
+    usual = f"the log usually moves below {_usual_speed(t, x):.2g} m/s"
+    found = f"{name!r} jumps by {size:.3g} mm within a sample at {t[first + 1]:.4g} s ({speed:.3g} m/s; {usual})"
+    if jumps.size == 1:
+        return f"{found}: cut the log in two there"
+    more = "and again" if jumps.size == 2 else f"and {jumps.size - 1} times more, next"
+    return f"{found}, {more} at {t[jumps[1] + 1]:.4g} s: leave the cells of {name!r} in between empty"
+
+
+def _evidence(experiment: Experiment, axis: StatedAxis, known: Indices, jumps: Indices) -> Evidence:
+    """The position, and the speed that it would need."""
+    log = experiment.trajectory
+    t, speed = log.t, np.full(len(log), np.nan)
+    speed[known[1:]] = np.diff(log[axis.position][known]) / np.diff(t[known])
+    begin, end = t[known[jumps[0]]], t[known[jumps[min(1, jumps.size - 1)] + 1]]
+    margin = max(end - begin, MIN_VIEW_SAMPLES * float(np.median(np.diff(t))))
+    where = np.zeros(len(log), dtype=bool)
+    for jump in jumps:
+        where[known[jump] : known[jump + 1] + 1] = True
+    needed = Panel("m/s", {f"slope of the {axis.position}": speed})
+    shown = evidence(experiment, axis.position, needed, where=where, label="jump")
+    return replace(shown, view=(max(float(t[0]), begin - margin), min(float(t[-1]), end + margin)))
+
+
+MEAN_BLOCKS = 20
+"""Blocks of a log whose means separate motion from noise: with more their means are noisy, with fewer hide motion."""
+MAX_SENSOR_LAG = 0.02
+"""Time [s] by which one sensor may come later than another: shorter takes a filter's lag in fast motion for a wrong
+sign, longer misses wrong signs of motion at a few hertz."""
+MAX_SLOPE_NOISE_SHARE = 0.1
+"""Share of a slope's variance [1] that noise may have: higher drowns the work in it, lower blurs fast motion."""
+
+
+def motion_speed(experiment: Experiment, axis: StatedAxis) -> Array | None:
+    """The speed as logged, else the slope of the position; None without either, or where noise hides the motion."""
+    log = experiment.trajectory
+    if axis.speed in log:
+        return log[axis.speed]
+    if axis.position not in log:
+        return None
+    known = np.isfinite(log[axis.position])
+    half = slope_half_width(log.t[known], log[axis.position][known], experiment.noise.get(axis.position))
+    return None if half is None else position_slope(log.t, log[axis.position], half)
+
+
+def speed_panel(experiment: Experiment, axis: StatedAxis, motion: Array) -> Panel:
+    """The panel of a speed from `motion_speed`, by the name of what it is."""
+    name = axis.speed if axis.speed in experiment.trajectory else f"slope of the {axis.position}"
+    return Panel(experiment.unit(axis.speed), {name: motion})
+
+
+def slope_half_width(t: Array, x: Array, noise: float | None) -> int | None:
+    """The narrowest half width [samples] over which a slope shows motion and hardly noise; None where none does.
+
+    It depends on the noise and not on the length of the log: a window that is longer than a cycle turns its sign round.
+    """
+    if t.size < 2 * MEAN_BLOCKS:
+        return None
+    sigma = noise_level(x, t) if noise is None else noise
+    half = 1
+    while 4 * half < t.size:
+        slope = position_slope(t, x, half)
+        expected = math.sqrt(2) * sigma / (2 * half * float(np.median(np.diff(t))))
+        if expected**2 < MAX_SLOPE_NOISE_SHARE * float(np.nanmean(slope**2)):
+            return half
+        half *= 2
+    return None
+
+
+def position_slope(t: Array, y: Array, half: int) -> Array:
+    """Speed from the position over a window of `half` samples to both sides; NaN at the ends."""
+    slope = np.full(len(t), np.nan)
+    slope[half:-half] = (y[2 * half :] - y[: -2 * half]) / (t[2 * half :] - t[: -2 * half])
+    return slope
+
+
+def window_mean(v: Array, half: int, simpson: bool) -> Array:
+    """Mean of a column from `half` samples before each sample to as many behind, by trapezoids or parabolas."""
+    pieces = (v[:-2] + 4 * v[1:-1] + v[2:]) / 6 if simpson else (v[:-2] + 2 * v[1:-1] + v[2:]) / 4
+    sums, out = np.zeros(v.size), np.full(v.size, np.nan)
+    for first in (0, 1):  # a piece spans two steps: every other one covers the window once
+        sums[2 + first :: 2] = np.cumsum(pieces[first::2])
+    out[half : v.size - half] = (sums[2 * half :] - sums[: v.size - 2 * half]) / half
+    return out
+
+
+def sensor_lags(t: Array, count: int = 4) -> list[int]:
+    """Lags [samples] between two sensors that count as one instant, as many each way as there are samples for."""
+    most = min(math.ceil(MAX_SENSOR_LAG / float(np.median(np.diff(t)))), t.size // 10)
+    steps = sorted({round(k * most / count) for k in range(count + 1)})
+    return [*(-k for k in reversed(steps[1:])), *steps]
+
+
+def shift(a: Array, b: Array, lag: int) -> tuple[Array, Array]:
+    """Two columns, the second one later by a lag [samples], where both are known."""
+    if lag > 0:
+        a, b = a[:-lag], b[lag:]
+    elif lag < 0:
+        a, b = a[-lag:], b[:lag]
+    known = np.isfinite(a) & np.isfinite(b)
+    return a[known], b[known]
+
+
+def lagged_correlation(a: Array, b: Array, lag: int) -> float:
+    """The correlation about zero of two columns at a lag; 0 where one is zero."""
+    a, b = shift(a, b, lag)
+    power = math.sqrt(float(a @ a) * float(b @ b))
+    return float(a @ b) / power if power > 0 else 0.0
+
+
+def lagged_ratio(a: Array, b: Array, lag: int) -> float:
+    """The size of the second column over that of the first, by regression at a lag."""
+    a, b = shift(a, b, lag)
+    return float(a @ b) / float(a @ a)
+
+
+MIN_PRESSURE_RATIO = 0.3
+"""Lowest pressure over the atmosphere [1] that counts as absolute: no chamber is exhausted further. A lower bound
+lets gauge readings pass, a higher one refuses sensors with an offset."""
+MAX_PRESSURE = 1e7
+"""Pressure [Pa] that no pneumatic drive has, 100 bar; lower blames blow moulding, higher misses units."""
+CLIPPED_SHARE = 0.02
+"""Share of samples at the largest value [1] that looks clipped: lower blames rest, higher misses short clipping."""
+
+
+def check_pressures(experiment: Experiment, _: StatedAxis) -> Iterator[LogFinding]:
+    """Find wrong zero points: gauge pressures taken for absolute ones, or the reverse."""
+    log = experiment.trajectory
+    supply = experiment.conditions.get("supply.pressure")
+    if supply is None and "supply_pressure" in log:
+        supply = float(np.nanmedian(log["supply_pressure"]))
+    for name in ("pressure_a", "pressure_b", "supply_pressure"):
+        if name not in log:
+            continue
+        low, high = (float(np.nanpercentile(log[name], q)) for q in (1, 99))
+        if low < MIN_PRESSURE_RATIO * ATMOSPHERE:
+            message = f"{name!r} falls to {low / 1e5:.2f} bar(a), a vacuum; a gauge sensor's unit is written bar(g)"
+            least = MIN_PRESSURE_RATIO * ATMOSPHERE
+            shown = _beside(experiment, name, "no chamber is exhausted further", least, above=False)
+            yield LogFinding(name, message, True, evidence=shown)
+        elif high > MAX_PRESSURE:
+            message = f"{name!r} rises to {high / 1e5:.3g} bar(a), more than air drives have: its unit?"
+            yield LogFinding(name, message, True, evidence=_beside(experiment, name, "highest of drives", MAX_PRESSURE))
+        elif supply is not None and high > 1.1 * supply and name != "supply_pressure":
+            message = f"{name!r} rises to {high / 1e5:.2f} bar(a), above the supply of {supply / 1e5:.2f} bar(a)"
+            shown = _beside(experiment, name, "supply", supply)
+            yield LogFinding(name, f"{message}; is an absolute sensor read as bar(g)?", True, evidence=shown)
+
+
+def _beside(experiment: Experiment, name: str, label: str, limit: float, *, above: bool = True) -> Evidence:
+    """A pressure beside a limit that it crosses, about where it is farthest beyond."""
+    p = experiment.trajectory[name]
+    at = int(np.nanargmax(p) if above else np.nanargmin(p))
+    panel = Panel("Pa(a)", {name: p, label: np.full(p.size, limit)})
+    return evidence(experiment, panel, where=(p > limit) if above else (p < limit), at=at)
+
+
+def check_sampling(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find jitter, clipping and coarse resolution."""
+    log = experiment.trajectory
+    steps = np.diff(log.t)
+    usual = float(np.median(steps))
+    jitter = float(np.median(np.abs(steps - usual))) * 1.4826
+    if jitter > 0.05 * usual:
+        message = f"the samples jitter by {jitter / usual:.0%} of {usual:g} s; their times are used"
+        lengths = np.append(steps, steps[-1])
+        uneven = np.abs(lengths - usual) > 0.05 * usual
+        shown = evidence(experiment, Panel("s", {"time to the next sample": lengths}), where=uneven)
+        yield LogFinding("time", message, False, evidence=shown)
+    for name in log:
+        y = log[name][np.isfinite(log[name])]
+        levels = np.unique(y).size
+        for end, which in ((y.max(initial=-np.inf), "largest"), (y.min(initial=np.inf), "smallest")):
+            share = float(np.mean(y == end)) if y.size else 0.0
+            if name.startswith("pressure") and levels > 50 and share > CLIPPED_SHARE:
+                message = f"{share:.0%} of {name!r} are exactly its {which} value: is the sensor clipped?"
+                shown = evidence(experiment, name, where=log[name] == end)
+                yield LogFinding(name, message, False, evidence=shown)
+        if name in (axis.position, axis.speed) and 2 < levels < min(50, y.size // 4):
+            message = f"{name!r} has only {levels} levels, the resolution is coarse for the motion"
+            yield LogFinding(name, message, False, evidence=evidence(experiment, name, at=len(log) // 2))
+
+
+MAX_NET_TRAVEL_SHARE = 0.3
+"""Net travel over path [1] up to which a log counts as one that returns: higher blames lifts, lower skips most logs."""
+MIN_WORK_SHARE = -0.2
+"""Work over the integral of the absolute power [1] below which the sign is wrong: nearer to zero, noise is blamed."""
+ROD_AREA_RATIOS = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0)
+"""Areas of the rod's side over the other's [1]: one of these is near for real cylinders; more hide wrong signs."""
+SPEED_SLOPE_RATIOS = (0.5, 2.0)
+"""Speed over the position's slope [1] that passes: wider lets wrong units pass, inches for centimetres say; narrower
+refuses filtered speeds of fast motion."""
+MIN_SPEED_CORRELATION = 0.7
+"""Correlation [1] of speed and slope from which they are compared: lower compares noise, higher misses short motion."""
+MAX_COMMAND_LAG = 0.1
+"""Time [s] within which a drive's speed follows its valve: longer finds chance correlations, shorter misses drives."""
+WRONG_SIGN_CORRELATIONS = (-0.6, 0.3)
+"""The sign is wrong if the least correlation of command and speed is below the first, the largest below the second."""
+RECIPROCATING_TRAVEL_RATIO = 1.9
+"""Travel over range [1]: at 2 a piston has come back, so it is commanded; a lower bound blames overshoot."""
+
+
+def check_position_speed(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find a speed that is not the slope of the position, in sign or in unit."""
+    log = experiment.trajectory
+    if axis.position not in log or axis.speed not in log:
+        return
+    experiment = _known_part(experiment, axis.position, axis.speed)
+    log = experiment.trajectory
+    t, x, v = log.t, log[axis.position], log[axis.speed]
+    half = slope_half_width(t, x, experiment.noise.get(axis.position))
+    if half is None:
+        return
+    slope, means = position_slope(t, x, half), [window_mean(v, half, simpson) for simpson in (False, True)]
+    found = {lag: lagged_correlation(slope, means[0], lag) for lag in sensor_lags(t)}
+    best = max(found, key=found.__getitem__)
+    if found[best] < -MIN_SPEED_CORRELATION / 2 and min(found.values()) < -MIN_SPEED_CORRELATION:
+        i = int(np.nanargmax(np.abs(slope)))
+        seen = f"at {t[i]:.4g} s {axis.position} changes by {slope[i]:.3g}/s, {axis.speed} is {means[0][i]:.3g}"
+        message = f"{axis.position} and {axis.speed} run against each other ({seen}): change the sign of one"
+        shown = _speeds(experiment, axis, slope, is_opposed(slope, means[0]), i)
+        yield LogFinding(axis.speed, message, True, evidence=shown)
+    elif found[best] > MIN_SPEED_CORRELATION:
+        ratios = [lagged_ratio(slope, mean, best) for mean in means]
+        # trapezoids and parabolas through the speed err in opposite directions where its samples are far apart
+        if max(ratios) < SPEED_SLOPE_RATIOS[0] or min(ratios) > SPEED_SLOPE_RATIOS[1]:
+            message = f"{axis.speed} is {ratios[0]:.3g} times the slope of the {axis.position}: check both units"
+            fast = np.abs(slope) > LARGE_SHARE * np.nanmax(np.abs(slope))
+            shown = _speeds(experiment, axis, slope, fast, int(np.nanargmax(np.abs(slope))))
+            yield LogFinding(axis.speed, message, True, evidence=shown)
+
+
+def _known_part(experiment: Experiment, *channels: str) -> Experiment:
+    """The samples in which channels are all known."""
+    log = experiment.trajectory
+    known = np.isfinite(log.matrix(channels)).all(axis=1)
+    part = Trajectory(log.t[known], {n: log[n][known] for n in log})
+    return replace(experiment, trajectory=part, holes=())
+
+
+def _speeds(experiment: Experiment, axis: StatedAxis, slope: Array, where: Mask, at: int) -> Evidence:
+    """The logged speed beside the slope of the position."""
+    speed, unit = experiment.trajectory[axis.speed], experiment.unit(axis.speed)
+    both = Panel(unit, {axis.speed: speed, f"slope of the {axis.position}": slope})
+    return evidence(experiment, both, axis.position, where=where, at=at, motion=slope)
+
+
+def check_work_sign(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find a force, torque or pressures of the wrong sign: a drive does net work on a load that comes back."""
+    log, motion = experiment.trajectory, motion_speed(experiment, axis)
+    if motion is None:
+        return
+    drives = {axis.push: (f"the {axis.push} brakes", f"'{axis.push}'")}
+    if "pressure_a" in log and "pressure_b" in log:
+        drives["pressures"] = ("the pressures brake", "the position, or exchange pressure_a and pressure_b")
+    for name, (message, remedy) in drives.items():
+        if name == axis.push and name not in log:
+            continue
+        if name == axis.push:
+            pushes = [log[name]]
+        else:
+            pushes = [log["pressure_a"] - ratio * log["pressure_b"] for ratio in ROD_AREA_RATIOS]
+            pushes = [push - np.nanmean(push) for push in pushes]
+        shares = np.stack([_work_shares(log.t, np.stack(pushes), motion, lag) for lag in sensor_lags(log.t)], axis=1)
+        share = max(shares.ravel().tolist())
+        if share < MIN_WORK_SHARE:
+            at = int(np.nanargmin(pushes[-1] * motion))
+            unit = experiment.unit(axis.push) if name == axis.push else "Pa"
+            fast = f"{motion[at]:.3g} {experiment.unit(axis.speed)}"
+            seen = f"most at {log.t[at]:.4g} s, where {pushes[-1][at]:.3g} {unit} pushes and the speed is {fast}"
+            why = f"{message} the motion on balance ({100 * share:.0f} % of its power, {seen}), which no drive does"
+            speed = speed_panel(experiment, axis, motion)
+            shown = Panel(experiment.unit(axis.push), {axis.push: pushes[0]})
+            if name != axis.push:
+                shown = Panel("Pa(a)", {n: log[n] for n in ("pressure_a", "pressure_b")})
+            brakes = is_opposed(pushes[-1], motion)
+            found = evidence(experiment, shown, speed, where=brakes, at=at, motion=motion, label="it brakes")
+            yield LogFinding(name, f"{why}: change the sign of {remedy}", True, evidence=found)
+
+
+def check_command(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find a piston that runs against its valve's command, or without one."""
+    log, motion = experiment.trajectory, motion_speed(experiment, axis)
+    if motion is None or "valve_voltage" not in log:
+        return
+    known = np.isfinite(motion) & np.isfinite(log["valve_voltage"])
+    t, command, motion = log.t[known], log["valve_voltage"][known], motion[known]
+    part = replace(experiment, trajectory=Trajectory(t, {"valve_voltage": command}), noise={}, intersample={})
+    if len(t) < 2 * MEAN_BLOCKS:
+        return
+    if not np.any(np.diff(command)):
+        every = max(1, len(t) // (5 * MEAN_BLOCKS))  # coarse: noise is no travel
+        travel = np.cumsum(motion[1:] * np.diff(t))[::every]
+        if float(np.abs(np.diff(travel)).sum()) > RECIPROCATING_TRAVEL_RATIO * float(np.ptp(travel)) > 0:
+            message = "'valve_voltage' is constant while the piston goes to and fro: log the command that moves it"
+            shown = evidence(part, "valve_voltage", speed_panel(experiment, axis, motion))
+            yield LogFinding("valve_voltage", message, True, evidence=shown)
+        return
+    lowest, highest = _command_correlations(t, command, motion)
+    if lowest < WRONG_SIGN_CORRELATIONS[0] and highest < WRONG_SIGN_CORRELATIONS[1]:
+        at = int(np.argmax(np.abs(motion)))
+        seen = f"correlation {lowest:.2f}; {motion[at]:.3g} m/s at {t[at]:.4g} s under {command[at]:.3g} V"
+        message = f"the piston runs against the valve's command ({seen}): change the sign of "
+        speed = speed_panel(experiment, axis, motion)
+        shown = evidence(
+            part, "valve_voltage", speed, where=is_opposed(command, motion), at=at, motion=motion, label="opposed"
+        )
+        yield LogFinding("valve_voltage", message + "'valve_voltage', or of the motion", True, evidence=shown)
+
+
+def _work_shares(t: Array, pushes: Array, motion: Array, lag: int) -> Array:
+    """Work of each push, over the integral of its power's absolute value; NaN where the log does not return."""
+    unknown = np.full(len(pushes), math.nan)
+    rows, motion = shift(np.where(np.isfinite(pushes).all(axis=0), np.arange(t.size), math.nan), motion, lag)
+    if rows.size < 10:
+        return unknown
+    at = rows.astype(np.intp)
+    steps = np.diff(t[at], prepend=t[at[0]], append=t[at[-1]])
+    travel = 0.5 * (steps[:-1] + steps[1:]) * motion  # by trapezoids
+    path = float(np.abs(travel).sum())
+    if path == 0 or abs(float(travel.sum())) > MAX_NET_TRAVEL_SHARE * path:
+        return unknown
+    known = pushes[:, at]
+    work, total = known @ travel, np.abs(known) @ np.abs(travel)
+    return np.asarray(np.divide(work, total, out=unknown, where=total > 0))
+
+
+def _command_correlations(t: Array, command: Array, motion: Array) -> tuple[float, float]:
+    """Least and largest correlation of a speed with the command up to `MAX_COMMAND_LAG` before; NaN at rest."""
+    grid = np.linspace(t[0], t[-1], t.size)
+    u, v = np.interp(grid, t, command), np.interp(grid, t, motion)
+    most = min(round(MAX_COMMAND_LAG / float(grid[1] - grid[0])), t.size // 4)
+    lags = range(0, most + 1, max(1, most // MEAN_BLOCKS))
+    if np.ptp(v) == 0 or any(np.ptp(u[: u.size - k]) == 0 for k in lags):
+        return math.nan, math.nan
+    found = [float(np.corrcoef(u[: u.size - k], v[k:])[0, 1]) for k in lags]
+    return min(found), max(found)
+
+
+MAX_WHITE_LAG = 20
+"""Lags [samples] that white noise leaves uncorrelated: with one, motion at a quarter of the rate looks white."""
+STILL_STEPS = 2.0
+"""Range at rest in steps of the resolution [1]: more takes small motion for rest, fewer flicker for motion."""
+MAX_PISTON_SPEED = 50.0
+"""Speed [m/s] that no piston or linear servo has; lower blames fast ones, higher misses slow ones in mm."""
+
+
+def check_has_motion(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find channels without motion."""
+    for name in (axis.position, axis.speed):
+        if name not in experiment.trajectory:
+            continue
+        y = experiment.trajectory[name]
+        y, noise = y[np.isfinite(y)], experiment.noise.get(name, 0.0)
+        if y.size and not np.any(np.diff(y)) and (name == axis.position or y[0] == 0):
+            message = f"{name!r} is constant: without motion friction is unidentifiable"
+            yield LogFinding(name, message, True, evidence=_stillness(experiment, name, axis))
+        elif y.size >= 2 * MEAN_BLOCKS and (_is_motionless(y, noise) or (name == axis.position and _is_white(y))):
+            message = f"{name!r} shows noise and no motion: log a run in which the drive moves"
+            yield LogFinding(name, message, True, evidence=_stillness(experiment, name, axis))
+
+
+def check_scale(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
+    """Find motion of a size that no drive has, as millimetres that are read as metres."""
+    log, motion = experiment.trajectory, motion_speed(experiment, axis)
+    fastest = 0.0 if motion is None else float(np.nanpercentile(np.abs(motion), 99))
+    if axis.position == PISTON.position and fastest > MAX_PISTON_SPEED:
+        name = axis.speed if axis.speed in log else axis.position
+        size = np.zeros(len(log)) if motion is None else np.abs(motion)
+        speeds = Panel("m/s", {"speed": size, "no piston is faster": np.full(size.size, MAX_PISTON_SPEED)})
+        shown = evidence(experiment, speeds, where=size > MAX_PISTON_SPEED, at=int(np.nanargmax(size)), motion=motion)
+        message = f"{name!r} moves at {fastest:.3g} m/s: is its unit mm, and read as m?"
+        yield LogFinding(name, message, True, evidence=shown)
+
+
+def _stillness(experiment: Experiment, name: str, axis: StatedAxis) -> Evidence:
+    """A channel without motion beside what should move it."""
+    drives = [n for n in (axis.push, "valve_voltage", "pressure_a") if n in experiment.trajectory]
+    return evidence(experiment, name, *drives[:1])
+
+
+def _is_motionless(y: Array, noise: float) -> bool:
+    """Whether a channel, and its block means, vary by no more than its noise, which has no rhythm."""
+    size = y.size // MEAN_BLOCKS
+    means = y[: MEAN_BLOCKS * size].reshape(MEAN_BLOCKS, size).mean(axis=1)
+    is_small = float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
+    flickers = float(np.ptp(y)) <= STILL_STEPS * find_resolution(y)
+    return is_small and (flickers or float(np.max(np.abs(_autocorrelation(y)))) < MIN_SPEED_CORRELATION)
+
+
+def _is_white(y: Array) -> bool:
+    """Whether samples are uncorrelated, which the position of a moving mass never is."""
+    return bool(np.max(np.abs(_autocorrelation(y))) < 4 / math.sqrt(y.size))
+
+
+def _autocorrelation(y: Array) -> Array:
+    """The correlation of samples at each lag up to `MAX_WHITE_LAG`."""
+    e = y - y.mean()
+    power = float(e @ e)
+    if power == 0:
+        return np.zeros(1)
+    return np.array([float(e[k:] @ e[:-k]) / power for k in range(1, min(MAX_WHITE_LAG, y.size - 1) + 1)])
+
 
 MIN_SPLINE = 4
 """Samples of a channel through which a cubic spline runs."""

@@ -11,7 +11,7 @@ from pneuopt.logs.columns import MIN_SAMPLES, split_unit
 from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, require
-from pneuopt.quantities.intersample import COMMAND_SUFFIX
+from pneuopt.quantities.parameters import COMMAND_SUFFIX
 from pneuopt.quantities.units import si_conversion
 
 _WORDS: Mapping[str, tuple[str, ...]] = {

@@ -9,15 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.logs import csv
-from pneuopt.logs.budget import read_bytes
-from pneuopt.logs.columns import CHANNELS, MAX_MAGNITUDE, ChannelColumn, find_columns, nearest_channel
-from pneuopt.logs.experiments import Experiment
-from pneuopt.logs.plant_channels import Plant, plant_channels
+from pneuopt.logs.columns import (
+    CHANNELS,
+    MAX_MAGNITUDE,
+    ChannelColumn,
+    Plant,
+    find_columns,
+    nearest_channel,
+    plant_channels,
+)
+from pneuopt.logs.experiment import Experiment
+from pneuopt.logs.foreign import READERS, read_table
 from pneuopt.logs.read_log import Sidecar, assemble_log, read_sidecar
-from pneuopt.logs.readers import READERS, read_table
-from pneuopt.logs.table import Table
-from pneuopt.logs.text_cells import mend_cells
+from pneuopt.logs.table import Table, read_bytes
+from pneuopt.logs.text import block_table, decode, find_block, mend_cells
+from pneuopt.logs.text import read_delimited as csv_read_table
 from pneuopt.quantities.arrays import Mask
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.trajectories import Trajectory
@@ -98,13 +104,13 @@ def list_rows(rows: Sequence[int]) -> str:
 
 def _table_maker(path: Path, raw: bytes) -> Callable[[Sequence[str]], tuple[Table, dict[str, list[int]]]]:
     """A function from the columns that have to be numbers to the table, and what was mended in its cells."""
-    if READERS.get(path.suffix.lower()) is not csv.read_table:
+    if READERS.get(path.suffix.lower()) is not csv_read_table:
         return lambda _: (read_table(path, raw), {})
-    block, layout = csv.find_block(path, csv.decode(path, raw))
+    block, layout = find_block(path, decode(path, raw))
 
     def make(used: Sequence[str]) -> tuple[Table, dict[str, list[int]]]:
         mended, changes = mend_cells(block, used)
-        return csv.block_table(mended, layout), changes
+        return block_table(mended, layout), changes
 
     return make
 

@@ -8,11 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 from pneuopt.models.declaration import Drive, DriveKind
-from pneuopt.models.drive import FORCE_KIND, MOTION_KIND
+from pneuopt.models.drives import FORCE_KIND, MOTION_KIND, ROTARY_KIND
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import LINEAR_KIND
-from pneuopt.models.pneumatic.drive_file import PNEUMATIC_KIND
-from pneuopt.models.rotary import ROTARY_KIND
+from pneuopt.models.pneumatic.drive import PNEUMATIC_KIND
 from pneuopt.quantities.errors import ModelError
 
 DRIVE_KINDS: Mapping[str, DriveKind] = {
@@ -38,7 +37,7 @@ def stick_slip_drive(drive: Drive) -> Drive:
 
     Examples
     --------
-    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.drives import ForceDrive
     >>> from pneuopt.models.friction import Coulomb
     >>> type(stick_slip_drive(ForceDrive(Coulomb())).friction).__name__
     'Karnopp'

@@ -2,28 +2,281 @@
 
 Signs: the force opposes positive speed when positive. Every map is smooth; `smoothing` is the speed over which the
 Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre holds it.
+
+Presliding friction as a map of the speed: friction that yields a little before it slides.
+
+Friction that grows with the force that a gear or a guide transmits.
+
+Declarations of a friction law from which an identification starts without a guess (see `models.starts.friction`).
+
+Motion that a log must show for the parameters of drives and friction laws, and runs that separate them.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
 
-from pneuopt.dynamics.excitation import DEFAULT_WIDTH, Excitation
+from pneuopt.dynamics.hooks import DEFAULT_WIDTH, Excitation, Lack, LoggedMotion, Need, SeparatingRun, Width
 from pneuopt.dynamics.system import Symbols
-from pneuopt.models.friction_start import Bristles, FrictionSamples, FrictionStart
-from pneuopt.models.needs import (
-    ASYMMETRY_EXCITATION,
-    BRISTLE_EXCITATION,
-    COULOMB_EXCITATION,
-    STRIBECK_EXCITATION,
-    VISCOUS_EXCITATION,
-)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionSamples:
+    """Samples of a log for a friction law; arrays of shape (n,), parameters and inputs by the law's names.
+
+    Attributes
+    ----------
+    speed : ndarray
+        Filtered speed [m/s].
+    side : ndarray
+        The sign of the speed, smooth over the law's `smoothing`; just before break-away, the sign of the force that
+        pulls.
+    level_speed : ndarray
+        The speed at which the friction level applies [m/s]: zero just before break-away.
+    values : mapping of str to float
+        The law's parameters as given; for a scanned one, the value that is tried.
+    """
+
+    speed: Array
+    side: Array
+    level_speed: Array
+    inputs: Mapping[str, Array]
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Bristles:
+    """Start of bristle deflections: their stiffness is the slope of the force over travel in presliding.
+
+    Parameters
+    ----------
+    stiffness, level : str
+        Names of the parameters for that slope [N/m] and for the sliding force [N], well below which bristles only bend.
+    range : tuple of float
+        Least and greatest stiffness of a start [N/m]: softer bristles bend for millimetres, stiffer ones need
+        integration steps below 1 us.
+    deflections : callable
+        ``(force, speed, values)`` returns the law's states from the friction force [N], the speed [m/s] and the
+        law's parameters.
+    """
+
+    stiffness: str
+    level: str
+    range: tuple[float, float]
+    deflections: Callable[[Array, Array, Mapping[str, float]], dict[str, Array]]
+
+
+@dataclass(frozen=True)
+class FrictionStart:
+    """A friction law as a linear regression: ``force = sum(column * parameter)`` at given scanned parameters.
+
+    Parameters
+    ----------
+    columns : callable
+        Maps `FrictionSamples` to the regression column of each parameter, by name.
+    unknowns : tuple of str
+        Parameters that are estimated unless the user frees others.
+    floors : mapping of str to float
+        Least value in the regression as a share of the median force [1], which keeps friction from driving the load.
+    above : mapping of str to str
+        Parameters whose column multiplies their excess over another parameter: static friction over Coulomb friction.
+    scanned : mapping of str to tuple of float
+        Parameters on which the force does not depend linearly, with the values to try, the most promising first.
+    bristles : Bristles, optional
+        For a law with internal states.
+    """
+
+    columns: Callable[[FrictionSamples], dict[str, Array]]
+    unknowns: tuple[str, ...]
+    floors: Mapping[str, float] = field(default_factory=dict)
+    above: Mapping[str, str] = field(default_factory=dict)
+    scanned: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    bristles: Bristles | None = None
+
+
+MIN_SPEED_RATIO = 3.0  # fast over slow speed [1]: less shows one point of the curve, a larger bound refuses good logs
+VISCOUS_SPEED_RATIO = 5.0  # speed over the Stribeck velocity [1] beyond which the static peak hides no viscous friction
+MIN_SLOW_SAMPLES = 20  # samples below the Stribeck velocity: fewer are noise, a larger bound refuses good logs
+MIN_DIRECTION_SHARE = 0.05  # share of the moving samples in the rarer direction [1]: fewer are accidental
+MIN_REVERSALS = 2  # reversals of the motion: one alone does not show that presliding repeats
+MIN_INERTIA_SHARE = 0.02  # inertia force over the friction level [1]: less is lost in the model's error
+DEFAULT_STRIBECK_VELOCITY = 0.02  # for laws without a Stribeck velocity [m/s]
+FRICTION_LEVELS = frozenset({"coulomb", "static"})
+STRIBECK_CURVE = FRICTION_LEVELS | {"stribeck_velocity"}
+# factor of a search over the width of dry friction's sign [1]: a smaller one takes more trials, a larger one leaves out
+# widths at which a log that slides is followed best
+SMOOTHING_FACTOR = 10.0
+BRISTLES = frozenset({"bristle_stiffness", "bristle_damping", "damping_velocity"})
+CONSTANT_FORCES = frozenset({"load.force", "rig.force_offset"})
+"""Parameters of drives for a force that is constant, whatever the speed."""
+ALIKE_AT_EVERY_SPEED = (
+    "they act alike at every speed: fix one, measure the offset with the load uncoupled, or turn the axis round"
+)
+
+
+def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
+    """Lack of the slow and fast speeds that a Stribeck curve needs, if any."""
+    stribeck = _largest_known("friction.stribeck_velocity", DEFAULT_STRIBECK_VELOCITY, seen.values)
+    speed = np.abs(seen.speed)
+    below = int(np.count_nonzero((speed > 0.1 * stribeck) & (speed < stribeck)))
+    slowest, fastest = 0.1 * stribeck, VISCOUS_SPEED_RATIO * stribeck
+    unit = _speed_unit(seen)
+    run = f"constant speeds, or slow ramps, from {slowest:.1g} to {fastest:.1g} {unit}"
+    if seen.fast < MIN_SPEED_RATIO * seen.slow:
+        speeds = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}"
+        return Lack(f"{speeds}, where friction is one level", f"log {run}")
+    if below < MIN_SLOW_SAMPLES:
+        message = f"only {below} samples are slower than the Stribeck velocity, {stribeck:.2g} {unit}"
+        return Lack(message, f"log {run}")
+    return None
+
+
+def lacks_speed_range(seen: LoggedMotion) -> Lack | None:
+    """Lack of the different speeds that a slope over speed needs, if any."""
+    if seen.fast < MIN_SPEED_RATIO * seen.slow:
+        unit, beyond = _speed_unit(seen), VISCOUS_SPEED_RATIO * seen.fast
+        message = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}, too near for a slope"
+        return Lack(message, f"log speeds from {seen.slow:.2g} to beyond {beyond:.2g} {unit}")
+    return None
+
+
+def lacks_directions(seen: LoggedMotion) -> Lack | None:
+    """Lack of the motion in both directions that asymmetric or constant forces need, if any."""
+    if min(seen.forward, 1 - seen.forward) < MIN_DIRECTION_SHARE:
+        way = "forwards" if seen.forward > 0.5 else "backwards"
+        return Lack(f"the drive moves {way} only", "log both directions")
+    return None
+
+
+def lacks_presliding(seen: LoggedMotion) -> Lack | None:
+    """Lack of the reversals that bristles need, if any."""
+    if seen.reversals < MIN_REVERSALS:
+        count = f"the motion reverses {seen.reversals} times" if seen.reversals else "the motion never reverses"
+        return Lack(
+            f"{count}, so that the bristles are hardly seen",
+            "log presliding: reversals, and a force that swings below break-away, sampled at 1 kHz",
+        )
+    return None
+
+
+def lacks_acceleration(inertia: str, remedy: str, seen: LoggedMotion) -> Lack | None:
+    """Lack of the acceleration that `inertia` needs beside friction, if any; the larger of two known values counts."""
+    force = _largest_known(inertia, math.nan, seen.values, seen.given) * seen.acceleration
+    friction = _largest_known("friction.coulomb", math.nan, seen.values)
+    if force < MIN_INERTIA_SHARE * friction:
+        unit = _known_unit(seen, "friction.coulomb")
+        return Lack(f"inertia takes {force:.2g} {unit} (rms), nothing beside {friction:.2g} {unit} of friction", remedy)
+    return None
+
+
+VISCOUS_EXCITATION = Excitation(
+    {"viscous": Need(lacks_speed_range, FRICTION_LEVELS)},
+    (
+        SeparatingRun(
+            frozenset({"viscous"}),
+            STRIBECK_CURVE,
+            "log speeds below <stribeck_velocity>, and such beyond <5 stribeck_velocity>",
+        ),
+    ),
+)
+COULOMB_EXCITATION = (
+    Excitation(
+        {},
+        (SeparatingRun(CONSTANT_FORCES, FRICTION_LEVELS, "log both directions"),),
+        (Width("smoothing", SMOOTHING_FACTOR),),
+    )
+    | VISCOUS_EXCITATION
+)
+STRIBECK_EXCITATION = COULOMB_EXCITATION | Excitation(
+    {
+        "stribeck_velocity": Need(lacks_stribeck_curve, FRICTION_LEVELS),
+        "static": Need(lacks_stribeck_curve, STRIBECK_CURVE),
+    },
+    (
+        SeparatingRun(
+            frozenset({"stribeck_velocity"}),
+            FRICTION_LEVELS,
+            "log speeds below <stribeck_velocity>: slow ramps through zero",
+        ),
+    ),
+    at_least={"static": "coulomb"},
+)
+BRISTLE_EXCITATION = STRIBECK_EXCITATION | Excitation(
+    dict.fromkeys(sorted(BRISTLES), Need(lacks_presliding)),
+    (
+        SeparatingRun(
+            BRISTLES,
+            BRISTLES | STRIBECK_CURVE,
+            "log presliding: reversals, and a force that swings below break-away, <static>",
+        ),
+    ),
+)
+ASYMMETRY_EXCITATION = Excitation(
+    {
+        "coulomb_asymmetry": Need(lacks_directions, FRICTION_LEVELS),
+        "viscous_asymmetry": Need(lacks_directions, frozenset({"viscous"})),
+    },
+    (
+        SeparatingRun(
+            CONSTANT_FORCES,
+            frozenset({"coulomb_asymmetry"}),
+            ALIKE_AT_EVERY_SPEED,
+        ),
+    ),
+    (Width("smoothing", SMOOTHING_FACTOR, follows=("asymmetry_width",)),),
+)
+_LEVELS = frozenset(f"friction.{n}" for n in FRICTION_LEVELS)
+
+
+def load_excitation(inertia: str, force: str, push: str, remedy: str) -> Excitation:
+    """Excitation that the load of a drive needs.
+
+    Parameters
+    ----------
+    inertia, force : str
+        Names of the load's parameters: its inertia, and its constant force.
+    push : str
+        The drive's input in words: "force", "torque".
+    remedy : str
+        How the inertia is found without a log, in words.
+    """
+    lacks = partial(lacks_acceleration, inertia, f"{remedy}, or log steps of {push}")
+    asymmetry, slope = (
+        frozenset({"friction.coulomb_asymmetry"}),
+        {"friction.viscous", *(f"friction.{n}" for n in BRISTLES)},
+    )
+    runs = (
+        SeparatingRun(frozenset({inertia}), frozenset(slope), f"log more acceleration: steps of {push}"),
+        SeparatingRun(frozenset({force}), asymmetry, ALIKE_AT_EVERY_SPEED),
+        SeparatingRun(frozenset({force}), _LEVELS, "log both directions"),
+    )
+    return Excitation({force: Need(lacks_directions, _LEVELS), inertia: Need(lacks)}, runs)
+
+
+LOAD_EXCITATION = load_excitation("load.mass", "load.force", "force", "weigh the load and fix its mass")
+RIG_EXCITATION = Excitation({"rig.force_offset": Need(lacks_directions, _LEVELS)})
+
+
+def _largest_known(name: str, default: float, *known: ParameterSet) -> float:
+    return max((values.value(name) for values in known if name in values), default=default)
+
+
+def _speed_unit(seen: LoggedMotion) -> str:
+    return _known_unit(seen, "friction.stribeck_velocity", "friction.smoothing") or "m/s"
+
+
+def _known_unit(seen: LoggedMotion, *names: str) -> str:
+    """Unit of the first parameter that is known; empty where none is."""
+    return next((known[n].unit for n in names for known in (seen.given, seen.values) if n in known), "")
+
 
 STICKING_SPEED = 1e-6  # rounding of |v| in LuGre [m/s]: a larger one creeps visibly, a smaller one needs finer steps
 STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # values that a start tries [m/s], most successful first
@@ -393,3 +646,114 @@ _STRIBECK_PARAMETERS = {
         0.02, "m/s", lower=1e-4, upper=1.0, log=True, meaning="speed over which friction falls from static to Coulomb"
     ),
 }
+
+
+# least presliding speed [m/s]: below it friction is as sharp as that of `Coulomb`, and takes many integration steps;
+# above it the yielding of stiff drives is missed
+MIN_PRESLIDING_SPEED = 3e-4
+SLOW_REVERSALS = SeparatingRun(
+    frozenset({"presliding_speed"}),
+    frozenset({"static", "stribeck_velocity", "bristle_stiffness", "bristle_damping", "coulomb", "viscous"}),
+    "log slow reversals, with many samples while the speed changes its sign",
+)
+PRESLIDING_EXCITATION = replace(COULOMB_EXCITATION, runs=(SLOW_REVERSALS, *COULOMB_EXCITATION.runs), widths=())
+
+
+@dataclass(frozen=True)
+class Presliding:
+    """F = coulomb * tanh(v / presliding_speed) + viscous * v.
+
+    The speed over which friction builds up is a property of the drive, and estimated: bristles that yield, a belt, a
+    sensor beside the contact. In `Coulomb` it is a means of integration, and as small as that allows.
+    """
+
+    excitation: ClassVar[Excitation] = PRESLIDING_EXCITATION
+    states: tuple[Quantity, ...] = ()
+    inputs: tuple[Quantity, ...] = ()
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Parameters: coulomb [N], viscous [N*s/m], presliding_speed [m/s]."""
+        base = Coulomb().parameters
+        speed = Parameter(
+            3e-3, "m/s", lower=MIN_PRESLIDING_SPEED, upper=0.1, log=True, meaning="speed over which friction builds up"
+        )
+        return base.select(n for n in base if n != "smoothing") | ParameterSet({"presliding_speed": speed})
+
+    @property
+    def start(self) -> FrictionStart:
+        """Regression of `Coulomb`; the presliding speed begins at its given value."""
+        base = Coulomb().start
+        return FrictionStart(base.columns, (*base.unknowns, "presliding_speed"), base.floors)
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
+        """Return the force and the rates of the states; see the class."""
+        return Coulomb().force(v, z, u, {**p, "smoothing": p["presliding_speed"]})
+
+
+@dataclass(frozen=True)
+class LoadDependent:
+    """A base model whose Coulomb and static levels rise with the transmitted force F: + coulomb_load |F|, |F| smooth.
+
+    ``|F| = sqrt(F^2 + load_rounding^2) - load_rounding``: zero without load, and never more than the exact value. F
+    drives the load: the input of a `ForceDrive`, the torque of a `RotaryDrive`. For gears of servos coulomb_load is
+    0.01 to 0.2.
+
+    Source: Hamon, Gautier, Garrec, Dynamic identification of robots with a dry friction model depending on load and
+    velocity, IROS 2010.
+    """
+
+    base: FrictionModel
+
+    def __post_init__(self) -> None:
+        check_coulomb_level(self.base, "load")
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """States of the base model."""
+        return self.base.states
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """Inputs of the base model, and the transmitted force [N]."""
+        return (*self.base.inputs, Quantity("force", "N", nominal=100.0))
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Parameters of the base model, coulomb_load [1] and load_rounding [N]."""
+        added = {
+            "coulomb_load": Parameter(0.0, "1", lower=0.0, upper=0.9, meaning="Coulomb friction per transmitted force"),
+            "load_rounding": Parameter(
+                1.0,
+                "N",
+                lower=1e-3,
+                upper=1e3,
+                log=True,
+                meaning="force over which the transmitted force's size is rounded",
+            ),
+        }
+        return self.base.parameters | ParameterSet(added)
+
+    @property
+    def excitation(self) -> Excitation:
+        """Excitation of the base model, and loads that differ."""
+        words = "log sliding under a load that is known and large: a weight lifted and lowered, or a spring"
+        others = FRICTION_LEVELS | {"viscous", "load.mass", "load.inertia"}
+        return Excitation(runs=(SeparatingRun(frozenset({"coulomb_load"}), others, words),)) | self.base.excitation
+
+    @property
+    def start(self) -> FrictionStart:
+        """Start of the base model, with levels that are linear in the absolute force."""
+        base = self.base.start
+
+        def columns(s: FrictionSamples) -> dict[str, Array]:
+            rounding = s.values["load_rounding"]
+            size = np.sqrt(s.inputs["force"] ** 2 + rounding**2) - rounding
+            return base.columns(s) | {"coulomb_load": s.side * size}
+
+        return replace(base, columns=columns, unknowns=(*base.unknowns, "coulomb_load"))
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
+        """Return the force of the base model with raised levels; see the class."""
+        size = ca.sqrt(u["force"] ** 2 + p["load_rounding"] ** 2) - p["load_rounding"]
+        return self.base.force(v, z, u, raise_levels(p, p["coulomb_load"] * size))

@@ -1,23 +1,28 @@
 """The registry of friction laws, a row each, for files, model selection (`friction_ladder`) and the table test.
 
 A row is a law's name in files and its class, which declares everything else (see `FrictionModel`).
+
+Section [friction] of a drive's file: the law and its wrappers.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from pneuopt.models.declaration import DriveSections
 from pneuopt.models.friction import (
     CHAMBER_PRESSURES,
     Asymmetric,
     Coulomb,
     FrictionModel,
+    LoadDependent,
     LuGre,
+    Presliding,
     PressureDependent,
     Stribeck,
     Viscous,
 )
-from pneuopt.models.load_dependent import LoadDependent
-from pneuopt.models.presliding import Presliding
+from pneuopt.quantities.errors import check_names
+from pneuopt.quantities.keys import Key, Takes, choice, flag
 
 
 @dataclass(frozen=True)
@@ -77,3 +82,29 @@ def usual_unknowns() -> tuple[str, ...]:
     """Parameters that a comparison of these laws estimates, as a drive names them."""
     unknowns = (f"friction.{n}" for law in friction_ladder().values() for n in law.start.unknowns)
     return tuple(dict.fromkeys(unknowns))
+
+
+FRICTION_KEYS: Mapping[str, Key] = {
+    "model": choice("friction law", FRICTION_LAWS),
+    **{
+        name: replace(flag(wrapper.meaning), takes=Takes.FLAG_OR_LIST if wrapper.options else Takes.FLAG)
+        for name, wrapper in FRICTION_WRAPPERS.items()
+    },
+}
+
+
+STRIBECK_UNKNOWNS = tuple(f"friction.{n}" for n in Stribeck().start.unknowns)
+"""Parameters of the usual law that logs give, as a drive names them."""
+
+
+def read_friction(sections: DriveSections) -> FrictionModel:
+    """Build the friction law that [friction] describes."""
+    options = sections.options("friction")
+    law: FrictionModel = options["model"]()
+    for name, wrapper in FRICTION_WRAPPERS.items():
+        if isinstance(options[name], list) and options[name]:
+            check_names(wrapper.option, options[name], wrapper.options, sections.place("friction", name))
+            law = wrapper.wrap(law, tuple(options[name]))
+        elif options[name]:
+            law = wrapper.wrap(law)
+    return law

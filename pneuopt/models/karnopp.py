@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from pneuopt.dynamics.excitation import Excitation
+from pneuopt.dynamics.hooks import Excitation
 from pneuopt.dynamics.system import Symbols
-from pneuopt.models.friction import Force, FrictionModel
-from pneuopt.models.friction_start import FrictionStart
+from pneuopt.models.friction import Force, FrictionModel, FrictionStart
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 

@@ -9,17 +9,15 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
-from pneuopt.models.dead_time import delay_line, pade_delay
 from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
-from pneuopt.models.drive import FORCE, POSITION, SPEED
+from pneuopt.models.drives import FORCE, POSITION, SPEED
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
-from pneuopt.models.starts.linear import LinearStarts, Polynomials, ResponseShape
+from pneuopt.models.friction_laws import FRICTION_KEYS, read_friction
+from pneuopt.models.starts.linear import LinearStarts, Polynomials, ResponseShape, delay_line, pade_delay
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, choice
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
-from pneuopt.quantities.unit_algebra import difference_unit
-from pneuopt.quantities.units import read_si
+from pneuopt.quantities.units import difference_unit, read_si
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
 USUAL_PADE_ORDER = 3  # of a dead time in a file: it follows the delay up to 4.6 rad of phase, with three states

@@ -60,7 +60,7 @@ def with_sensors(
 
     Examples
     --------
-    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.drives import ForceDrive
     >>> from pneuopt.models.friction import Coulomb
     >>> drive = with_sensors(ForceDrive(Coulomb()).system(), offset=["speed"], delay=["position"])
     >>> [n for n in drive.parameters if n.startswith("sensor")]

@@ -5,23 +5,32 @@ the only room that imports matplotlib; `cli` may import it. A newcomer adds a fi
 Figure`` in a file of its subject, with what `canvas` shares.
 """
 
-from pneuopt.plotting.bode import plot_bode
-from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, check_figure_path, legend_above, save_figure
-from pneuopt.plotting.diagnostics import plot_correlation, plot_residuals
-from pneuopt.plotting.distributions import plot_distribution
-from pneuopt.plotting.experiment_designs import plot_experiment
-from pneuopt.plotting.findings import plot_finding
-from pneuopt.plotting.fits import plot_fit, plot_prediction
-from pneuopt.plotting.friction_map import friction_force, has_friction_map, plot_friction
-from pneuopt.plotting.fronts import plot_front
-from pneuopt.plotting.logs import plot_logs
-from pneuopt.plotting.loop_diagram import plot_loop
-from pneuopt.plotting.loops import Response, plot_steps
-from pneuopt.plotting.maps import plot_map
-from pneuopt.plotting.sensitivities import plot_sensitivity
-from pneuopt.plotting.svg import to_svg
-from pneuopt.plotting.texts import replace_unprintable
-from pneuopt.plotting.trackings import plot_tracking
+from pneuopt.plotting.canvas import (
+    BLUE,
+    GREY,
+    ORANGE,
+    RED,
+    axes_grid,
+    check_figure_path,
+    legend_above,
+    replace_unprintable,
+    save_figure,
+    to_svg,
+)
+from pneuopt.plotting.diagram import plot_loop
+from pneuopt.plotting.fits import (
+    friction_force,
+    has_friction_map,
+    plot_correlation,
+    plot_fit,
+    plot_friction,
+    plot_prediction,
+    plot_residuals,
+)
+from pneuopt.plotting.logs import plot_finding, plot_logs
+from pneuopt.plotting.loops import Response, plot_bode, plot_steps
+from pneuopt.plotting.plans import plot_experiment, plot_tracking
+from pneuopt.plotting.studies import plot_distribution, plot_front, plot_map, plot_sensitivity
 
 __all__ = [
     "BLUE",

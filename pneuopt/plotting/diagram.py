@@ -1,14 +1,25 @@
-"""`Sheet`: boxes, sums, arrows and labels of a block diagram, along a forward path."""
+"""`Sheet`: boxes, sums, arrows and labels of a block diagram, along a forward path.
+
+`plot_loop`: the block diagram of a closed loop, drawn from its parts.
+"""
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pneuopt.control.dither import Waveform
+from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.pid import AntiWindup, Form
+from pneuopt.control.sensor import Encoder
 from pneuopt.plotting.canvas import BLUE, GREY
 from pneuopt.quantities.parameters import Quantity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
 
 BLOCK_HEIGHT, CIRCLE_RADIUS, ARROW_LENGTH = 0.62, 0.12, 0.3  # [inch]; the arrow's where it has no label
 BLOCK_TEXT, SMALL_TEXT = 9.0, 8.0  # [points] inside a block, and beside an arrow or below a block
@@ -136,3 +147,205 @@ class Sheet:
 def signal_lines(signal: Quantity) -> list[str]:
     """A signal's name, and its unit where it has one."""
     return [signal.name] if signal.unit in ("", "1") else [signal.name, f"[{signal.unit}]"]
+
+
+LAWS = {
+    Form.PARALLEL: r"$K_p + \dfrac{K_i}{s} + \dfrac{K_d\,s}{T_f\,s + 1}$",
+    Form.STANDARD: r"$K_p\,\left(1 + \dfrac{1}{T_i\,s} + \dfrac{T_d\,s}{1 + s\,T_d/N}\right)$",
+    Form.SERIES: r"$K\,\left(1 + \dfrac{1}{T_i\,s}\right)\,\dfrac{T_d\,s + 1}{T_f\,s + 1}$",
+}
+SOURCE_HEIGHT, SENSOR_HEIGHT, WIRE_HEIGHT = 1.2, -1.45, -1.15  # [inch] of what is added, of the sensor, without one
+PID_WIDTH, SOURCE_WIDTH, SMALL_WIDTH, PLANT_WIDTH = 2.1, 1.5, 0.8, 1.7  # [inch] of blocks
+COMPENSATOR_WIDTH = 1.15  # [inch]
+OUTPUT_SPACING = 0.32  # [inch] between the outputs of a plant: closer, their labels overlap
+FRAME = 0.12  # [inch] between the controller and the frame around it
+BRANCH = 0.15  # [inch] from an arrow's begin to where it divides
+
+
+def plot_loop(loop: ClosedLoop) -> "Figure":
+    """Draw the block diagram of a loop: its parts, and its signals with their units; only what the loop has.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+
+    Returns
+    -------
+    Figure
+        As large as the diagram needs.
+
+    Raises
+    ------
+    InputError
+        If it is no `ClosedLoop`.
+    """
+    from matplotlib.figure import Figure
+
+    check_closed_loop(loop)
+    figure = Figure()
+    sheet = Sheet(figure.add_axes((0.0, 0.0, 1.0, 1.0)))
+    sheet.draw_arrow("reference", loop.feedback.unit, least=1.2 if loop.feedforward else 0.9)
+    begin, error = sheet.x, sheet.draw_sum("−")
+    sheet.draw_arrow("error", loop.feedback.unit)
+    _draw_position_loop(sheet, loop)
+    _draw_pid(sheet, loop)
+    _draw_feedforward(sheet, loop)
+    _draw_compensators(sheet, loop)
+    _draw_command(sheet, loop)
+    _draw_sampling(sheet, loop, begin)
+    sheet.draw_arrow("control", loop.command.unit, least=sheet.above + 0.15 - sheet.x)
+    outlet = _draw_plant(sheet, loop)
+    _draw_feedback(sheet, loop, outlet, error)
+    _list_states(sheet, loop)
+    sheet.fit(figure)
+    return figure
+
+
+def _draw_position_loop(sheet: Sheet, loop: ClosedLoop) -> None:
+    """The outer loop of a cascade; what the PID is fed back itself is said in words."""
+    if loop.outer is not None:
+        sheet.write_below(sheet.draw_block("$K_p$", SMALL_WIDTH), "position\nloop")
+        sheet.draw_arrow(f"{loop.pid_signal.name} wanted", loop.pid_signal.unit)
+        sheet.draw_sum(f"− {loop.pid_signal.name}")
+        sheet.draw_arrow()
+
+
+def _draw_pid(sheet: Sheet, loop: ClosedLoop) -> None:
+    notes = [f"PID, {loop.pid.form.value} form;", "P sees b r − y, D sees c r − y"]
+    notes += ["gains follow position and load"] if loop.schedule else []
+    notes += ["the integral has a dead band"] if loop.pid.dead_band else []
+    notes += ["the error's change of sign resets it"] if loop.pid.reset else []
+    notes += ["it is clamped at a limit"] if loop.pid.limits and loop.pid.anti_windup is AntiWindup.CLAMPING else []
+    sheet.write_below(sheet.draw_block(LAWS[loop.pid.form], PID_WIDTH), "\n".join(notes))
+
+
+def _draw_feedforward(sheet: Sheet, loop: ClosedLoop) -> None:
+    if loop.feedforward:
+        centre = sheet.draw_source("feedforward\n" + r"gain $\frac{time\;s}{time\;s + 1}$", SOURCE_WIDTH, SOURCE_HEIGHT)
+        sheet.draw_branch(BRANCH, 0.0)
+        sheet.draw_line([(BRANCH, 0.0), (BRANCH, SOURCE_HEIGHT), (centre - SOURCE_WIDTH / 2, SOURCE_HEIGHT)])
+
+
+def _draw_compensators(sheet: Sheet, loop: ClosedLoop) -> None:
+    """Each adds to the command that it gets."""
+    for part in loop.compensators:
+        sheet.draw_arrow()
+        centre = sheet.draw_block(fill(part.section.replace("_", " "), 14), COMPENSATOR_WIDTH)
+        sheet.write_below(centre, "adds to the\ncommand")
+
+
+def _draw_command(sheet: Sheet, loop: ClosedLoop) -> None:
+    """Dither and limits, as the controller adds and clips."""
+    if loop.dither and not _has_generator(loop):
+        _draw_dither(sheet, loop.dither.waveform, "dither: offset +")
+    elif loop.dither:
+        sheet.draw_source("dither: offset", SOURCE_WIDTH, SOURCE_HEIGHT)
+    _draw_limits(sheet, loop)
+
+
+def _draw_sampling(sheet: Sheet, loop: ClosedLoop, begin: float) -> None:
+    """What a sampled controller does to its command, the frame around it, and an analogue dither behind it."""
+    h = loop.pid.sample_time
+    if h is None:
+        return
+    if loop.pid.delay:
+        sheet.draw_arrow()
+        sheet.write_below(sheet.draw_block("$z^{-1}$", 0.6), "computing\ndelay")
+    sheet.draw_arrow()
+    centre = sheet.draw_block("", 0.6)
+    steps = [(-0.22, -0.16), (-0.08, -0.16), (-0.08, 0.04), (0.07, 0.04), (0.07, 0.16), (0.22, 0.16)]
+    sheet.draw_curve(centre, 0.0, steps)
+    sheet.write_below(centre, "hold")
+    top = sheet.high + 0.3
+    sheet.draw_frame(begin - FRAME, sheet.x + FRAME, -0.98, top, f"controller, every {1e3 * h:g} ms")
+    sheet.draw_line([(sheet.x, 0.0), (sheet.x + FRAME, 0.0)], head=False)
+    sheet.x += FRAME
+    sheet.above = sheet.x
+    if loop.dither and _has_generator(loop):
+        _draw_dither(sheet, loop.dither.waveform, "dither generator:")
+        _draw_limits(sheet, loop)
+
+
+def _draw_dither(sheet: Sheet, waveform: Waveform, title: str) -> None:
+    centre = sheet.draw_source(f"{title}\namplitude ·" + 9 * " ", SOURCE_WIDTH, SOURCE_HEIGHT)
+    phases = np.linspace(0, 3 * np.pi, 61)
+    sheet.draw_curve(
+        centre + 0.28, SOURCE_HEIGHT - 0.1, list(zip(0.035 * phases, 0.09 * waveform.at(phases), strict=True))
+    )
+
+
+def _draw_limits(sheet: Sheet, loop: ClosedLoop) -> None:
+    if loop.pid.limits:
+        sheet.draw_arrow(least=0.45)
+        centre = sheet.draw_block("", SMALL_WIDTH)
+        sheet.draw_curve(centre, 0.0, [(-0.28, -0.18), (-0.12, -0.18), (0.12, 0.18), (0.28, 0.18)])
+        sheet.write_below(centre, "limits lower,\nupper")
+
+
+def _draw_plant(sheet: Sheet, loop: ClosedLoop) -> float:
+    """The plant, its parts, its other inputs from above, its outputs to the right; returns where feedback branches."""
+    parts = dict.fromkeys(n.removeprefix("plant.").partition(".")[0] for n in loop.plant.parameters)
+    outputs = sorted(loop.plant.outputs, key=lambda q: q.name != _sensed_name(loop))
+    high = max(BLOCK_HEIGHT / 2, OUTPUT_SPACING * (len(outputs) - 1) + 0.2)
+    text = fill(f"plant: {', '.join(parts)}", 23, break_long_words=False)
+    centre = sheet.draw_block(text, PLANT_WIDTH, low=-BLOCK_HEIGHT / 2, high=high)
+    driven = loop.inputs[1 + len(loop.motion_inputs) :]
+    for k, signal in enumerate(driven):
+        x = centre + 0.7 * (k - (len(driven) - 1) / 2)
+        sheet.draw_line([(x, high + 0.45), (x, high)])
+        sheet.write(x, high + 0.48, "\n".join(signal_lines(signal)), va="bottom")
+    return _draw_outputs(sheet, outputs)
+
+
+def _draw_outputs(sheet: Sheet, outputs: list[Quantity]) -> float:
+    """Arrows out of the plant: the one that is fed back on the forward path, the others above it."""
+    labels = [" ".join(signal_lines(q)) for q in outputs]
+    length = LETTER_WIDTH * max(map(len, labels)) + 0.3
+    for k, label in enumerate(labels):
+        y = OUTPUT_SPACING * k
+        sheet.draw_line([(sheet.x, y), (sheet.x + length + 0.3 * (k == 0), y)])
+        sheet.write(sheet.x + 0.08, y + 0.03, label, ha="left", va="bottom")
+    return sheet.x + length
+
+
+def _draw_feedback(sheet: Sheet, loop: ClosedLoop, outlet: float, error: float) -> None:
+    """From the plant's output, through the sensor where there is one, to the sum."""
+    sheet.draw_branch(outlet, 0.0)
+    height = WIRE_HEIGHT if loop.sensor is None else SENSOR_HEIGHT
+    path = [(outlet, 0.0), (outlet, height), (error, height), (error, -CIRCLE_RADIUS)]
+    if loop.sensor is None:
+        sheet.draw_line(path)
+        return
+    width, place = 2.3, (error + outlet) / 2
+    text = r"sensor: $\dfrac{1}{lag\;s + 1}$"
+    if isinstance(loop.sensor, Encoder):
+        text = "encoder: counts" + ("" if loop.sensor.position == loop.feedback.name else ", difference, filter")
+    sheet.draw_line([*path[:2], (place + width / 2, SENSOR_HEIGHT)])
+    sheet.draw_box(place, SENSOR_HEIGHT, width, text)
+    sheet.draw_line([(place - width / 2, SENSOR_HEIGHT), *path[2:]])
+    shown = "sensor.count" if loop.outer and isinstance(loop.sensor, Encoder) else "sensor.reading"
+    for q in (q for q in loop.states if q.name == shown):
+        sheet.write(place - width / 2 - 0.1, SENSOR_HEIGHT + 0.04, " ".join(signal_lines(q)), ha="right", va="bottom")
+
+
+def _list_states(sheet: Sheet, loop: ClosedLoop) -> None:
+    """All states in small print below, and what else the controller gets."""
+    outputs = {q.name: q for q in loop.plant.outputs}
+    seen = [*loop.motion_inputs, *(outputs[n] for n in loop.readings)]
+    listed = {"States": loop.states, "The controller also gets": seen}
+    letters = max(40, int(sheet.right / LEGEND_LETTER_WIDTH))
+    lines = []
+    for title, own in ((title, own) for title, own in listed.items() if own):
+        signals = ", ".join(" ".join(signal_lines(q)).replace(" [", "\u00a0[") for q in own)
+        lines.append(fill(f"{title}: {signals}", letters, break_on_hyphens=False))
+    sheet.write(0.0, sheet.low - 0.12, "\n".join(lines), ha="left", va="top", color="0.35")
+
+
+def _has_generator(loop: ClosedLoop) -> bool:
+    """Whether the dither is added behind a sampled controller."""
+    return loop.dither is not None and loop.dither.analogue and loop.pid.sample_time is not None
+
+
+def _sensed_name(loop: ClosedLoop) -> str:
+    """The output that the feedback begins at."""
+    return loop.sensor.position if isinstance(loop.sensor, Encoder) else loop.feedback.name

@@ -1,29 +1,48 @@
-"""Fits and predictions beside their logs."""
+"""Fits and predictions beside their logs.
 
+Diagnosis of a fit: its residuals, their correlations and distribution; the correlation of its estimates.
+
+The friction that the logs imply over speed, with the fitted curve and its band.
+"""
+
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pneuopt.dynamics.hooks import Axis
+from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.identification.profiles import propagate_intervals
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
+from pneuopt.identification.statistics import correlation, ljung_box
+from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.experiment import Experiment, differentiate
 from pneuopt.plotting.canvas import (
     BLUE,
     GREY,
     MAX_PLOT_COLUMNS,
     MAX_PLOT_POINTS,
+    NORMAL_QUANTILE_95,
     ORANGE,
+    RED,
     axes_grid,
     common_channels,
     finish_columns,
+    legend_above,
+    note_omissions,
     plot_unit,
 )
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
 
 Pairs = Sequence[tuple[Trajectory, Trajectory]]
 
@@ -100,3 +119,368 @@ def _draw_comparison(
     top.set_ylabel(f"{channel} [{unit}]")
     bottom.set_ylabel(f"measured\n- {label} [{unit}]", fontsize=8)
     bottom.axhline(0, color=GREY, lw=0.8)
+
+
+MAX_CORRELATION_LAG = 40
+"""Largest lag of a correlation [samples]: more crowd the axis, fewer hide slow dynamics."""
+MAX_PLOT_CHANNELS = 4
+"""Channels below each other: more cannot be read, fewer leave channels out."""
+MAX_NUMBERED_PARAMETERS = 12
+"""Parameters up to which each cell has room for its number; with more, numbers overlap."""
+
+
+def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> "Figure":
+    """Residuals of each channel: over time, against themselves, against the inputs, and their distribution.
+
+    Parameters
+    ----------
+    runs : sequence of Trajectory
+        Fitted or predicted, one an experiment.
+    experiments : sequence of Experiment
+        Correlations are taken within each, then averaged; the band is what 95 % of white residuals stay in.
+
+    Returns
+    -------
+    Figure
+    """
+    require(len(runs) == len(experiments) > 0, f"{len(runs)} runs do not match {len(experiments)} experiments")
+    pairs = list(zip(runs, experiments, strict=True))
+    channels = common_channels(runs, experiments)
+    require(bool(channels), "the runs and the logs have no channel in common")
+    shown = channels[:MAX_PLOT_CHANNELS]
+    figure, grid = axes_grid(len(shown), 4, [2.4] * len(shown), width=13.0)
+    for (over_time, own, crossed, spread), channel in zip(grid, shown, strict=True):
+        _draw_over_time(over_time, pairs, channel)
+        _draw_autocorrelation(own, pairs, channel)
+        _draw_crosscorrelation(crossed, pairs, channel)
+        _draw_distribution(spread, pairs, channel)
+    for axes, title in zip(
+        grid[0], ("residuals", "autocorrelation", "correlation with inputs", "distribution"), strict=True
+    ):
+        axes.set_title(title, fontsize=10)
+    for axes, label in zip(grid[-1], ("time [s]", "lag [samples]", "lag [samples]"), strict=False):
+        axes.set_xlabel(label)
+    note_omissions(figure, len(shown), len(channels), "channels")
+    return figure
+
+
+def plot_correlation(result: IdentificationResult) -> "Figure":
+    """The correlation of the estimates: a cell a pair, 1 or -1 where only a combination of both is identifiable.
+
+    Parameters
+    ----------
+    result : IdentificationResult
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        If no estimate has a standard deviation.
+    """
+    covariance = result.covariance
+    known = np.isfinite(np.diag(covariance.to_numpy()))
+    require(bool(known.any()), "no estimate has a standard deviation, so that there is no correlation to draw")
+    names = [str(n) for n in covariance.index[known]]
+    values, count = correlation(covariance.to_numpy()[np.ix_(known, known)]), len(names)
+    side = max(3.2, min(8.0, 0.62 * count))
+    figure, ((axes,),) = axes_grid(1, 1, [side], width=side + 3.0)
+    image = axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
+    figure.colorbar(image, ax=axes, pad=0.02, shrink=0.9)
+    axes.grid(False)
+    axes.set_xticks(range(count), names, rotation=40, ha="right", fontsize=8)
+    axes.set_yticks(range(count), names, fontsize=8)
+    if count <= MAX_NUMBERED_PARAMETERS:
+        for (row, column), value in np.ndenumerate(values):
+            colour = "white" if abs(value) > 0.6 else "black"
+            axes.text(column, row, _format_correlation(value), ha="center", va="center", fontsize=8, color=colour)
+    axes.set_title("correlation of the estimates", fontsize=10)
+    note_omissions(figure, count, len(covariance), "estimates have a standard deviation")
+    return figure
+
+
+def _format_correlation(value: float) -> str:
+    """Two digits, but never a 1.00 that is none."""
+    return f"{value:.2f}" if abs(value) < 0.995 or abs(value) > 1 - 1e-9 else f"{math.trunc(1e4 * value) / 1e4:.4f}"
+
+
+def _channel_residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> list[tuple[Trajectory, Array]]:
+    return [
+        (e.trajectory, e.trajectory[channel] - run[channel])
+        for run, e in pairs
+        if channel in e.trajectory and channel in run
+    ]
+
+
+def _draw_over_time(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    factor, unit = plot_unit([e for _, e in pairs], channel)
+    found = _channel_residuals(pairs, channel)
+    every = max(1, sum(len(log) for log, _ in found) // MAX_PLOT_POINTS)
+    for number, (log, e) in enumerate(found):
+        colour = (BLUE, ORANGE)[number % 2] if len(found) <= 4 else BLUE
+        axes.plot(log.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
+    axes.axhline(0, color=GREY, lw=0.8)
+    axes.set_ylabel(f"{channel} [{unit}]")
+
+
+def _draw_autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    found = [e for _, e in _channel_residuals(pairs, channel)]
+    rho = _mean_correlogram([_correlogram(e, e) for e in found])
+    axes.vlines(range(1, len(rho)), 0, rho[1:], color=BLUE, lw=1.4)
+    _draw_band(axes, found)
+    p = [ljung_box(e)[1] for e in found]
+    known = [q for q in p if math.isfinite(q)]
+    message = (
+        f"Ljung-Box p {_format_probability(min(known))}" + (f" (least of {len(known)})" if len(known) > 1 else "")
+        if known
+        else ""
+    )
+    axes.text(0.98, 0.03, message, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
+    _set_symmetric_limits(axes, rho[1:])
+
+
+def _draw_crosscorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    found = _channel_residuals(pairs, channel)
+    outputs = {n for run, _ in pairs for n in run}
+    logged = dict.fromkeys([*CHANNELS, *(n for log, _ in found for n in log)])
+    inputs = [n for n in logged if n not in outputs and any(n in log for log, _ in found)]
+    every = []
+    for name, colour in zip(inputs, (BLUE, ORANGE, RED), strict=False):
+        rho = _mean_correlogram([_correlogram(e, log[name]) for log, e in found if name in log])
+        axes.plot(range(len(rho)), rho, color=colour, lw=1.2, label=name)
+        every.append(rho)
+    _draw_band(axes, [e for _, e in found])
+    if inputs:
+        axes.legend(fontsize=8, frameon=False, loc="upper right")
+        _set_symmetric_limits(axes, np.concatenate(every))
+
+
+def _draw_distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    """Residuals over their noise, beside the normal distribution that they should have."""
+    scaled = np.concatenate(
+        [
+            (e.trajectory[channel] - run[channel]) / e.noise.get(channel, math.nan)
+            for run, e in pairs
+            if channel in e.trajectory and channel in run
+        ]
+    )
+    label = "residual / noise"
+    if not np.isfinite(scaled).any():  # no noise is declared: the residuals' own deviation
+        scaled = np.concatenate([e for _, e in _channel_residuals(pairs, channel)])
+        scaled, label = scaled / np.nanstd(scaled), "residual / its deviation"
+    scaled = scaled[np.isfinite(scaled)]
+    edge = max(4.0, float(np.quantile(np.abs(scaled), 0.999)))
+    axes.hist(np.clip(scaled, -edge, edge), bins=60, range=(-edge, edge), density=True, color=BLUE, alpha=0.5)
+    x = np.linspace(-edge, edge, 200)
+    axes.plot(x, np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi), color=ORANGE, lw=1.2)
+    axes.set_yticks([])
+    axes.set_xlabel(label)
+
+
+def _correlogram(e: Array, other: Array) -> Array:
+    """Correlation of residuals with another column 0 to `MAX_CORRELATION_LAG` samples before; NaN if constant."""
+    known = np.isfinite(e) & np.isfinite(other)
+    a, b = (np.where(known, v - np.mean(v[known]), 0.0) if known.any() else np.zeros(len(v)) for v in (e, other))
+    size = math.sqrt(float(a @ a) * float(b @ b))
+    lags = min(MAX_CORRELATION_LAG, len(e) - 2) + 1
+    return np.array([a[k:] @ b[: len(b) - k] for k in range(lags)]) / size if size > 0 else np.full(lags, np.nan)
+
+
+def _mean_correlogram(rows: Sequence[Array]) -> Array:
+    n = min(len(row) for row in rows)
+    finite = [row[:n] for row in rows if np.isfinite(row[:n]).all()]
+    return np.mean(finite, axis=0) if finite else np.zeros(n)
+
+
+def _draw_band(axes: "Axes", residuals: Sequence[Array]) -> None:
+    width = NORMAL_QUANTILE_95 / math.sqrt(sum(int(np.isfinite(e).sum()) for e in residuals))
+    axes.axhspan(-width, width, color=GREY, alpha=0.25, lw=0)
+    axes.axhline(0, color=GREY, lw=0.8)
+
+
+def _set_symmetric_limits(axes: "Axes", rho: Array) -> None:
+    edge = min(1.05, max(0.2, 1.3 * float(np.max(np.abs(rho), initial=0.0))))
+    axes.set_ylim(-edge, edge)
+
+
+def _format_probability(p: float) -> str:
+    return f"{p:.2g}" if p >= 1e-4 else "< 1e-4"
+
+
+SLOPE_SAMPLES = 20  # of a local derivative
+
+
+def plot_friction(system: System, result: IdentificationResult, experiments: Sequence[Experiment]) -> "Figure":
+    """The friction force that the logs imply against speed, with the fitted curve and its 95 % band on top.
+
+    For a `MotionDrive` the force as measured, offset and pressure and all. For a drive with a mass what pushes it (the
+    logged force or pressures, less the load) less mass times acceleration. The acceleration is the fitted run's and
+    the local slope of what the log deviates from it: so the points of a perfect fit lie on its friction at any speed,
+    where a slope of the log itself would round off fast motion, and a misfit slower than the slope's window is seen
+    whole. Where the motion reverses there are none, for a slope taken across the jump is none. The curve is that of
+    steady motion, at the median of the pressures, and of the size of a logged force, for laws that depend on them.
+
+    Parameters
+    ----------
+    system : System
+    result : Fitted
+    experiments : sequence of Experiment
+        Those that it was made from, in the same order.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        If the system is neither (`has_friction_map`).
+    """
+    require(has_friction_map(system), "a friction map is drawn for a drive with a mass, or for a MotionDrive")
+    imposed, axis = not system.states, system.axis or Axis()
+    figure, ((axes,),) = axes_grid(1, 1, [4.2], width=7.0)
+    clouds = [
+        _rig_points(e) if imposed else _drive_points(system, result, e, name)
+        for name, e in zip(result.trajectories, experiments, strict=True)
+    ]
+    speed, force = (np.concatenate(part) for part in zip(*clouds, strict=True))
+    every = max(1, len(speed) // MAX_PLOT_POINTS)
+    axes.plot(speed[::every], force[::every], ".", color=GREY, ms=2.5, alpha=0.6, label="from the logs")
+    if imposed:
+        fitted = np.concatenate([run["force"] for run in result.trajectories.values()])
+        axes.plot(speed[::every], fitted[::every], ".", color=BLUE, ms=2.5, label="fitted")
+    else:
+        _draw_curve(axes, system, result, experiments, _speed_grid(speed))
+    low, high = np.nanpercentile(force, [0.5, 99.5])
+    axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+    speed_unit = next(q.unit for q in (*system.states, *system.inputs) if q.name == axis.speed)
+    pushes = "force" if axis.force == "N" else "torque"
+    axes.set(
+        xlabel=f"speed [{speed_unit}]",
+        ylabel=f"{pushes} [{axis.force}]" if imposed else f"friction {pushes} [{axis.force}]",
+    )
+    legend_above(figure, axes)
+    return figure
+
+
+def has_friction_map(system: System) -> bool:
+    """Whether `plot_friction` can draw it: speed in and force out, or a mass that moves."""
+    imposed = not system.states and "speed" in names(system.inputs) and names(system.outputs) == ("force",)
+    return imposed or system.axis is not None
+
+
+def friction_force(system: System, run: Trajectory, parameters: ParameterSet) -> Array:
+    """The friction force on the load along a simulated run, shape (n,) [N].
+
+    Parameters
+    ----------
+    system : System
+        With a friction map, and a mass.
+    run : Trajectory
+        Its states and inputs.
+    parameters : ParameterSet
+    """
+    seen, axis = {n: run[n] for n in names(system.states)}, _moving_axis(system)
+    idle = {n: np.zeros(len(run)) for n in seen if n == axis.speed or n.startswith("friction.")}
+    inputs = {n: run[n] for n in names(system.inputs)}
+    moves, free = (_state_rates(system, parameters, x, inputs)[axis.speed] for x in (seen, {**seen, **idle}))
+    return np.asarray(parameters.value(axis.inertia) * (free - moves))
+
+
+def _moving_axis(system: System) -> Axis:
+    assert system.axis is not None, "has_friction_map comes first"
+    return system.axis
+
+
+def _rig_points(experiment: Experiment) -> tuple[Array, Array]:
+    return experiment.trajectory["speed"], experiment.trajectory["force"]
+
+
+def _drive_points(
+    system: System, result: IdentificationResult, experiment: Experiment, name: str
+) -> tuple[Array, Array]:
+    """Speed, and what pushes the mass without accelerating it."""
+    log, run, axis = experiment.trajectory, result.trajectories[name], _moving_axis(system)
+    found = {str(n): float(v) for n, v in result.estimates["value"].items()}
+    own = {n.partition("[")[0]: v for n, v in found.items() if n.endswith(f"[{name}]")}
+    known = {n: v for n, v in experiment.conditions.items() if n in result.parameters}
+    parameters = result.parameters.with_values({**own, **known})
+    deviation = {n: log[n] - run[n] for n in (axis.speed, axis.position) if n in log}
+    if axis.speed not in deviation:
+        deviation[axis.speed] = _smooth_derivative(log.t, deviation[axis.position])
+    speed = run[axis.speed] + deviation[axis.speed]
+    states, inputs = names(system.states), {q: log[q] for q in names(system.inputs)}
+    seen = {n: log[n] if n in log else run[n] for n in states}
+    idle = {n: np.zeros(len(log)) for n in seen if n == axis.speed or n.startswith("friction.")}
+    pushed, moves = (
+        _state_rates(system, parameters, x, inputs)[axis.speed] for x in ({**seen, **idle}, {n: run[n] for n in states})
+    )
+    force = parameters.value(axis.inertia) * (pushed - moves - _smooth_derivative(log.t, deviation[axis.speed]))
+    reverses = np.convolve(np.abs(np.diff(np.sign(speed), prepend=np.nan)) > 0, np.ones(2 * SLOPE_SAMPLES), "same")
+    return speed, np.where(reverses > 0, np.nan, force)
+
+
+def _draw_curve(
+    axes: "Axes", system: System, result: IdentificationResult, experiments: Sequence[Experiment], grid: Array
+) -> None:
+    """The fitted curve, and how far the estimates' covariance lets it move; no band where it does not say."""
+    shared = [n for n in result.covariance.index if n in result.parameters]
+    usual = {
+        n: float(np.median(np.concatenate([run[n] for run in result.trajectories.values()])))
+        for n in names(system.states)
+    }
+    logs = [e.trajectory for e in experiments]
+    usual |= {n: float(np.nanmedian(np.abs(np.concatenate([q[n] for q in logs])))) for n in names(system.inputs)}
+
+    def friction(values: Mapping[str, float]) -> Array:
+        moved = {n: replace(result.parameters[n], value=values[n], lower=-math.inf, upper=math.inf) for n in shared}
+        return _steady_friction(system, result.parameters | ParameterSet(moved), usual, grid)
+
+    force, intervals = propagate_intervals(result, friction)
+    if np.isfinite(intervals).all():
+        axes.fill_between(grid, *intervals.T, color=BLUE, alpha=0.3, lw=0, label="95 % band")
+    axes.plot(grid, force, color=BLUE, lw=1.2, label="fitted")
+
+
+def _steady_friction(system: System, parameters: ParameterSet, usual: Mapping[str, float], speeds: Array) -> Array:
+    """The friction force at a steady speed, with the bristles at their deflection for that speed.
+
+    A bristle's rate is linear in its deflection: two points tell where it is zero.
+    """
+    axis, usual_columns = _moving_axis(system), {n: np.full(len(speeds), value) for n, value in usual.items()}
+    inputs = {n: usual_columns[n] for n in names(system.inputs)}
+    still = {n: usual_columns[n] for n in names(system.states)} | {axis.speed: np.zeros(len(speeds))}
+    bristles = {s.name: s.nominal for s in system.states if s.name.startswith("friction.")}
+    still |= {n: np.zeros(len(speeds)) for n in bristles}
+    moving, bent = {**still, axis.speed: speeds}, {n: np.full(len(speeds), size) for n, size in bristles.items()}
+    straight = _state_rates(system, parameters, moving, inputs)
+    other = _state_rates(system, parameters, {**moving, **bent}, inputs)
+    ends = {n: size * straight[n] / (straight[n] - other[n]) for n, size in bristles.items()}
+    rest, steady = (_state_rates(system, parameters, x, inputs)[axis.speed] for x in (still, {**moving, **ends}))
+    return np.asarray(parameters.value(axis.inertia) * (rest - steady))
+
+
+def _state_rates(
+    system: System, parameters: ParameterSet, x: Mapping[str, Array], u: Mapping[str, Array]
+) -> dict[str, Array]:
+    """The states' rates at many points at once."""
+    count = len(next(iter(x.values())))
+    given = [np.array([part[q.name] for q in group]) for part, group in ((x, system.states), (u, system.inputs))]
+    p = np.tile(parameter_vector(system.parameters, parameters)[:, None], (1, count))
+    found = system.ode.map(count)(np.zeros((1, count)), *given, p)[0].full()
+    return dict(zip(names(system.states), np.asarray(found), strict=True))
+
+
+def _smooth_derivative(t: Array, y: Array) -> Array:
+    window = SLOPE_SAMPLES * float(np.median(np.diff(t)))
+    return differentiate(Experiment(Trajectory(t, {"position": y})), window=window).trajectory["speed"]
+
+
+def _speed_grid(speed: Array) -> Array:
+    """A grid over the range, dense around zero."""
+    low, high = float(np.nanmin(speed)), float(np.nanmax(speed))
+    near = np.geomspace(1e-4, 1.0, 120) * max(-low, high)
+    grid = np.unique(np.concatenate([np.linspace(low, high, 200), near, -near]))
+    return np.asarray(grid[(grid >= low) & (grid <= high) & (grid != 0)])

@@ -1,25 +1,35 @@
-"""Logs as they were read: each channel over time."""
+"""Logs as they were read: each channel over time.
 
+A finding of the log doctor: the signals that contradict each other.
+"""
+
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pneuopt.logs.columns import CHANNELS
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.doctor import Evidence, LogFinding, Panel
+from pneuopt.logs.experiment import Experiment
 from pneuopt.plotting.canvas import (
     BLUE,
     GREY,
     MAX_PLOT_COLUMNS,
     MAX_PLOT_POINTS,
+    ORANGE,
+    PLOT_UNITS,
+    RED,
     axes_grid,
     axis_label,
     note_omissions,
     plot_unit,
 )
 from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import InputError
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -73,3 +83,83 @@ def _envelope(t: Array, y: Array) -> tuple[Array, Array]:
     low, high = filled.argmin(axis=1), np.where(np.isnan(blocks), -np.inf, blocks).argmax(axis=1)
     at = np.sort(np.concatenate([low, high]) + np.tile(np.arange(0, whole, stretch), 2))
     return t[at], y[at]
+
+
+COLOURS = (BLUE, ORANGE, GREY, RED)
+MAX_ZOOM_SHARE = 0.6
+"""Share of a log [1] from which it is drawn once, not whole and enlarged; lower, one event fills both columns."""
+TITLE_WIDTH = 118
+"""Letters of a line of the title: more are cut off at 10 inches, fewer take a line more."""
+LABEL_WIDTH = 24
+"""Letters of a line of a label beside an axis: more run into the next panel's, fewer make three lines."""
+
+
+def plot_finding(finding: LogFinding) -> "Figure":
+    """The signals that show a finding, shaded where they contradict each other, in the whole log and enlarged.
+
+    Parameters
+    ----------
+    finding : LogFinding
+        From `examine_logs`, or the `finding` of a `LogError`.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        If the finding has no evidence.
+    """
+    shown = finding.evidence
+    if shown is None:
+        raise InputError(f"the finding {finding.check!r} has no signals to be drawn")
+    whole = float(shown.t[0]), float(shown.t[-1])
+    views = {"whole log": whole}
+    if shown.view[1] - shown.view[0] < MAX_ZOOM_SHARE * (whole[1] - whole[0]):
+        views["enlarged"] = shown.view
+    figure, grid = axes_grid(len(shown.panels), len(views), [2.1] * len(shown.panels), sharex="col")
+    for column, (label, view) in enumerate(views.items()):
+        for number, panel in enumerate(shown.panels):
+            axes = grid[number][column]
+            _draw_panel(axes, shown, panel, view, COLOURS[number:])
+            if column == 0:
+                axes.set_ylabel(_panel_label(panel), fontsize=9)
+        grid[0][column].set_title(label, fontsize=9, color=GREY)
+        grid[-1][column].set_xlabel("time [s]")
+    title = f"{finding.log}: {finding.message}" if finding.log else finding.message
+    figure.suptitle("\n".join(textwrap.wrap(title, TITLE_WIDTH)), fontsize=9, ha="left", x=0.01)
+    _add_legend(figure, [row[0] for row in grid], shown)
+    return figure
+
+
+def _draw_panel(axes: "Axes", shown: Evidence, panel: Panel, view: tuple[float, float], colours: Sequence[str]) -> None:
+    """The curves of a panel within a view, and where they contradict others."""
+    factor, _ = PLOT_UNITS.get(panel.unit, (1.0, ""))
+    inside = np.flatnonzero((shown.t >= view[0]) & (shown.t <= view[1]))
+    part = inside[:: max(1, inside.size // MAX_PLOT_POINTS)]
+    for colour, (name, curve) in zip(colours, panel.curves.items(), strict=False):
+        axes.plot(shown.t[part], factor * curve[part], color=colour, lw=1.1, label=name)
+    axes.set_xlim(*view)
+    if not shown.contradiction.all():
+        between = axes.get_xaxis_transform()
+        axes.fill_between(shown.t, 0, 1, where=shown.contradiction, transform=between, color=RED, alpha=0.15, lw=0)
+
+
+def _panel_label(panel: Panel) -> str:
+    """The name of a panel's only curve, or nothing, and the unit that is drawn."""
+    unit = PLOT_UNITS.get(panel.unit, (1.0, panel.unit))[1]
+    name = next(iter(panel.curves)) if len(panel.curves) == 1 else ""
+    return axis_label("\n".join(textwrap.wrap(name, LABEL_WIDTH)), unit).strip()
+
+
+def _add_legend(figure: "Figure", panels: Sequence["Axes"], shown: Evidence) -> None:
+    """Names of the curves of panels that have several, and what is shaded, below all axes."""
+    from matplotlib.patches import Patch
+
+    several = [axes for axes, panel in zip(panels, shown.panels, strict=True) if len(panel.curves) > 1]
+    handles: list[Artist] = [line for axes in several for line in axes.get_legend_handles_labels()[0]]
+    if not shown.contradiction.all():
+        handles.append(Patch(color=RED, alpha=0.15, label=shown.label))
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)

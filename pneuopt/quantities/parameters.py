@@ -1,15 +1,25 @@
-"""Signals (`Quantity`) and numbers (`Parameter`, `ParameterSet`): immutable, named, in SI units, edited by copy."""
+"""Signals (`Quantity`) and numbers (`Parameter`, `ParameterSet`): immutable, named, in SI units, edited by copy.
+
+`Intersample`: how a signal runs between two samples of a log, held or linearly, and which of both is usual.
+
+Arguments of the verbs: one thing as well as several, and an error that says which argument came as what.
+"""
 
 import fnmatch
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeVar
+from enum import Enum
+from math import inf
+from numbers import Integral, Real
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pneuopt.quantities.errors import InputError, UnknownNameError, check_names, require
 
 if TYPE_CHECKING:
     import pandas as pd
+
 
 T = TypeVar("T")
 
@@ -225,3 +235,107 @@ def without_prefix(values: Mapping[str, T], prefix: str) -> dict[str, T]:
 def with_prefix(values: Mapping[str, T], prefix: str) -> dict[str, T]:
     """The entries under the name ``prefix.name``."""
     return {f"{prefix}.{n}": v for n, v in values.items()}
+
+
+# What sensors show: a signal in one of these units varies between samples. With a command's unit here, its steps are
+# smeared over a sample; without a sensor's, it comes half a sample late.
+MEASURED_UNITS = frozenset(["N", "N*m", "Pa", "Pa(a)", "Pa(g)", "m", "m/s", "m/s^2", "rad", "rad/s", "rad/s^2", "K"])
+COMMAND_SUFFIX = "_reference"  # of the name of a set-point, which a controller holds whatever its unit
+
+
+class Intersample(Enum):
+    """How a signal runs between two samples."""
+
+    HELD = "held"
+    LINEAR = "linear"
+
+
+def usual_intersample(name: str, unit: str) -> Intersample:
+    """How a signal of this name and SI unit usually runs between two samples.
+
+    A measured force, torque, pressure, motion or temperature is linear, and so is what has no unit; a set-point, and a
+    command in any other unit, is held by the controller that gives it.
+
+    Examples
+    --------
+    >>> usual_intersample("force", "N"), usual_intersample("valve_voltage", "V")
+    (<Intersample.LINEAR: 'linear'>, <Intersample.HELD: 'held'>)
+    """
+    measured = (not unit or unit in MEASURED_UNITS) and not name.endswith(COMMAND_SUFFIX)
+    return Intersample.LINEAR if measured else Intersample.HELD
+
+
+def as_tuple(argument: str, given: T | Iterable[T], kind: type[T], meant: str) -> tuple[T, ...]:
+    """Make a tuple of one or several.
+
+    Parameters
+    ----------
+    argument : str
+        Its name, for the message.
+    given : object of `kind`, or an iterable of them
+    meant : str
+        What the argument takes, for the message.
+
+    Raises
+    ------
+    InputError
+        If something else came.
+
+    Examples
+    --------
+    >>> as_tuple("sizes", 2.0, float, "a float or several"), as_tuple("sizes", [1.0, 2.0], float, "a float or several")
+    ((2.0,), (1.0, 2.0))
+    """
+    if isinstance(given, kind):
+        return (given,)
+    if isinstance(given, str | PurePath) or not isinstance(given, Iterable):
+        raise wrong_argument(argument, given, meant)
+    several = tuple(given)
+    for one in several:
+        if not isinstance(one, kind):
+            raise wrong_argument(argument, one if isinstance(given, list | tuple) else given, meant)
+    return several
+
+
+def check_argument(argument: str, given: object, kind: type | tuple[type, ...], meant: str) -> None:
+    """Raise `InputError` where an argument is not of its kind, so that swapped ones are named."""
+    if not isinstance(given, kind):
+        raise wrong_argument(argument, given, meant)
+
+
+def check_number(
+    argument: str, given: object, meant: str, *, least: float = -inf, most: float = inf, whole: bool = False
+) -> None:
+    """Raise `InputError` where an argument is no number from `least` to `most`, NaN among them, or not whole.
+
+    Examples
+    --------
+    >>> check_number("members", 40, "a whole number of at least 5", least=5, whole=True)
+    >>> check_number("members", 4, "a whole number of at least 5", least=5, whole=True)
+    Traceback (most recent call last):
+    ...
+    pneuopt.quantities.errors.InputError: members takes a whole number of at least 5; got 4
+    """
+    if not isinstance(given, Integral if whole else Real) or isinstance(given, bool):
+        is_number = isinstance(given, Real) and not isinstance(given, bool)
+        raise (
+            InputError(f"{argument} takes {meant}; got {given}")
+            if is_number
+            else wrong_argument(argument, given, meant)
+        )
+    if not least <= float(given) <= most:
+        raise InputError(f"{argument} takes {meant}; got {given}")
+
+
+def check_parameters(given: object) -> None:
+    """Raise `InputError` where `parameters` is no `ParameterSet`."""
+    meant = "a ParameterSet, such as read_drive, a fit's .parameters or a loop's .parameters give"
+    check_argument("parameters", given, ParameterSet, meant)
+
+
+def wrong_argument(argument: str, given: Any, meant: str) -> InputError:
+    """The error that names the argument, what it takes, and what came."""
+    kind = given.__name__ if isinstance(given, type) else type(given).__name__
+    came = f"the class {kind}" if isinstance(given, type) else f"an object of type {kind}"
+    came = f"{str(given)!r} ({kind})" if isinstance(given, str | PurePath) else came
+    return InputError(f"{argument} takes {meant}; got {came}")

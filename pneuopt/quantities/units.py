@@ -2,6 +2,10 @@
 
 Units are read exactly (rational arithmetic), so "20 um" is the float 2e-05 and not its neighbour. A frequency in Hz, an
 angular frequency in rad/s and a rate in 1/s are three dimensions: nothing is converted by 2 pi behind one's back.
+
+The units that are known: a short list of our own loads fast, and keeps surprises out, "pt" as a pint, say.
+
+Products and quotients of unit texts: what a gain from volts to metres a second is measured in.
 """
 
 import difflib
@@ -16,7 +20,6 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from pneuopt.quantities.errors import UnitError, require
-from pneuopt.quantities.vocabulary import COMMON_UNITS, UNIT_DEFINITIONS
 
 ATMOSPHERE = 101325.0
 """Standard atmosphere [Pa] (ISO 2533), which gauge pressures count from unless `count_gauge_from` says otherwise."""
@@ -338,3 +341,106 @@ def _suggest_unit(unit_text: str) -> str:
 
 def _place_prefix(where: str) -> str:
     return f"{where}: " if where else ""
+
+
+UNIT_DEFINITIONS = """
+nano- = 1e-9 = n-
+micro- = 1e-6 = µ- = μ- = u-
+milli- = 1e-3 = m-
+centi- = 1e-2 = c-
+deci- = 1e-1 = d-
+hecto- = 1e2 = h-
+kilo- = 1e3 = k-
+mega- = 1e6 = M-
+giga- = 1e9 = G-
+meter = [length] = m = metre
+kilogram = [mass] = kg
+second = [time] = s = sec
+ampere = [current] = A = amp
+kelvin = [temperature] = K
+radian = [angle] = rad
+cycle = [cycle]
+percent = 0.01 = %
+permille = 0.001 = ‰
+ppm = 1e-6
+count = 1 = cnt
+gram = 1e-3 kilogram = g
+tonne = 1000 kilogram = t
+pound = 0.45359237 kilogram = lb
+minute = 60 second = min
+hour = 3600 second = h
+day = 86400 second = d
+inch = 0.0254 meter = in
+foot = 0.3048 meter = ft
+degree_Celsius = kelvin; offset: 273.15 = °C = degC = celsius
+degree = 0.017453292519943295769 radian = deg = °
+revolution = 6.283185307179586477 radian = rev
+rpm = revolution / minute
+hertz = cycle / second = Hz
+newton = kilogram * meter / second ** 2 = N
+kilogram_force = 9.80665 newton = kgf = kp
+pound_force = 4.4482216152605 newton = lbf
+pascal = newton / meter ** 2 = Pa
+bar = 1e5 pascal
+psi = 6894.757293168361 pascal
+standard_atmosphere = 101325 pascal = atm
+joule = newton * meter = J
+watt = joule / second = W
+volt = watt / ampere = V
+coulomb = ampere * second = C
+ohm = volt / ampere = Ω
+liter = 1e-3 meter ** 3 = l = L = litre
+newton_meter = newton * meter = Nm
+newton_second = newton * second = Ns
+volt_second = volt * second = Vs
+"""
+"""pint's definitions."""
+
+COMMON_UNITS = """
+m mm um cm km in s ms us min h day kg g t N kN Nm V mV A mA K degC Hz kHz rad deg rad/s rpm m/s mm/s m/s^2 m^2 m^3 mm^2
+cm^2 cm^3 l N*s/m V*s/m 1/s m^3/(s*Pa) % count kg*m^2 N*m rev N*m*s/rad newton volt meter Pa kPa MPa bar mbar psi
+Pa(a) Pa(g) kPa(a) kPa(g) MPa(a) MPa(g) bar(a) bar(g) mbar(a) mbar(g) psi(a) psi(g)
+"""
+"""The units that a message may suggest."""
+
+
+def unit_ratio(numerator: str, denominator: str) -> str:
+    """Divide two unit texts and simplify; a level such as "Pa(a)" counts as a difference.
+
+    Examples
+    --------
+    >>> unit_ratio("V", "m/s"), unit_ratio("V", "m/s*s"), unit_ratio("1", "Pa(g)")
+    ('V*s/m', 'V/m', '1/Pa')
+    """
+    powers = _unit_powers(difference_unit(numerator))
+    for name, power in _unit_powers(difference_unit(denominator)).items():
+        powers[name] = powers.get(name, 0) - power
+    above = [_unit_factor(n, k) for n, k in powers.items() if k > 0]
+    below = [_unit_factor(n, -k) for n, k in powers.items() if k < 0]
+    divisor = "*".join(below) if len(below) < 2 else f"({'*'.join(below)})"
+    return ("*".join(above) or "1") + (f"/{divisor}" if below else "")
+
+
+def difference_unit(unit: str) -> str:
+    """The unit of a difference: a pressure level loses its mark, "Pa(g)" becomes "Pa"."""
+    return re.sub(r"\([ag]\)", "", unit)
+
+
+def _unit_factor(name: str, power: int) -> str:
+    return name if power == 1 else f"{name}^{power}"
+
+
+def _unit_powers(unit: str) -> dict[str, int]:
+    powers: dict[str, int] = {}
+    rest = "*" + unit.replace(" ", "")
+    while rest:
+        match = re.match(r"([*/])(?:\(([^()]*)\)|([^\W\d_]+|%|1)(?:\^(-?\d+))?)", rest)
+        if match is None:
+            raise UnitError(f"cannot read the unit {unit!r}; write it like 'V*s/m' or 'm^3/(s*Pa)'")
+        sign = 1 if match[1] == "*" else -1
+        factors = _unit_powers(match[2]) if match[2] else {match[3]: int(match[4] or 1)}
+        for name, power in factors.items():
+            if name != "1":
+                powers[name] = powers.get(name, 0) + sign * power
+        rest = rest[match.end() :]
+    return powers

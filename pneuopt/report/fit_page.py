@@ -9,10 +9,9 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import HasSystem, as_runnable
 from pneuopt.dynamics.system import System
 from pneuopt.identification.identify import predict, validate
-from pneuopt.identification.marks import Mark
-from pneuopt.identification.result import IdentificationResult, join_names, report_agreement, report_estimates
-from pneuopt.logs.checks.findings import LogFinding
-from pneuopt.logs.experiments import Experiment
+from pneuopt.identification.result import IdentificationResult, Mark, join_names, report_agreement, report_estimates
+from pneuopt.logs.doctor import LogFinding
+from pneuopt.logs.experiment import Experiment
 from pneuopt.plotting import (
     has_friction_map,
     plot_correlation,
@@ -27,8 +26,7 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, number_columns,
 from pneuopt.quantities.status import report_status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
-from pneuopt.report.data import data_section, provenance_section
-from pneuopt.report.page import Page, Picture, Section
+from pneuopt.report.page import Page, Picture, Section, data_section, provenance_section
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,20 +1,55 @@
-"""`Page`: what a page holds, and how it becomes HTML. The template beside this file says how it looks."""
+"""`Page`: what a page holds, and how it becomes HTML. The template beside this file says how it looks.
+
+What pages say of their data: the logs with their channels, the hashes of what was read, the versions.
+
+`report_forms`: a controller's gains in every form that controllers take, and its settings that are not tuned.
+
+Responses of a closed loop, and the figures that show it: steps before and after, the Bode plot, the diagram.
+"""
 
 import base64
 import hashlib
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.plotting import replace_unprintable, to_svg
-from pneuopt.quantities.errors import InputError
+import numpy as np
+
+from pneuopt.control.controller import Controller
+from pneuopt.control.loop import ClosedLoop, add_disturbances
+from pneuopt.control.pid import ParallelForm, to_series, to_standard
+from pneuopt.control.reference import Reference
+from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.evaluate import respond
+from pneuopt.evaluation.margins import worst_open_loop
+from pneuopt.evaluation.metric import Band
+from pneuopt.export.blocks import describe_refusal
+from pneuopt.export.makers import BLOCK_FORMS, Block
+from pneuopt.logs.experiment import Experiment
+from pneuopt.plotting import (
+    Response,
+    friction_force,
+    has_friction_map,
+    plot_bode,
+    plot_loop,
+    plot_steps,
+    replace_unprintable,
+    to_svg,
+)
+from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.output import write_text
-from pneuopt.quantities.report import Line, Report, Table, Tone
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, format_number, number_columns, text_columns
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import unit_ratio, write_value
 
 if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure
+
 
 _SEVERITY = [tone.value for tone in (Tone.PLAIN, Tone.HEADING, Tone.GOOD, Tone.DOUBTFUL, Tone.BAD)]
 
@@ -144,3 +179,260 @@ def _report_block(part: Line | Table) -> dict[str, Any]:
         return {"kind": "line", "text": part.text, "tone": part.tone.value, "indent": part.indent}
     columns = [{"heading": c.heading.split("\n"), "is_text": c.is_text} for c in part.columns]
     return {"kind": "table", "columns": columns, "rows": part.rows}
+
+
+_HASH = "sha256["
+"""What a name in a provenance begins with, where its value is the hash of a file or a log."""
+
+
+def data_section(experiments: Sequence[Experiment], noise: Mapping[tuple[str, str], float] | None = None) -> Section:
+    """Logs, a row each, and their channels with range and noise.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    noise : mapping, optional
+        By log and channel, the noise that a fit has counted with [SI] where the log states none.
+    """
+    if not experiments:
+        return Section("Data", ())
+    logs, channels = [], []
+    for log in experiments:
+        t = log.trajectory.t
+        rate = write_value(float(np.median(np.diff(t))), "s", 4) if len(t) > 1 else "-"
+        source = log.source.path if log.source else ""
+        logs.append((log.name or "log", str(len(t)), f"{t[0]:.6g}", f"{t[-1]:.6g}", rate, source))
+        channels += [_channel_row(log, channel, noise or {}) for channel in log.trajectory]
+    heads = *text_columns("log"), *number_columns("samples", "from [s]", "to [s]", "one every")
+    own = *text_columns("log", "channel", "column"), *number_columns("least", "largest", "noise", "missing")
+    known = (Line(f"in {e.name}: {n} = {value:.6g}") for e in experiments for n, value in e.conditions.items())
+    remarks = (Line(f"{e.name}: {remark}") for e in experiments for remark in e.remarks)
+    table = Table((*heads, *text_columns("file")), tuple(logs))
+    return Section("Data", (Report((table, Table(own, tuple(channels)), *known, *remarks)),))
+
+
+def provenance_section(provenance: Mapping[str, str], hashes: Mapping[str, str]) -> Section:
+    """What a result was computed from, by hash, and with which versions and options."""
+    known = {**{n: v for n, v in provenance.items() if n.startswith(_HASH)}, **hashes}
+    files = tuple((n.removeprefix(_HASH).removesuffix("]"), str(value)) for n, value in known.items() if value)
+    others = {n: str(v) for n, v in provenance.items() if not n.startswith(_HASH)}
+    options = others.pop("options", "")
+    lines = [Line(", ".join(f"{n} {value}" for n, value in others.items()))] if others else []
+    tables = [Table(text_columns("read", "SHA-256"), files)] if files else []
+    said = [Line("options", Tone.HEADING), *(Line(text) for text in options.split("; "))] if options else []
+    return Section("Provenance", (Report((*tables, *lines, *said)),))
+
+
+def _channel_row(log: Experiment, channel: str, counted: Mapping[tuple[str, str], float]) -> tuple[str, ...]:
+    values, unit = log.trajectory[channel], log.unit(channel)
+    column = log.source.columns.get(channel) if log.source else None
+    finite = values[np.isfinite(values)]
+    low, high = (write_value(float(f(finite)), unit or "1", 4) if finite.size else "-" for f in (np.min, np.max))
+    level = log.noise.get(channel, counted.get((log.name, channel), math.nan))
+    noise = "-" if math.isnan(level) else write_value(level, unit or "1", 3)
+    missing = format_number(len(values) - finite.size, 6)
+    return (log.name or "log", channel, column.name if column else "", low, high, noise, missing)
+
+
+GAIN_DIGITS = 6
+"""Significant digits of converted gains: fewer change the loop that was certified, more are of no controller."""
+LAW_TEXTS = {
+    "parallel": "Kp~(b~r~−~y) + Ki~e/s + Kd~s/(Tf~s~+~1)~(c~r~−~y)",
+    "standard (ISA)": "Kp~((b~r~−~y) + e/(Ti~s) + Td~s/(1~+~s~Td/N)~(c~r~−~y))",
+    "series": "K (1~+~1/(Ti~s)) (1~+~Td~s/(Tf~s~+~1))~e",
+}
+"""The forms and their laws; no line ends at a tilde."""
+EXPORTS = {
+    "st": "a PLC (IEC 61131-3 structured text)",
+    "c": "a microcontroller (C99, with a test)",
+    "python": "a Python program",
+    **{block.value: f"the PID block of {BLOCK_FORMS[block].maker}" for block in Block},
+    "fmu": "a simulation tool (the plant as FMU)",
+}
+"""The forms of `pneuopt export`, and who takes them."""
+N_NOTE = "N of the standard form is ISA's ratio Td/Tf. Simulink's N is the filter's pole in rad/s, 1/Tf."
+
+
+def report_forms(controller: Controller, parameters: ParameterSet) -> Report:
+    """The gains in the parallel, the standard and the series form; why one of them has none.
+
+    Parameters
+    ----------
+    controller : Controller
+    parameters : ParameterSet
+        Every parameter of the controller.
+    """
+    parallel = controller.parallel_form(parameters)
+    unit = unit_ratio(controller.command.unit, controller.pid_signal.unit)
+    units = {"Kp": unit, "K": unit, "Ki": unit_ratio(unit, "s"), "Kd": unit_ratio(f"({unit})*s", "1"), "N": "1"}
+    rows, refused = [], []
+    for (name, law), convert in zip(LAW_TEXTS.items(), (_as_given, to_standard, to_series), strict=True):
+        try:
+            gains = vars(convert(parallel))
+        except InputError as error:
+            refused.append(Line(str(error)))
+            continue
+        if gains.get("Td") == 0:
+            gains = {**gains, "N": math.nan} if "N" in gains else gains  # of no derivative there is no ratio
+        rows.append((name, *(_cell(n, value, units.get(n, "s")) for n, value in gains.items()), law.replace("~", TIED)))
+    return Report((Table(text_columns("form", "", "", "", "", "law"), tuple(rows)), *refused, Line(N_NOTE)))
+
+
+def report_exports(
+    controller: Controller,
+    parameters: ParameterSet,
+    references: Sequence[Reference],
+    centre: float,
+    fit: Path,
+    tuned: Path,
+) -> Report:
+    """The commands that take a design to a controller, and the makers whose block cannot hold it.
+
+    Parameters
+    ----------
+    controller : Controller
+    parameters : ParameterSet
+        Of the design.
+    references : sequence of Reference
+    centre : float
+        On the wire while the command is zero [the command's unit].
+    fit, tuned : Path
+        The files of the plant and of the design.
+    """
+    if controller.pid.sample_time is None:
+        return Report((Line("A continuous controller has no export: give it a sample_time, and tune it so."),))
+    refused = [block for block in Block if describe_refusal(controller, parameters, block, references, centre)]
+    taken = {form: what for form, what in EXPORTS.items() if form not in {block.value for block in refused}}
+    rows = tuple((what, f"pneuopt export {fit} {tuned} --to {form}") for form, what in taken.items())
+    makers = ", ".join(BLOCK_FORMS[block].maker for block in refused)
+    told = f"The PID block of these makers cannot hold this design: {makers}. The structured text holds it whole."
+    return Report((Table(text_columns("what it takes", "command"), rows), *([Line(told)] if refused else [])))
+
+
+def report_settings(controller: Controller, parameters: ParameterSet) -> Report:
+    """What else a controller is set to, the numbers that are not tuned, and how it computes."""
+    full = controller.complete(parameters)
+    rows = tuple((n, write_value(full.value(n), full[n].unit)) for n in controller.parameters if not full[n].free)
+    pid, lines = controller.pid, []
+    if pid.sample_time is None:
+        lines.append("a continuous controller")
+    else:
+        late = f", its command acts {pid.delay} sample late" if pid.delay else ""
+        lines.append(f"computes every {write_value(pid.sample_time, 's')} by backward Euler{late}")
+    return Report((Line("; ".join(lines)), *([Table(text_columns("setting", "value"), rows)] if rows else [])))
+
+
+def _cell(name: str, value: float, unit: str) -> str:
+    return f"{name} -" if math.isnan(value) else f"{name} {write_value(value, unit, GAIN_DIGITS)}"
+
+
+def _as_given(gains: ParallelForm) -> ParallelForm:
+    return gains
+
+
+def simulate_responses(
+    loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, before: ParameterSet | None = None
+) -> list[Response]:
+    """The response to each reference, with that of the gains before where they can be simulated."""
+    units = (loop.feedback.unit, loop.command.unit)
+    found = []
+    for reference in references:
+        run = _simulate_response(loop, reference, parameters)
+        earlier = None if before is None else _simulate_initial_response(loop, reference, before)
+        period, push = loop.dither_period(parameters), loop.plant.axis.force if loop.plant.axis else "N"
+        found.append(Response(run, reference, loop.feedback.name, units, earlier, period, push))
+    return found
+
+
+def loop_figures(
+    loop: ClosedLoop,
+    references: Sequence[Reference],
+    parameters: ParameterSet,
+    before: ParameterSet | None = None,
+    *,
+    band: Band = 0.02,
+) -> dict[str, "Figure"]:
+    """The steps, "", and the Bode plot, "bode", at the first one's operating point with the largest sensitivity.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : sequence of Reference
+    parameters : ParameterSet
+    before : ParameterSet, optional
+        With the gains before tuning, which are drawn beside.
+    band : float
+        Half width of the settling band, a fraction of the step.
+    """
+    responses = simulate_responses(loop, references, parameters, before)
+    first, earlier = responses[0], None
+    if first.before is not None and before is not None:
+        earlier = _open_loop(loop, before, first.reference, first.before)
+    bode = plot_bode(_open_loop(loop, parameters, first.reference, first.run), earlier)
+    return {"": plot_steps(responses, band=band), "bode": bode}
+
+
+def loop_pictures(draw: Callable[[], Mapping[str, "Figure"]], *, compared: bool) -> tuple[Picture, Picture]:
+    """The steps and the Bode plot for a page; both are simulated when the first one is drawn.
+
+    Parameters
+    ----------
+    draw : callable
+        As `loop_figures`.
+    compared : bool
+        Whether gains before are drawn beside.
+    """
+    drawn: dict[str, Figure] = {}
+
+    def figure(name: str) -> "Figure":
+        if not drawn:
+            try:
+                drawn.update(draw())
+            except ConvergenceError as error:
+                raise InputError(str(error)) from None
+        return drawn[name]
+
+    beside = ", before and after the tuning" if compared else ""
+    steps = Picture(
+        partial(figure, ""),
+        f"Step responses{beside}: the signal with its reference and band, the command, valve and friction over time.",
+        f"Steps{beside}: signal, reference and settling band, command, and what goes on inside the drive.",
+    )
+    bode = Picture(
+        partial(figure, "bode"),
+        f"Bode plot of the open loop{beside}: gain and phase with margins marked, and the two sensitivities.",
+        f"The open loop where its sensitivity is largest in the first step{beside}; below, what feedback leaves of a "
+        "disturbance (S) and what of the reference arrives (T).",
+    )
+    return steps, bode
+
+
+def diagram_picture(loop: ClosedLoop) -> Picture:
+    """The block diagram for a page."""
+    alt = (
+        f"Block diagram: reference, {loop.pid.form.value} PID{', dither' if loop.dither else ''}, the plant driven by "
+        f"{loop.command.name} and feedback of {loop.feedback.name}."
+    )
+    return Picture(partial(plot_loop, loop), alt, "The loop as it was simulated.")
+
+
+def _simulate_response(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> Trajectory:
+    """The response, with the friction force where the plant has one."""
+    run, plant = respond(loop, reference, parameters), loop.plant
+    if not plant.states or not has_friction_map(plant):
+        return run
+    others = {q.name: np.zeros(len(run)) for q in plant.inputs if q.name not in run}
+    whole = run.with_columns({**others, loop.command.name: run["control"]})
+    return run.with_columns({"friction.force": friction_force(plant, whole, parameters)})
+
+
+def _simulate_initial_response(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> Trajectory | None:
+    try:
+        return _simulate_response(loop, reference, parameters)
+    except (ConvergenceError, InputError):
+        return None
+
+
+def _open_loop(loop: ClosedLoop, parameters: ParameterSet, reference: Reference, run: Trajectory) -> Linearisation:
+    disturbed = add_disturbances(loop, [reference])
+    return worst_open_loop(disturbed, loop.complete(parameters), reference, run)[1]

@@ -1,26 +1,51 @@
-"""The pages of a tuned loop, and of one that is simulated with the gains it has."""
+"""The pages of a tuned loop, and of one that is simulated with the gains it has.
+
+The page of a study: a map over its cases, or a Pareto front.
+
+`summary_page`: the page of a result that has none of its own, its summary and what may be drawn of it.
+
+`write_report`: a result as one page of HTML.
+"""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Reference
-from pneuopt.evaluation.band import Band
+from pneuopt.control.reference import Reference, as_references
+from pneuopt.dynamics.runnable import HasSystem
 from pneuopt.evaluation.certificate import Certificate, report_notes
 from pneuopt.evaluation.evaluate import metric_cell, report_metrics
+from pneuopt.evaluation.metric import Band
 from pneuopt.evaluation.requirements import larger_is_better
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.tracking import Tracking
+from pneuopt.logs.experiment import Experiment
+from pneuopt.plotting import plot_sensitivity, plot_tracking
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet, as_tuple
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
+from pneuopt.quantities.results import Shown
 from pneuopt.quantities.status import report_status
-from pneuopt.report.data import provenance_section
-from pneuopt.report.fit_page import Source
-from pneuopt.report.gains import report_forms, report_settings
+from pneuopt.report.fit_page import Source, fit_page
 from pneuopt.report.live import live_script
-from pneuopt.report.loop_figures import diagram_picture, loop_figures, loop_pictures
-from pneuopt.report.page import Page, Picture, Section
+from pneuopt.report.page import (
+    Page,
+    Picture,
+    Section,
+    data_section,
+    diagram_picture,
+    loop_figures,
+    loop_pictures,
+    provenance_section,
+    report_forms,
+    report_settings,
+    write_page,
+)
+from pneuopt.studies.sensitivity import Sensitivity
 from pneuopt.tuning.result import TuningResult, report_active, report_certificate_status, report_gains, report_refusal
 from pneuopt.tuning.validation import report_validation, report_validation_verdict
 
@@ -28,6 +53,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pneuopt.plotting.canvas import Figure
+
 
 MARGINS = {
     "MaxSensitivity": "Ms",
@@ -227,3 +253,187 @@ def _broken_limits(metrics: "pd.DataFrame", limits: Mapping[str, float]) -> Iter
 
 def _some(picture: Picture | None) -> tuple[Picture, ...]:
     return () if picture is None else (picture,)
+
+
+def study_page(
+    source: Source,
+    report: Report,
+    draw: "Callable[[], Figure] | None",
+    *,
+    what: str,
+    alt: str,
+    design: tuple[ClosedLoop, ParameterSet] | None = None,
+) -> Page:
+    """The page of a study.
+
+    Parameters
+    ----------
+    source : Source
+    report : Report
+        How many cases hold, in its first line; then the cases, or the designs of a front.
+    draw : callable, optional
+        Makes the map or the front; None where there are too many axes for one.
+    what : str
+        Heading: "Pareto front".
+    alt : str
+        What the figure shows, for those who see it and those who do not.
+    design : (ClosedLoop, ParameterSet), optional
+        The controller that all cases share, where they do.
+    """
+    verdict, table = Report(report.parts[:1]), Report(report.parts[1:])
+    pictures = () if draw is None else (Picture(draw, alt, alt),)
+    settings = () if design is None else (report_settings(design[0].controller, design[1].fixed("*")),)
+    sections = Section(what, (*pictures, table)), Section("The design", settings)
+    return Page(source.title, verdict, (*sections, provenance_section({}, source.hashes)), source.warnings)
+
+
+def summary_page(
+    source: Source,
+    found: Report,
+    pictures: Sequence[Picture] = (),
+    experiments: Sequence[Experiment] = (),
+    provenance: Mapping[str, str] | None = None,
+) -> Page:
+    """The page of a summary, whose first line is the verdict.
+
+    Parameters
+    ----------
+    source : Source
+    found : Report
+    pictures : sequence of Picture
+    experiments : sequence of Experiment
+        Logs of which the page lists what was read, and their hashes.
+    provenance : mapping of str to str, optional
+        The result's own.
+    """
+    first, *others = found.parts or (Line(""),)
+    is_line = isinstance(first, Line)
+    details = Report(tuple(others) if is_line else (first, *others))
+    sections = (
+        Section("Figures", tuple(pictures)),
+        Section("Result", (details,)),
+        *((data_section(experiments),) if experiments else ()),
+        provenance_section(dict(provenance or {}), {**source.hashes, **_hashes(experiments)}),
+    )
+    return Page(source.title, Report((first,) if is_line else ()), sections, source.warnings)
+
+
+def _hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
+    return {f"sha256[{e.name}]": e.sha256 for e in experiments if e.sha256}
+
+
+def tracking_picture(found: Tracking) -> Picture:
+    """Of a drive's parameters over dated logs."""
+    alt = "Estimates with their intervals over dates, the line through them and its band."
+    return Picture(partial(plot_tracking, found), alt, "Estimates over time.")
+
+
+def title_of(what: str, file: Path, logs: Sequence[Path]) -> str:
+    """What a page is of: "Check of drive.toml with run_01.csv"; of many logs their number."""
+    names = ", ".join(log.name for log in logs) if len(logs) <= MOST_NAMES else f"{len(logs)} logs"
+    return f"{what} of {file.name}" + (f" with {names}" if logs else "")
+
+
+MOST_NAMES = 3
+"""Logs that a title names: more make it longer than a line."""
+
+
+LOGS = "an Experiment or several, as read_log(path) gives them"
+_TITLES: dict[type, str] = {IdentificationResult: "Identification", TuningResult: "Tuning", Certificate: "Certificate"}
+
+
+def write_report(
+    result: Shown,
+    path: str | Path,
+    *,
+    title: str = "",
+    model: HasSystem | ClosedLoop | None = None,
+    experiments: Experiment | Sequence[Experiment] = (),
+    held_out: Experiment | Sequence[Experiment] = (),
+    references: Reference | Sequence[Reference] = (),
+    parameters: ParameterSet | None = None,
+    band: Band = 0.02,
+) -> None:
+    """Write a result as one page of HTML that needs no network: verdict first, figures where they belong, hashes.
+
+    The same result gives the same page, to the letter. A result that did not converge gets its page, too, which says
+    so first. Results hold no models and no logs: what is to be drawn of these is given here. The page of a loop ends
+    with sliders, which a script within it follows by simulating the loop; without scripts only they are missing.
+
+    Parameters
+    ----------
+    result : Shown
+        Whatever `identify`, `tune`, `certificate`, `bootstrap`, `track` or another verb returns.
+    path : str or Path
+    title : str
+        By default the kind of the result.
+    model : drive, System or ClosedLoop, optional
+        Of a fit: draws its friction, and predicts held-out logs. Of a tuning or a certificate the loop: draws steps,
+        the Bode plot and the diagram, and gives the gains in every form.
+    experiments : Experiment or sequence of Experiment
+        Of a fit: the logs that it was made from, in their order.
+    held_out : Experiment or sequence of Experiment
+        Logs that the fit has not seen.
+    references : Reference or sequence of Reference
+        Those of the loop.
+    parameters : ParameterSet, optional
+        Of a certificate: every parameter of its loop. Of a tuning: those before, to be drawn beside.
+    band : float
+        Half width of the settling band, a fraction of the step.
+
+    Raises
+    ------
+    InputError
+        If the result is no such object, a figure lacks what it is drawn from, or the file cannot be written; no file is
+        left then.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pneuopt.quantities.report import Line, Report
+    >>> class Found(Shown):
+    ...     def summary(self):
+    ...         return Report((Line("nothing is wrong"),))
+    >>> place = Path(tempfile.mkdtemp()) / "found.html"
+    >>> write_report(Found(), place)
+    >>> "nothing is wrong" in place.read_text("utf-8")
+    True
+    """
+    require(isinstance(result, Shown), f"a report is written of a result, got {type(result).__name__}")
+    steps = as_references(references)
+    logs, others = (
+        as_tuple(n, given, Experiment, LOGS) for n, given in (("experiments", experiments), ("held_out", held_out))
+    )
+    require(not others or model is not None, "held-out logs are predicted with the model: give both")
+    source = Source(title or _TITLES.get(type(result), type(result).__name__))
+    if isinstance(result, IdentificationResult):
+        page = fit_page(source, result, logs, model, held_out=others)
+    elif isinstance(result, TuningResult):
+        page = tuning_page(source, result, _view(model, steps, result.parameters, parameters, band))
+    elif isinstance(result, Certificate):
+        require(model is None or parameters is not None, "a certificate holds no gains: give parameters with the loop")
+        page = simulation_page(source, result, _view(model, steps, parameters, None, band))
+    else:
+        page = summary_page(source, result.summary(), _pictures(result), (), getattr(result, "provenance", {}))
+    write_page(path, page)
+
+
+def _view(
+    model: object, steps: Sequence[Reference], parameters: ParameterSet | None, before: ParameterSet | None, band: Band
+) -> LoopView | None:
+    """What a loop's figures are drawn from; None without a loop."""
+    if model is None or parameters is None:
+        return None
+    require(isinstance(model, ClosedLoop), f"the model of this result is a ClosedLoop, got {type(model).__name__}")
+    assert isinstance(model, ClosedLoop)
+    require(bool(steps), "a loop is drawn with its references: give both")
+    earlier = None if before is None else model.complete(before)
+    return LoopView(model, steps, model.complete(parameters), earlier, band)
+
+
+def _pictures(result: Shown) -> tuple[Picture, ...]:
+    """Of a result without a page of its own."""
+    if isinstance(result, Sensitivity):
+        alt = "For each figure the share of its variance that each parameter brings, with its 95 % interval."
+        return (Picture(partial(plot_sensitivity, result), alt, "Shares of the variance."),)
+    return (tracking_picture(result),) if isinstance(result, Tracking) else ()

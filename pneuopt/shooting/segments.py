@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled.rollout import Gram, Pieces, Rollout, RolloutResult
-from pneuopt.dynamics.partitioned_step import PARTITIONED_MAX_H_GROWTH, PARTITIONED_MAX_H_LAMBDA
-from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
+from pneuopt.dynamics.integrators import PARTITIONED_MAX_H_GROWTH, PARTITIONED_MAX_H_LAMBDA, RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import DiscreteSystem, names
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import ModelError, require

@@ -22,24 +22,26 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import HasSystem, Runnable, as_runnable
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
-from pneuopt.evaluation.record import record
-from pneuopt.evaluation.rig import Rig, Sensor
-from pneuopt.identification.checks import NEEDED, check_logs, outputs_in_log
+from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.identification.identify import identify
-from pneuopt.identification.marks import Mark
-from pneuopt.identification.problem import as_estimation_model
-from pneuopt.identification.repairs import input_behaviour, known_runs
-from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.problem import (
+    NEEDED,
+    as_estimation_model,
+    check_logs,
+    input_behaviour,
+    known_runs,
+    outputs_in_log,
+)
+from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.logs.doctor import CHECKS
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise
-from pneuopt.quantities.arguments import check_number
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
-from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.progress import Progress
+from pneuopt.quantities.parameters import Parameter, ParameterSet, check_number
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.results import Shown
+from pneuopt.quantities.status import Progress
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.studies.sweep import sweep

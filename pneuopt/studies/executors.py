@@ -1,14 +1,399 @@
-"""Somebody else's threads, processes or machines: anything with the interface of `concurrent.futures`."""
+"""Somebody else's threads, processes or machines: anything with the interface of `concurrent.futures`.
+
+Processes of this machine, in which a study computes its cases by default.
+
+They are loky's executors of one process each: if a process dies, its executor breaks, and that names the cases that it
+had. They are spawned, not forked, on every system, and have one thread each for linear algebra.
+
+`CaseQueue`: which cases are computed next, how many in one go, and which of them again.
+
+`open_executor`: the executor of a study by a word, as the command line has it; a cluster's is dask's.
+"""
 
 import functools
+import math
+import os
 import pickle
-from collections.abc import Callable, Iterable, Iterator
+import re
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import inf
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait as wait_for_connections
+from typing import TYPE_CHECKING, Any
 
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.studies.outcome import CaseFunction, CaseValues, Outcome, describe_error, evaluate_cases
-from pneuopt.studies.processes import Outcomes, pickle_function
-from pneuopt.studies.queue import CaseQueue, Chunk
+from pneuopt.quantities.errors import InputError, require
+from pneuopt.quantities.parameters import ParameterSet, check_number
+from pneuopt.studies.outcome import CaseFunction, CaseValues, Outcome, describe_error, evaluate_cases, limit_memory
+
+if TYPE_CHECKING:
+    import loky
+
+
+CHUNK_SECONDS = 0.5
+"""Time that a chunk of cases shall take [s]: longer chunks lose more where a process dies, shorter ones cost more to
+send."""
+MAX_CHUNK = 1000
+"""Cases in a chunk [1]: more hold up the table, and fill the memory where each is large."""
+_TRIES = 2  # runs of a case whose process dies [1]: a second one tells a case that kills from a machine that went away
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Cases that one process computes in one go, by name; and how often they were tried before."""
+
+    cases: Mapping[str, CaseValues]
+    tries: int = 0
+
+
+class CaseQueue:
+    """Hands cases out in chunks of about half a second.
+
+    Parameters
+    ----------
+    cases : iterable of str and mapping or ParameterSet
+        Read as they are needed.
+    count : int
+        How many there are.
+    workers : int
+        Processes or threads that share them.
+    most_seconds : float
+        That a chunk may take, which a limit of time may lower.
+    """
+
+    def __init__(
+        self, cases: Iterable[tuple[str, CaseValues]], count: int, workers: int, most_seconds: float = math.inf
+    ) -> None:
+        self._fresh, self._again, self._suspect = iter(cases), deque[Chunk](), deque[Chunk]()
+        self._left, self._workers, self._seconds = count, workers, min(CHUNK_SECONDS, most_seconds)
+        self._done, self._spent = 0, 0.0
+
+    def __bool__(self) -> bool:
+        return self._left > 0 or bool(self._again or self._suspect)
+
+    def take(self, *, alone: bool = True) -> Chunk | None:
+        """The next chunk; None where there is none.
+
+        Last come cases whose process has died, but only if nothing else is computed beside: a worker of a cluster takes
+        along what waits for it.
+        """
+        if self._again:
+            return self._again.popleft()
+        cases = dict(next(self._fresh) for _ in range(min(self._size(), self._left)))
+        self._left -= len(cases)
+        if cases:
+            return Chunk(cases)
+        return self._suspect.popleft() if alone and self._suspect else None
+
+    def measure(self, outcomes: Sequence[Outcome]) -> None:
+        """Learn from a chunk how long cases take."""
+        self._done += len(outcomes)
+        self._spent += sum(o.seconds for o in outcomes if o.seconds > 0)
+
+    def give_back(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
+        """Take back a chunk whose process died: its cases are tried one by one; one that dies twice is said."""
+        if len(chunk.cases) > 1:
+            self._again.extend(Chunk({name: values}) for name, values in chunk.cases.items())
+        elif chunk.tries + 1 < _TRIES:
+            self._suspect.append(Chunk(chunk.cases, chunk.tries + 1))
+        else:
+            for name in chunk.cases:
+                yield name, Outcome(error=reason)
+
+    def separate(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
+        """Take back a chunk that took too long: a case alone is said, several are tried one by one."""
+        yield from self.give_back(Chunk(chunk.cases, _TRIES), reason)
+
+    def _size(self) -> int:
+        if not self._done:
+            return 1
+        by_time = self._seconds * self._done / max(self._spent, 1e-9)
+        return max(1, math.ceil(min(by_time, MAX_CHUNK, self._left / (2 * self._workers))))
+
+
+Outcomes = Generator[tuple[str, Outcome], None, None]
+_MAX_PROCESSES = 60
+"""Processes at once: Windows cannot wait for more than 63, and each takes memory for CasADi and the model."""
+_THREADS_REMEDY = "in this process, executor=ThreadPoolExecutor()"
+_NO_START = (
+    'the processes of a study cannot start; a script must call the study under `if __name__ == "__main__":`, '
+    f"or compute {_THREADS_REMEDY}"
+)
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_LIMIT_SHARE = 0.25  # of a case's time limit that a chunk shall take [1]: one that takes all of it is cut up
+_packed = b""  # of a spawned process: its function, as it came
+_task: "tuple[CaseFunction, ParameterSet, Processes] | None" = None  # of a spawned process: what it evaluates
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Processes of this machine as the executor of a study, and what a case may take in them.
+
+    Parameters
+    ----------
+    count : int, optional
+        By default one a CPU; the table is the same whatever their number.
+    seconds : float
+        Time of a case on the clock [s]; one that takes longer is killed with its process.
+    megabytes : float
+        Memory that a case may take beyond what its process has when the study begins [MiB]; Linux alone.
+    """
+
+    count: int | None = None
+    seconds: float = inf
+    megabytes: float = inf
+
+    def __post_init__(self) -> None:
+        if self.count is not None:
+            check_number("Processes: count", self.count, "a whole number of processes, or None", whole=True)
+        check_number("Processes: seconds", self.seconds, "a time in seconds, as 60.0")
+        check_number("Processes: megabytes", self.megabytes, "a size in MiB, as 500.0")
+        require(self.count is None or self.count >= 1, f"there must be a process at least, got {self.count}")
+        require(self.seconds > 0, f"the time limit of a case must be positive, got {self.seconds:g} s")
+        require(self.megabytes > 0, f"the memory limit of a case must be positive, got {self.megabytes:g} MB")
+        on_linux = sys.platform == "linux" or self.megabytes == inf
+        require(on_linux, "a memory limit of cases needs Linux; leave it out, and compute fewer cases at once")
+
+    @property
+    def time_reason(self) -> str:
+        """Why a case that took too long has no result."""
+        return f"killed: took longer than the {self.seconds:g} s that a case may take"
+
+    @property
+    def memory_reason(self) -> str:
+        """Why a case that needs too much memory has no result."""
+        return f"needs more memory than the {self.megabytes:g} MB that a case may take"
+
+
+def run_in_processes(
+    chosen: Processes,
+    fn: CaseFunction,
+    parameters: ParameterSet,
+    cases: Iterable[tuple[str, CaseValues]],
+    count: int,
+) -> Outcomes:
+    """Evaluate cases in spawned processes and yield each outcome as it comes.
+
+    Parameters
+    ----------
+    chosen : Processes
+    fn : callable
+        It travels by pickle, once to each process.
+    parameters : ParameterSet
+        What the cases have in common.
+    cases : iterable of str and mapping or ParameterSet
+    count : int
+        How many there are.
+
+    Yields
+    ------
+    tuple of str and Outcome
+
+    Raises
+    ------
+    InputError
+        If the function cannot travel, or no process can start.
+    """
+    wanted = min(count, chosen.count or os.cpu_count() or 1, _MAX_PROCESSES)
+    queue = CaseQueue(cases, count, wanted, _LIMIT_SHARE * chosen.seconds)
+    crew = _Crew(pickle_function(fn, parameters, chosen), chosen)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="A worker was restarted")  # its chunk is given to its successor
+        try:
+            for _ in range(wanted):
+                crew.start()
+            while crew.busy:
+                for run, future in crew.wait():
+                    yield from _receive(crew, queue, run, future)
+                yield from _stop_late(crew, queue)
+            while chunk := queue.take():
+                yield from ((name, Outcome(error="no process could be started for it")) for name in chunk.cases)
+        finally:
+            crew.shut_down()
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What a process computes; without a chunk it loads the function. `deadline` is of `time.monotonic` [s]."""
+
+    process: "loky.ProcessPoolExecutor"
+    chunk: Chunk | None
+    deadline: float
+
+
+class _Crew:
+    """The processes of a study, and what each computes now."""
+
+    def __init__(self, packed: bytes, limits: Processes) -> None:
+        self._packed, self.limits, self.began = packed, limits, False
+        self._processes: list[loky.ProcessPoolExecutor] = []
+        self.busy: dict[Future[list[Outcome]], _Run] = {}
+
+    def start(self) -> None:
+        """Start a process."""
+        process = _spawn_process(self._packed)
+        self._processes.append(process)
+        with _one_thread_each():
+            self.busy[process.submit(_load_task)] = _Run(process, None, inf)
+
+    def give(self, process: "loky.ProcessPoolExecutor", chunk: Chunk) -> None:
+        """Let a process compute a chunk."""
+        run = _Run(process, chunk, time.monotonic() + self.limits.seconds)
+        self.busy[process.submit(_evaluate_chunk, list(chunk.cases.values()))] = run
+
+    def wait(self) -> list[tuple[_Run, "Future[list[Outcome]]"]]:
+        """Wait until a process is done, or has had its time; those that are done, in the order of their chunks."""
+        patience = min(run.deadline for run in self.busy.values()) - time.monotonic()
+        done = wait(self.busy, None if patience == inf else max(patience, 0.0), FIRST_COMPLETED).done
+        return [(self.busy.pop(future), future) for future in list(self.busy) if future in done]
+
+    def late(self) -> list[_Run]:
+        """End the processes that had their time; what they computed."""
+        now = time.monotonic()
+        late = {future: run for future, run in self.busy.items() if run.deadline <= now and not future.done()}
+        for future, run in late.items():
+            del self.busy[future]
+            self.remove(run.process)
+        return list(late.values())
+
+    def remove(self, process: "loky.ProcessPoolExecutor") -> None:
+        """Give a process up."""
+        self._processes.remove(process)
+        process.shutdown(kill_workers=True)
+
+    def shut_down(self) -> None:
+        """End all processes, those that compute at once."""
+        computing = {run.process for run in self.busy.values()}
+        for process in self._processes:
+            process.shutdown(kill_workers=process in computing)
+
+
+def _receive(
+    crew: _Crew, queue: CaseQueue, run: _Run, future: "Future[list[Outcome]]"
+) -> Iterator[tuple[str, Outcome]]:
+    """What a process gave; it, or another if it died, goes on with the next chunk."""
+    try:
+        outcomes = future.result()
+    except BrokenProcessPool as error:
+        require(crew.began, _NO_START)
+        crew.remove(run.process)
+        if run.chunk is not None:
+            yield from queue.give_back(run.chunk, _describe_death(error))
+        if queue and run.chunk is not None:
+            crew.start()
+        return
+    crew.began = True
+    queue.measure(outcomes)
+    chunk = queue.take()
+    if chunk is not None:
+        crew.give(run.process, chunk)
+    if run.chunk is not None:
+        yield from zip(run.chunk.cases, outcomes, strict=False)  # fewer outcomes where the last is an interruption
+
+
+def _stop_late(crew: _Crew, queue: CaseQueue) -> Iterator[tuple[str, Outcome]]:
+    """Kill what takes too long, and let other processes go on."""
+    for run in crew.late():
+        if run.chunk is not None:
+            yield from queue.separate(run.chunk, crew.limits.time_reason)
+        if queue:
+            crew.start()
+
+
+def _describe_death(error: BrokenProcessPool) -> str:
+    code = re.search(r"\((-?\w+)\)", str(error))  # loky gives it in words only, and not on Windows
+    return "its process died twice" + (f" (exit code {code[1]})" if code else "")
+
+
+def _spawn_process(packed: bytes) -> "loky.ProcessPoolExecutor":
+    """An executor of one process, which follows this one, and has one thread for linear algebra: it shares the CPUs.
+
+    Loky puts another process in its place where its memory grows.
+    """
+    import loky
+
+    return loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_begin, initargs=(packed,))
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes that are started within have one thread for linear algebra; what the user has said of it goes first."""
+    own = {n: "1" for n in _THREAD_VARIABLES if n not in os.environ}
+    os.environ.update(own)
+    try:
+        yield
+    finally:
+        for n in own:
+            del os.environ[n]
+
+
+def _begin(packed: bytes) -> None:
+    """In a spawned process: keep the function; ignore Ctrl-C, which reaches all processes; end when the first has."""
+    global _packed  # noqa: PLW0603 - the state of a worker process, which serves one study
+    _packed = packed
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_with(sentinel: int) -> None:
+    """Wait for the end of the first process, which may be killed without a word to the others."""
+    wait_for_connections([sentinel])
+    os._exit(1)
+
+
+def _load_task() -> list[Outcome]:
+    """In a spawned process: unpack the function, once for all its cases."""
+    global _task  # noqa: PLW0603 - the state of a worker process, which serves one study
+    import pandas as pd  # noqa: F401 - of the results: no case's time
+
+    try:
+        _task = pickle.loads(_packed)
+    except Exception as error:  # whatever its module raises when imported
+        raise InputError(
+            f"the function cannot be loaded by other processes: {describe_error(error)}; "
+            f"define it in a module that can be imported, or compute {_THREADS_REMEDY}"
+        ) from None
+    assert _task is not None
+    limit_memory(_task[2].megabytes)
+    return []
+
+
+def _evaluate_chunk(cases: list[CaseValues]) -> list[Outcome]:
+    """In a spawned process: evaluate its function."""
+    if _task is None:  # in a process that stands in for one that had grown
+        _load_task()
+    assert _task is not None
+    fn, parameters, limits = _task
+    outcomes = evaluate_cases(fn, parameters, cases)
+    return [Outcome(seconds=o.seconds, error=limits.memory_reason) if _lacks_memory(o, limits) else o for o in outcomes]
+
+
+def _lacks_memory(outcome: Outcome, limits: Processes) -> bool:
+    """Whether an allocation has failed, in Python or in C++."""
+    return limits.megabytes < inf and bool(re.search("MemoryError|bad_alloc", outcome.error))
+
+
+def pickle_function(fn: CaseFunction, *others: object) -> bytes:
+    """A function with what it needs, as it travels to other processes; `InputError` if it cannot."""
+    try:
+        return pickle.dumps((fn, *others))
+    except Exception as error:  # pickle raises what it likes
+        raise InputError(
+            f"the function cannot go to other processes ({error}); give a function of a module, or "
+            f"functools.partial of one with what it needs, or compute {_THREADS_REMEDY}"
+        ) from None
+
 
 _CHUNKS_A_WORKER = 3
 """Chunks that wait for each worker [1]: fewer leave it idle while a result travels, more fill the memory."""
@@ -35,7 +420,7 @@ def run_in_executor(
                 yield from _submit(executor, task, chunk, running)
             done = wait(running, return_when=FIRST_COMPLETED).done
             for future in [future for future in running if future in done]:  # in the order of the cases
-                yield from _receive(future, running.pop(future), queue)
+                yield from _receive_chunk(future, running.pop(future), queue)
     finally:
         for future in running:
             future.cancel()
@@ -81,7 +466,7 @@ def _submit(
         yield from ((name, Outcome(error=describe_error(error))) for name in chunk.cases)
 
 
-def _receive(future: "Future[list[Outcome]]", chunk: Chunk, queue: CaseQueue) -> Iterator[tuple[str, Outcome]]:
+def _receive_chunk(future: "Future[list[Outcome]]", chunk: Chunk, queue: CaseQueue) -> Iterator[tuple[str, Outcome]]:
     """What a chunk gave; one whose worker died is tried again."""
     try:
         outcomes = future.result()
@@ -90,3 +475,95 @@ def _receive(future: "Future[list[Outcome]]", chunk: Chunk, queue: CaseQueue) ->
         return
     queue.measure(outcomes)
     yield from zip(chunk.cases, outcomes, strict=False)  # fewer outcomes where the last is an interruption
+
+
+LOCAL_CLUSTER = "dask"
+"""The word for a cluster of dask on this machine, which is there for the study alone."""
+_SCHEMES = ("tcp://", "tls://", "ws://", "wss://", "ucx://")
+_CONNECT_SECONDS = 10.0  # patience with a scheduler [s]: shorter gives up on a slow net, longer looks like a hang
+
+_OWN_CLUSTER: dict[str, Any] = {
+    "distributed.scheduler.allowed-failures": 0,  # the study itself tries again, case by case
+    "distributed.scheduler.work-stealing-interval": "1s",
+    "distributed.scheduler.active-memory-manager.start": False,
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.admin.system-monitor.gil.enabled": False,
+    "distributed.nanny.pre-spawn-environ": dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), 1
+    ),
+}
+"""What a cluster that is there for one study does not need: its sampling profiler, monitors many times a second, and
+memory that is given back to the system after each array. They took as much CPU time as a sixth of the cases
+(problems/speed/study_executors.py)."""
+
+
+@contextmanager
+def open_executor(where: str) -> Iterator[Executor | Processes]:
+    """Open the executor that a word names, for as long as a study runs.
+
+    Parameters
+    ----------
+    where : str
+        A number of processes of this machine; "dask", a cluster of dask on this machine; or the address of a dask
+        scheduler, "tcp://host:8786", whose workers have this version of pneuopt. A worker should have one thread.
+
+    Yields
+    ------
+    Executor or Processes
+
+    Raises
+    ------
+    InputError
+        If the word is none of these, dask is not installed, or there is no scheduler at the address.
+
+    Examples
+    --------
+    >>> with open_executor("2") as executor:
+    ...     executor
+    Processes(count=2, seconds=inf, megabytes=inf)
+    """
+    if where.isdecimal():
+        yield Processes(int(where))
+        return
+    if where != LOCAL_CLUSTER and not where.startswith(_SCHEMES):
+        raise InputError(f"executor {where!r}: give a number of processes, dask, or a scheduler, tcp://host:8786")
+    distributed = _import_distributed()
+    with _make_client(distributed, where) as client:
+        executor = client.get_executor(pure=False)  # otherwise a chunk that is tried again is given its old error
+        workers = sum(client.nthreads().values())
+        executor._max_workers = workers if where == LOCAL_CLUSTER else max(workers, UNKNOWN_WORKERS)
+        yield executor
+
+
+@contextmanager
+def _make_client(distributed: Any, where: str) -> Iterator[Any]:
+    """A client of the scheduler at an address, or of a cluster of its own, whose workers have one thread each."""
+    import dask
+
+    if where == LOCAL_CLUSTER:
+        with (
+            dask.config.set(_OWN_CLUSTER),
+            distributed.LocalCluster(threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            yield client
+        return
+    try:
+        client = distributed.Client(where, timeout=_CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise InputError(f"executor {where}: there is no dask scheduler ({' '.join(str(error).split())})") from None
+    with client:
+        yield client
+
+
+def _import_distributed() -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise InputError(
+            "dask is not installed; pip install 'pneuopt[cluster]', or give a number of processes"
+        ) from None
+    return distributed

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING
 
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.progress import Progress
-from pneuopt.studies.cases import grid
+from pneuopt.quantities.status import Progress
+from pneuopt.studies.executors import Processes
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction
-from pneuopt.studies.processes import Processes
-from pneuopt.studies.sweep import sweep
+from pneuopt.studies.sweep import grid, sweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -151,7 +150,7 @@ def search_again(
     --------
     >>> from concurrent.futures import ThreadPoolExecutor
     >>> from pneuopt.quantities.parameters import Parameter
-    >>> from pneuopt.studies.cases import grid
+    >>> from pneuopt.studies.sweep import grid
     >>> given = ParameterSet({"mass": Parameter(1.0, "kg"), "Kp": Parameter(0.0, "1")})
     >>> def tune(p):  # a good start is 2; from 0 the heavy cell ends far away
     ...     return {"gain": 2.0, "error": 9.0 if p.value("mass") > 2 and p.value("Kp") == 0 else 1.0}

@@ -1,5 +1,10 @@
-"""`Outcome`: what one case of a study gave, in plain numbers and text, or why it gave nothing."""
+"""`Outcome`: what one case of a study gave, in plain numbers and text, or why it gave nothing.
 
+A limit of memory for a process of a study, so that a case that fills it costs no other.
+"""
+
+import math
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping
@@ -13,6 +18,7 @@ from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
     import pandas as pd
+
 
 CaseFunction = Callable[[ParameterSet], Any]
 CaseValues = ParameterSet | Mapping[str, float]
@@ -103,3 +109,22 @@ def _check_plain(value: Any, name: str) -> Any:
     if not isinstance(value, bool | int | float | str):
         raise InputError(f"{name} is {type(value).__name__}; return numbers or text, by name")
     return value
+
+
+_MEGABYTE = 2**20
+
+
+def limit_memory(megabytes: float) -> None:
+    """Let this process have so much more memory than it has now; beyond it an allocation fails.
+
+    Data alone are limited, not the address space, of which threads reserve gigabytes that they never touch.
+    """
+    if sys.platform != "linux" or megabytes == math.inf:
+        return
+    import resource
+
+    with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123 - no file of ours
+        pages = int(file.read().split()[5])  # data and stack
+    most = pages * resource.getpagesize() + int(megabytes * _MEGABYTE)
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    resource.setrlimit(resource.RLIMIT_DATA, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))

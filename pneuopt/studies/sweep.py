@@ -3,27 +3,275 @@
 A case that fails is a row with its reason, even where its process dies; Ctrl-C keeps what is done. Processes are
 spawned, not forked, on every system: the function is pickled once for each of them, with all that it refers to (a
 `System`, a `ClosedLoop`); machine code comes from the cache.
+
+Cases of a study: named parameter values, as `sweep` takes them: every combination, or the rows of a table.
+
+Corners and draws are the scenarios of `evaluation`, which are cases as they are.
+
+`CaseRows`: the table of a study while it grows, column by column: a hundred thousand cases take a few megabytes.
+
+The sample time of a loop's controller as an axis of a study: a part of the loop's structure, no parameter of it.
+
+A case that has it among its values is of a loop of its own, with which it is evaluated or tuned.
 """
 
+import itertools
+import math
+import re
 import time
-from collections.abc import Callable, Mapping
+from array import array
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, suppress
+from dataclasses import replace
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from io import BytesIO
+from math import nan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from pneuopt.quantities.errors import require
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.studies.cases import check_case
-from pneuopt.studies.executors import run_in_executor
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Reference
+from pneuopt.dynamics.simulate import MAX_STEPS
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.metric import Band
+from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.output import MAX_REASON, read_source
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.status import Progress, ProgressReporter
+from pneuopt.quantities.units import si_conversion, write_value
+from pneuopt.studies.executors import Processes, run_in_executor, run_in_processes
 from pneuopt.studies.journal import CaseMarks, Journal
-from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, CaseValues
-from pneuopt.studies.processes import Processes, run_in_processes
-from pneuopt.studies.rows import CaseRows
+from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, CaseValues, Outcome
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+MAX_TABLE_BYTES = 2**28
+"""Size of a table of cases [byte], 256 MiB: more fills the memory; less refuses a million cases of ten parameters."""
+_NAMES = "case"  # the column of a table that names its cases, as in the table that `sweep` returns
+
+
+def grid(parameters: ParameterSet, axes: Mapping[str, Iterable[float]]) -> dict[str, dict[str, float]]:
+    """Every combination of values, as named cases for `sweep`; the last axis runs fastest.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        Gives units and bounds.
+    axes : mapping of str to iterable of float
+        Parameter to its values [its SI unit].
+
+    Returns
+    -------
+    dict of str to dict of str to float
+        "load.mass = 2 kg, load.force = 0 N" to the values by name.
+
+    Raises
+    ------
+    InputError
+        If a parameter is unknown, a value is outside its bounds or there twice, or there is none.
+
+    Examples
+    --------
+    >>> from pneuopt.quantities.parameters import Parameter
+    >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "stroke": Parameter(0.2, "m")})
+    >>> grid(rig, {"load.mass": [2.0, 8.0], "stroke": [0.1]})["load.mass = 8 kg, stroke = 100 mm"]
+    {'load.mass': 8.0, 'stroke': 0.1}
+    """
+    require(len(axes) > 0, "a grid needs an axis: a parameter and its values")
+    check_names("parameter", axes, parameters, "axis")
+    columns = [_label_axis(parameters, name, list(map(float, values))) for name, values in axes.items()]
+    return {
+        ", ".join(label for label, _ in point): dict(zip(axes, (value for _, value in point), strict=True))
+        for point in itertools.product(*columns)
+    }
+
+
+def read_cases(parameters: ParameterSet, table: "pd.DataFrame | str | Path") -> dict[str, dict[str, float]]:
+    """Read the cases of a table, a row each: plants that were measured, or that another tool has chosen.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        Gives units and bounds.
+    table : DataFrame, str or Path
+        A column a parameter, "load.mass [kg]"; one without a unit is in the parameter's SI unit. A column "case" names
+        the cases. A path is that of a CSV file.
+
+    Returns
+    -------
+    dict of str to dict of str to float
+        By the name of the case, or "row 1" and so on.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a parameter is unknown, a value is missing or outside its bounds, a name is there
+        twice, or there is no row.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from pneuopt.quantities.parameters import Parameter
+    >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "stroke": Parameter(0.2, "m")})
+    >>> read_cases(rig, pd.DataFrame({"case": ["short"], "stroke [mm]": [150], "load.mass": [4]}))
+    {'short': {'stroke': 0.15, 'load.mass': 4.0}}
+    """
+    import pandas as pd
+
+    where = "table" if isinstance(table, pd.DataFrame) else str(table)
+    frame = table if isinstance(table, pd.DataFrame) else _read_csv(Path(table))
+    heads = {column: re.fullmatch(r"(.*?)(?: \[(.*)\])?", str(column)) for column in frame if column != _NAMES}
+    columns = {column: (head[1].strip(), head[2]) for column, head in heads.items() if head}
+    names = [name for name, _ in columns.values()]
+    check_names("parameter", names, parameters, where)
+    require(len(frame) > 0 and len(names) > 0, f"{where}: no case; it needs a row, and a column of a parameter")
+    require(len(set(names)) == len(names), f"{where}: a parameter has two columns; leave one out")
+    labels = [f"row {k}" for k in range(1, len(frame) + 1)] if _NAMES not in frame else list(map(str, frame[_NAMES]))
+    require(len(set(labels)) == len(labels), f"{where}: two cases have the same name")
+    values = {
+        name: _read_column(frame[column], parameters[name].unit if unit is None else unit, parameters[name].unit, where)
+        for column, (name, unit) in columns.items()
+    }
+    cases = {label: {n: values[n][k] for n in names} for k, label in enumerate(labels)}
+    for label, case in cases.items():
+        check_case(parameters, case, f"{where}: {label}")
+    return cases
+
+
+def _read_csv(path: Path) -> "pd.DataFrame":
+    import pandas as pd
+
+    raw = read_source(path, MAX_TABLE_BYTES, "take fewer cases")
+    try:
+        return pd.read_csv(BytesIO(raw))
+    except ValueError as error:  # pandas' own errors among them
+        raise InputError(f"{path}: is no table of cases in CSV ({' '.join(str(error).split())[:MAX_REASON]})") from None
+
+
+def _read_column(column: "pd.Series[Any]", written: str, unit: str, where: str) -> list[float]:
+    """A column's numbers in its parameter's unit."""
+    import pandas as pd
+
+    numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
+    bad = [k for k, v in enumerate(numbers.tolist(), 1) if not math.isfinite(v)]
+    require(not bad, f"{where}: {column.name}: row {bad[0] if bad else 0} is no number; every case needs its own")
+    factor, offset = si_conversion(written, unit, where=f"{where}: {column.name}")
+    return [float(v) for v in factor * numbers + offset]
+
+
+def check_case(parameters: ParameterSet, case: CaseValues, name: str) -> None:
+    """Raise `InputError`, which names the case, if it has an unknown parameter, or a value out of bounds."""
+    if isinstance(case, ParameterSet) or all(_is_inside(parameters, n, v) for n, v in case.items()):
+        return
+    check_names("parameter", case, parameters, name)
+    try:
+        parameters.with_values(case)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+def _is_inside(parameters: ParameterSet, name: str, value: float) -> bool:
+    """Whether a value is certainly good; `ParameterSet.with_values` finds the words where it is not."""
+    if name not in parameters:
+        return False
+    p = parameters[name]
+    return p.lower <= value <= p.upper and (not p.log or value > 0)
+
+
+def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:
+    """The values with their labels, of six digits, or of 17 where two labels would be equal."""
+    require(len(values) > 0, f"axis {name}: no values")
+    require(len(set(values)) == len(values), f"axis {name}: a value is there twice; leave one out")
+    for value in values:
+        check_case(parameters, {name: value}, "axis")
+    short, full = ([write_value(v, parameters[name].unit, digits) for v in values] for digits in (6, 17))
+    labels = short if len(set(short)) == len(values) else full
+    return [(f"{name} = {label}", value) for label, value in zip(labels, values, strict=True)]
+
+
+_STUDY_COLUMNS = ("case", "seconds", "error")
+
+
+class CaseRows:
+    """A row a case, in their order; one without an outcome counts as interrupted.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        What the cases have in common.
+    cases : mapping of str to mapping of str to float, or to ParameterSet
+
+    Attributes
+    ----------
+    count, done, failed : int
+        Cases, those with an outcome, and those of these that have an error.
+    """
+
+    def __init__(self, parameters: ParameterSet, cases: Mapping[str, CaseValues]) -> None:
+        self._parameters, self._cases = parameters, cases
+        self.count, self.done, self.failed = len(cases), 0, 0
+        self._places = {str(name): place for place, name in enumerate(cases)}
+        self._swept = _swept_names(parameters, cases.values())
+        self._taken = {*_STUDY_COLUMNS, *self._swept}
+        self._results: dict[str, list[Any]] = {}
+        self._seconds = array("d", [nan]) * len(cases)
+        self._errors = [INTERRUPTED_CASE] * len(cases)
+
+    def add(self, name: str, outcome: Outcome) -> None:
+        """Put what a case gave into its row."""
+        place, outcome = self._places[name], _check_column_names(outcome, self._taken)
+        self._seconds[place], self._errors[place] = outcome.seconds, outcome.error
+        for n, value in outcome.results.items():
+            if n not in self._results:
+                self._results[n] = [nan] * len(self._cases)
+            self._results[n][place] = value
+        self.done += 1
+        self.failed += bool(outcome.error)
+
+    def is_missing(self, name: str) -> bool:
+        """Whether a case has no outcome yet."""
+        return self._errors[self._places[name]] == INTERRUPTED_CASE
+
+    def row(self, name: str) -> dict[str, Any]:
+        """The row of a case that has an outcome, without the results that it lacks."""
+        place, case = self._places[name], self._cases[name]
+        row: dict[str, Any] = {"case": name} | {n: _value_of(n, case, self._parameters) for n in self._swept}
+        row |= {n: column[place] for n, column in self._results.items() if not self._errors[place]}
+        return row | {"seconds": self._seconds[place], "error": self._errors[place]}
+
+    def columns(self) -> dict[str, list[Any]]:
+        """The table's columns."""
+        columns: dict[str, list[Any]] = {"case": list(self._places)}
+        columns |= {n: [_value_of(n, case, self._parameters) for case in self._cases.values()] for n in self._swept}
+        return columns | self._results | {"seconds": list(self._seconds), "error": self._errors}
+
+
+def _swept_names(parameters: ParameterSet, cases: Iterable[CaseValues]) -> list[str]:
+    """The parameters in which the cases differ from what they have in common."""
+    nominal = {n: p.value for n, p in parameters.items()}
+    found: dict[str, None] = {}
+    for case in cases:
+        values = {n: p.value for n, p in case.items()} if isinstance(case, ParameterSet) else case
+        found |= dict.fromkeys(n for n, v in values.items() if n not in found and nominal.get(n) != v)
+    return list(found)
+
+
+def _value_of(name: str, case: CaseValues, parameters: ParameterSet) -> float:
+    if isinstance(case, ParameterSet):
+        return case.value(name) if name in case else nan
+    return float(case[name]) if name in case else parameters.value(name) if name in parameters else nan
+
+
+def _check_column_names(outcome: Outcome, taken: set[str]) -> Outcome:
+    twice = taken.intersection(outcome.results)
+    if not twice:
+        return outcome
+    said = f"{', '.join(sorted(twice))}: a result has the name of a column of the study; rename it"
+    return Outcome(seconds=outcome.seconds, error=said)
+
 
 _RATE_AFTER = 5.0  # time after the first case until a rate is shown [s]: earlier ones jump
 
@@ -75,7 +323,7 @@ def sweep(
     --------
     >>> from concurrent.futures import ThreadPoolExecutor
     >>> from pneuopt.quantities.parameters import Parameter
-    >>> from pneuopt.studies.cases import grid
+    >>> from pneuopt.studies.sweep import grid
     >>> rig = ParameterSet({"mass": Parameter(5.0, "kg"), "force": Parameter(10.0, "N")})
     >>> table = sweep(lambda p: p.value("force") / p.value("mass"), rig, grid(rig, {"mass": [2.0, 0.0]}),
     ...               executor=ThreadPoolExecutor())
@@ -130,3 +378,44 @@ class _Meter:
         rate = (rows.done - known) / (now - begun)
         left = round((rows.count - rows.done) / rate)
         return f"{text}, {rate:.3g} a second, {timedelta(seconds=left)} left"
+
+
+SAMPLE_TIME_AXIS = "pid.sample_time"
+"""Its name in a study, as a tuning.toml has it."""
+
+
+def with_sample_time(loop: ClosedLoop, parameters: ParameterSet) -> ParameterSet:
+    """The parameters with the sample time of the loop's controller among them, which cases may change.
+
+    Raises
+    ------
+    InputError
+        If the controller is continuous.
+    """
+    step = loop.pid.sample_time
+    require(
+        step is not None, f"{SAMPLE_TIME_AXIS}: the controller is continuous; give [pid] a sample_time in the tuning"
+    )
+    assert step is not None
+    return parameters | ParameterSet({SAMPLE_TIME_AXIS: Parameter(step, "s", lower=0.0)})
+
+
+def loop_at_sample_time(loop: ClosedLoop, parameters: ParameterSet) -> tuple[ClosedLoop, ParameterSet]:
+    """The loop with the sample time of a case, and the case's other parameters; without one, both as they are."""
+    if SAMPLE_TIME_AXIS not in parameters:
+        return loop, parameters
+    sampled = replace(loop, pid=replace(loop.pid, sample_time=parameters.value(SAMPLE_TIME_AXIS)))
+    return sampled, parameters.select(n for n in parameters if n != SAMPLE_TIME_AXIS)
+
+
+def evaluate_at_sample_time(
+    loop: ClosedLoop,
+    references: Reference | Sequence[Reference],
+    parameters: ParameterSet,
+    *,
+    band: Band = 0.02,
+    max_steps: float = MAX_STEPS,
+) -> "pd.DataFrame":
+    """The metrics of a case that may have a sample time among its parameters; as `evaluate`."""
+    own, given = loop_at_sample_time(loop, parameters)
+    return evaluate(own, references, given, band=band, max_steps=max_steps)

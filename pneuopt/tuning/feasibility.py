@@ -13,13 +13,12 @@ from pneuopt.control.linear_loop import ComposedLoops
 from pneuopt.control.loop import ClosedLoop, find_rest, set_sliding_direction
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Reference, Step
-from pneuopt.evaluation.band import band_share
-from pneuopt.evaluation.cases import TuningCase
-from pneuopt.evaluation.counts import describe_counts, sees_speed
-from pneuopt.evaluation.dither_mean import TAIL_SHARE
-from pneuopt.evaluation.motion_requirements import FollowingError
-from pneuopt.evaluation.move_check import check_motion
+from pneuopt.evaluation.certificate import describe_counts, sees_speed
+from pneuopt.evaluation.margins import are_stable
+from pneuopt.evaluation.metric import TAIL_SHARE, band_share
+from pneuopt.evaluation.moves import check_motion
 from pneuopt.evaluation.requirements import (
+    FollowingError,
     NoiseGain,
     PeakControl,
     RiseTime,
@@ -28,10 +27,8 @@ from pneuopt.evaluation.requirements import (
     metric_name,
     upper_limit,
 )
-from pneuopt.evaluation.response import highest_dither_frequency
+from pneuopt.evaluation.response import TuningCase, check_travel, highest_dither_frequency
 from pneuopt.evaluation.specification import Specification
-from pneuopt.evaluation.stability import are_stable
-from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet

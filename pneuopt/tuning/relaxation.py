@@ -14,8 +14,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from pneuopt.control.reference import Reference
-from pneuopt.evaluation.dither_mean import TAIL_SHARE
-from pneuopt.evaluation.metric import Requirement, Sense
+from pneuopt.evaluation.metric import TAIL_SHARE, Requirement, Sense
 from pneuopt.evaluation.requirements import SettlingTime, upper_limit, user_limit, with_user_limit
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array

@@ -22,10 +22,9 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.rest_check import RestCheck
 from pneuopt.evaluation.specification import Specification
-from pneuopt.quantities.archive import NOT_SAVED
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
-from pneuopt.quantities.shown import Result
+from pneuopt.quantities.results import NOT_SAVED, Result
 from pneuopt.quantities.status import Code, Status, report_status
 from pneuopt.quantities.units import write_value
 from pneuopt.tuning.relaxation import describe_relaxations

@@ -1,23 +1,52 @@
-"""`Search`: one tuning from its start to a certified answer; `relax`: by how much limits would have to give way."""
+"""`Search`: one tuning from its start to a certified answer; `relax`: by how much limits would have to give way.
 
-from collections.abc import Iterator
+`Certifier`: the certificate of a search's point beside the search's claim, and of gains that no search has found.
+
+`confirm_refusal`: before a certificate's refusal stands, a second search under the same certificate.
+
+A search hands over one design, its best. Where that hunts, creeps, or breaks a limit after its horizon, others that
+are worse by the objective may hold. The second search looks for designs with room to every limit, over the horizon and
+over a longer one, and certifies several that lie apart.
+
+Confirmation that no design keeps all limits, by a search that shares neither method nor merit with the first.
+
+A search adds up the excesses over its limits. Where that sum has a local minimum it stays there, though a design far
+away keeps every limit. The second search is SciPy's differential evolution on the largest excess.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import inf
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import OptimizeResult, differential_evolution
 
-from pneuopt.evaluation.cases import cases
-from pneuopt.evaluation.certificate import Defect
-from pneuopt.evaluation.requirements import metric_name, upper_limit
+from pneuopt.evaluation.certificate import Certificate, Defect, judge_evaluations
+from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
+from pneuopt.evaluation.requirements import (
+    METRICS,
+    REQUIREMENT_KINDS,
+    RiseTime,
+    SettlingTime,
+    SteadyStateError,
+    describe_value,
+    metric_name,
+    requirement_values,
+    upper_limit,
+    user_value,
+)
+from pneuopt.evaluation.response import cases
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.status import Code, ProgressCallback, Status
-from pneuopt.tuning.certifier import MAX_CERTIFIED_EXCESS, Certifier
-from pneuopt.tuning.confirmation import confirm_infeasible, describe_confirmation
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code, ProgressCallback, Status, provenance
 from pneuopt.tuning.feasibility import check_feasibility
-from pneuopt.tuning.merit import compute_merits
-from pneuopt.tuning.method import Method, SearchResult, TuningTask
+from pneuopt.tuning.method import Method, SearchResult, TuningTask, describe_agreement
+from pneuopt.tuning.racing import compute_merits
 from pneuopt.tuning.relaxation import (
     limit_excess,
     limits_with_settling,
@@ -25,10 +54,241 @@ from pneuopt.tuning.relaxation import (
     relaxation_row,
     relaxation_specification,
 )
-from pneuopt.tuning.responses import to_records
-from pneuopt.tuning.result import Refusal, TuningResult, relaxation_share, with_relaxations
-from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.result import (
+    RELAXATION_COLUMNS,
+    Refusal,
+    TuningResult,
+    relaxation_share,
+    requirement_table,
+    with_relaxations,
+)
+from pneuopt.tuning.simulator import Simulator, to_records, worst_values
 from pneuopt.tuning.space import Space
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+# Relative difference of the certified from the claimed objective that a certificate allows, up or down. A smaller one
+# refuses designs for the search's coarser samples; a larger one certifies designs whose response grazes the band, and
+# claims that the search has misread.
+MAX_CERTIFIED_EXCESS = 0.01
+# Defects that a status tells: fewer hide that there are several; more bury the remedy.
+MAX_DEFECTS_TOLD = 3
+# What is said of a design that has no value of a metric; where nothing stands here, it "has no" that metric.
+WORDS_WITHOUT_VALUE = {
+    SettlingTime.metric.name: "does not settle within its horizon",
+    RiseTime.metric.name: "does not reach 90 % of its step within its horizon",
+}
+TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.metric.headline)
+
+
+@dataclass(frozen=True, eq=False)
+class Certifier:
+    """Make the certificate of gains: their independent simulation, beside the claim of the search where there is one.
+
+    Parameters
+    ----------
+    task : TuningTask
+    method : Method, optional
+        Named in the provenance; None where nothing was sought.
+    """
+
+    task: TuningTask
+    method: Method | None = None
+
+    def certify(self, simulator: Simulator, found: SearchResult, point: Array) -> TuningResult:
+        """Simulate a point by both simulations; the result has its gains where the certificate holds."""
+        import pandas as pd
+
+        rows = zip(simulator.cases, simulator.table(point, self.task.spec), strict=True)
+        claimed = pd.DataFrame({case.label: metrics for case, metrics in rows})
+        result = self._prove(found, self.task.space.parameters_at(point), claimed)
+        values = dict(zip(self.task.space.names, point.tolist(), strict=True))
+        if result.status.converged:
+            return replace(result, parameters=self.task.space.parameters.with_values(values))
+        return replace(result, best=values if np.isfinite(point).all() else {})
+
+    def certify_given(self) -> TuningResult:
+        """The certificate of the task's gains as they stand, of which no search claims anything."""
+        import pandas as pd
+
+        task = self.task
+        every = cases(task.references, task.scenarios, task.space.parameters)
+        unclaimed = pd.DataFrame(np.nan, index=[*METRICS], columns=[case.label for case in every])
+        return self._prove(None, task.space.parameters, unclaimed)
+
+    def _prove(self, found: SearchResult | None, parameters: ParameterSet, claimed: "pd.DataFrame") -> TuningResult:
+        """The result of parameters, with the given ones; `found` is None where nobody has claimed the figures."""
+        import pandas as pd
+
+        ripple = ("SettlingTimeRaw", "Ripple") if self.task.loop.dither_period(parameters) else ()
+        shown = [n for n in METRICS if n in (*TABLE_METRICS, *ripple, *self.task.spec.metric_names)]
+        claimed = claimed.loc[shown]
+        try:
+            evaluations, contacts = self._evaluate(parameters)
+            within = self._compare(found, claimed, tabulate_metrics(evaluations).loc[shown]).converged
+            proof = self._judge(evaluations, continues=(within or found is None) and not contacts)
+            slopes, certified = _friction_slopes(proof.metrics), proof.metrics.loc[shown]
+            status = _contact_status(contacts) if contacts else self._certificate_status(found, claimed, proof)
+        except ConvergenceError as error:
+            proof, certified, contacts, slopes, within = None, claimed * np.nan, [], {}, False
+            status = Status(Code.NOT_CERTIFIED, (str(error),))
+        deviation = (claimed - certified).abs().max(axis=1).items() if found is not None else ()
+        marks = {"contacts": float(len(contacts))} if contacts else {}
+        fails_late = within and not contacts and not status.converged
+        marks |= {"fails_late": 1.0} if fails_late else {}
+        active, stats = (found.active, found.stats) if found is not None else ((), {})
+        return TuningResult(
+            self.task.space.parameters,
+            claimed,
+            certified,
+            requirement_table(self.task.spec, claimed, certified, active),
+            pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.task.space.names], dtype=float),
+            active,
+            status,
+            {**stats, **{f"deviation.{n}": float(v) for n, v in deviation}, **marks, **slopes},
+            self._provenance(),
+            proof,
+            refusal=Refusal.END_STOP if contacts else Refusal.LATE if fails_late else None,
+        )
+
+    def _provenance(self) -> dict[str, str]:
+        method, spec = (self.method,) if self.method is not None else (), self.task.spec
+        return provenance(*method, *spec.weights, *spec.limits, *self.task.references, *self.task.scenarios.items())
+
+    def _evaluate(self, parameters: ParameterSet) -> tuple[tuple[CaseEvaluation, ...], list[str]]:
+        """Every case over its horizon, and the warnings of end stops and emptied chambers that the responses met."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", PhysicsWarning)
+            found = evaluate_cases(
+                self.task.loop,
+                self.task.references,
+                parameters,
+                scenarios=self.task.scenarios,
+                band=self.task.spec.band,
+                envelope=self.task.spec.envelope,
+            )
+            return tuple(found), [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
+
+    def _judge(self, evaluations: Sequence[CaseEvaluation], *, continues: bool) -> Certificate:
+        """The certificate; a rest off the reference is allowed as far as a limit on SteadyStateError says."""
+        allowed = self.task.spec.limit(SteadyStateError)
+        rest_error = allowed if np.isfinite(allowed) else 0.0
+        return judge_evaluations(evaluations, self.task.spec.band, rest_error, continues=continues)
+
+    def _certificate_status(self, found: SearchResult | None, claimed: "pd.DataFrame", proof: Certificate) -> Status:
+        """Whether the independent evaluation confirms the search, and finds no defect that is not accepted."""
+        status = self._compare(found, claimed, proof.metrics.loc[claimed.index])
+        defects = dict.fromkeys(f.sentence for f in proof.findings if f.defect not in self.task.accept)
+        if (found is not None and not found.status.converged) or not defects:
+            details = [f"accepted: {f.sentence}" for f in proof.findings] if status.converged else proof.notes
+            return status.with_details(*details[:MAX_DEFECTS_TOLD])
+        words = dict.fromkeys(f.defect.value for f in proof.findings if f.defect not in self.task.accept)
+        if found is None:
+            broken = () if status.converged else status.sentences
+            return Status(Code.NOT_CERTIFIED, (*list(defects)[:MAX_DEFECTS_TOLD], *broken))
+        remedy = f"limit SettlingTime or MaxSensitivity, or accept it by name: {', '.join(map(repr, words))}"
+        if Defect.STANDS_STILL.value in words and self.task.spec.limits:
+            limits = " and ".join(metric_name(q) for q in self.task.spec.limits)
+            remedy = f"the search found only designs that stand still: {limits} may leave no room to move; relax them"
+        broken = () if status.converged else status.sentences[:1]
+        return Status(Code.NOT_CERTIFIED, (*list(defects)[:MAX_DEFECTS_TOLD], *broken, remedy))
+
+    def _compare(self, found: SearchResult | None, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
+        """Whether the certified metrics keep the limits and agree with the claimed objective, where there is one."""
+        if found is None:
+            return self._check_limits(certified)
+        if not found.status.converged:
+            return found.status
+        spec = self.task.spec
+        claim, proof = (worst_values([requirement_values(dict(f[r])) for r in f]) for f in (claimed, certified))
+        for q in spec.violations(proof):
+            n, (value, allowed) = metric_name(q), describe_value(q, proof[metric_name(q)])
+            claim_text = f"claimed {describe_value(q, claim[n])[0]}"
+            verdict = f"{n} is {value}{self._worst_case(certified, n)}, {allowed}, {claim_text}"
+            return Status(Code.NOT_CERTIFIED, (verdict, f"give {n} more room"))
+        for n in (metric_name(q) for q in spec.weights if np.isnan(proof[metric_name(q)])):
+            claim_text = "" if np.isnan(claim[n]) else f", claimed {claim[n]:.6g}"
+            lack = WORDS_WITHOUT_VALUE.get(n, f"has no {n}")
+            verdict = f"the design found {lack}{self._worst_case(certified, n)}{claim_text}"
+            return Status(Code.NOT_CERTIFIED, (verdict, "give the limits more room, or lengthen the horizon"))
+        ours, theirs = spec.objective(proof), spec.objective(claim)
+        if not objectives_agree(ours, theirs, found.stats["optimum"], spec.resolution):
+            verdict = f"the objective is {ours:.6g}, claimed {min(theirs, found.stats['optimum']):.6g}"
+            cause = "the optimum grazes the band, or does not survive rounding, or the search misread it"
+            return Status(Code.NOT_CERTIFIED, (verdict, cause, "ask for more digits or a wider band"))
+        agreeing, warning = describe_agreement(found.stats)
+        verdict = f"certified objective {ours:.6g}, claimed {theirs:.6g}"
+        return Status(Code.CONVERGED, (f"{verdict}, {agreeing}" if agreeing else verdict,)).with_details(warning)
+
+    def _check_limits(self, certified: "pd.DataFrame") -> Status:
+        """Whether the certified metrics keep the limits; if not, by how much each of them is broken."""
+        spec, count = self.task.spec, len(certified.columns)
+        proof = worst_values([requirement_values(dict(certified[r])) for r in certified])
+        broken = list[str]()
+        for q in spec.violations(proof):
+            n, value = metric_name(q), proof[metric_name(q)]
+            (shown, allowed), worst = describe_value(q, value), self._worst_case(certified, n)
+            if np.isnan(value):
+                broken.append(f"the loop {WORDS_WITHOUT_VALUE.get(n, f'has no {n}')}{worst}, {allowed}")
+                continue
+            excess = 100 * abs(user_value(q, value) / user_value(q, upper_limit(q)) - 1)
+            broken.append(f"{n} is {shown}{worst}, {allowed}" + (f": off by {excess:.3g} %" if excess < inf else ""))
+        if broken:
+            return Status(Code.NOT_CERTIFIED, tuple(broken))
+        missing = [n for n in (metric_name(q) for q in spec.weights) if np.isnan(proof[n])]
+        if missing:
+            lack = WORDS_WITHOUT_VALUE.get(missing[0], f"has no {missing[0]}")
+            return Status(Code.NOT_CERTIFIED, (f"the loop {lack}{self._worst_case(certified, missing[0])}",))
+        kept = (
+            f"keep {len(spec.limits)} limit{'s' * (len(spec.limits) > 1)}" if spec.limits else "have no limit to keep"
+        )
+        return Status(Code.CONVERGED, (f"the gains as they stand {kept} in {count} case{'s' * (count > 1)}",))
+
+    def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
+        """The words " at" and the worst case of a metric, where there are several cases."""
+        values = requirement_values({metric: certified.loc[metric].to_numpy(dtype=float)})[metric]
+        k = int(np.argmax(np.where(np.isnan(values), np.inf, values)))
+        return f" at {certified.columns[k]}" if len(values) > 1 else ""
+
+
+def certified_objective(spec: Specification, result: TuningResult) -> float:
+    """The objective by a result's certificate, the worst over the cases."""
+    values = [requirement_values(dict(column)) for _, column in result.certified.items()]
+    return spec.objective(worst_values(values))
+
+
+def objectives_agree(certified: float, claimed: float, optimum: float, resolution: float) -> bool:
+    """Whether a certified objective is no worse than the claim and the optimum before rounding, and not far better.
+
+    A claim far above the certificate is as wrong as one far below: the search has then compared other figures than
+    those of the response. Near zero, where no relative difference counts, `resolution` decides.
+
+    Examples
+    --------
+    >>> objectives_agree(4e-16, 0.0, 0.0, 1e-6)
+    True
+    >>> objectives_agree(0.3, 0.4, 0.4, 1e-6), objectives_agree(0.4, 0.3, 0.3, 1e-6)
+    (False, False)
+    """
+    lowest, highest = claimed, min(claimed, optimum)
+    above = lowest - MAX_CERTIFIED_EXCESS * abs(lowest) - resolution
+    below = highest + MAX_CERTIFIED_EXCESS * abs(highest) + resolution
+    return above <= certified <= below
+
+
+def _friction_slopes(certified: "pd.DataFrame") -> dict[str, float]:
+    """The slope of friction with which each case's margins are read [N s/m, or N m s/rad]."""
+    rows = certified.loc[[n for n in certified.index if n == "FrictionSlope"]]
+    return {f"friction_slope[{case}]": float(v) for case, column in rows.items() for v in column}
+
+
+def _contact_status(contacts: Sequence[str]) -> Status:
+    """The status of a design whose response meets an end stop or empties a chamber, where the model no longer holds."""
+    remedy = "shorten the horizon, take a smaller step, or start elsewhere, Step(..., start={'position': ...})"
+    return Status(Code.NOT_CERTIFIED, (*dict.fromkeys(contacts), remedy))
+
 
 # Margins tried, each twice the one before. Fewer give up on designs that need more room to survive the certificate;
 # each more costs another search where no design exists.
@@ -394,3 +654,217 @@ def _continue_from_feasible(search: Search, point: Array) -> TuningResult:
 def end_point(result: TuningResult, space: Space) -> Array:
     """The gains in which a search ended, certified or rejected, shape (n,)."""
     return np.array([result.best.get(n, result.parameters.value(n)) for n in space.names])
+
+
+def confirm_refusal(search: Search, refused: TuningResult) -> tuple[TuningResult, bool]:
+    """A design that the certificate lets through, or the refused one's result, which says that none was found.
+
+    The second tells whether a design stands whose improvement was interrupted.
+
+    Parameters
+    ----------
+    search : Search
+        Whose design was refused.
+    refused : TuningResult
+    """
+    resting = search.among_resting()
+    longer = resting.lengthen(rests=True)
+    try:
+        points, count = find_candidates(lambda at: _excess(resting, longer, at), search.space, search.progress)
+        for k, point in enumerate(points):
+            search.progress(f"certifying candidate {k + 1} of {len(points)} of the second search")
+            held = search.certify_point(point)
+            if held.status.converged:
+                words = f"the first search's design was refused ({refused.status.verdict}); better ones may exist"
+                best, is_stopped = _improve(search, longer, held)
+                return replace(best, status=best.status.with_details(words)), is_stopped
+    except KeyboardInterrupt:
+        sentences = (f"nothing found so far: {refused.status.verdict}", "run again for an answer")
+        return replace(refused, status=Status(Code.INTERRUPTED, sentences)), False
+    failed = f"of {len(points)} designs that it finds none is certified" if points else "finds none that comes to rest"
+    words = f"{describe_confirmation(count)}, {failed}, either"
+    stats = {**refused.stats, "confirmation.simulations": float(count)}
+    return replace(refused, status=refused.status.with_details(words), stats=stats), False
+
+
+def _excess(resting: Search, longer: Search, points: Array) -> Array:
+    """The largest relative excess over a limit; of points that keep all of them, over the longer horizon as well."""
+    found = _excess_within(resting, points)
+    kept = found <= 0
+    if kept.any() and longer is not resting:
+        found[kept] = np.maximum(found[kept], _excess_within(longer, points[kept]))
+    return found
+
+
+def _excess_within(search: Search, points: Array) -> Array:
+    """The largest relative excess over a limit within a search's horizon, in which the response has to settle."""
+    spec = search.tighten(0.0)
+    return limit_excess(search.simulator.coarse(spec).values(points, spec), spec)
+
+
+def _improve(search: Search, longer: Search, held: TuningResult) -> tuple[TuningResult, bool]:
+    """A design that is certified, or a better one that a short search about it finds; whether that was interrupted."""
+    margin = search.method.margin
+    try:
+        found = longer.find(margin, end_point(held, search.space), 1)
+        if not (found.is_complete and found.status.converged):
+            return held, found.status.code is Code.INTERRUPTED
+        better = search.certify_roundings(search.restate(found), margin)
+    except KeyboardInterrupt:
+        return held, True
+    before, after = (certified_objective(search.spec, result) for result in (held, better))
+    return (better if better.status.converged and after < before else held), False
+
+
+# Members of the population and trials in all, for each free gain. Fewer miss designs that keep the limits; more delay
+# the answer where there is none.
+MEMBERS_A_GAIN, TRIALS_A_GAIN = 15, 900
+SEED = 0  # of the random numbers, so that an answer repeats
+# Designs that are certified one after the other, at most, and how far apart they lie, a share of a gain's range. Fewer
+# or closer ones fail alike; each more costs an independent simulation of every case.
+MAX_CANDIDATES, CANDIDATE_DISTANCE = 8, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Confirmation:
+    """What the second search found.
+
+    Attributes
+    ----------
+    point : ndarray, shape (n,)
+        The gains closest to the limits.
+    share : float
+        The largest relative excess over a limit there, as `limit_excess` counts; at most 0 where all are kept.
+    simulations : int
+        Candidates simulated.
+    """
+
+    point: Array
+    share: float
+    simulations: int
+
+
+def confirm_infeasible(
+    simulator: Simulator, spec: Specification, room: float, progress: ProgressCallback
+) -> Confirmation:
+    """Search for gains that keep all limits, with some room, until they are found or the trials are used up.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    spec : Specification
+        As asked for.
+    room : float
+        Share of every limit that is to be left; the search ends where it is.
+    progress : callable
+        Receives a line of text a generation.
+
+    Returns
+    -------
+    Confirmation
+    """
+    quick, stable = simulator.coarse(spec), spec.with_stability()
+    found, count = _minimise_excess(
+        lambda points: limit_excess(quick.values(points, stable), stable),
+        simulator.space,
+        lambda excess: excess <= -room,
+        lambda excess: progress(f"confirming that no design keeps all limits: {_describe_closest(excess)}"),
+    )
+    share = float(limit_excess(simulator.values(found[None], stable), stable)[0])
+    return Confirmation(found, share, count)
+
+
+def find_candidates(
+    excess: Callable[[Array], Array], space: Space, progress: ProgressCallback
+) -> tuple[list[Array], int]:
+    """Designs that keep all limits, to be certified one after the other, by the same search.
+
+    Parameters
+    ----------
+    excess : callable
+        The largest relative excess over a limit of points, shape (m, n): shape (m,), at most 0 where all are kept.
+    space : Space
+    progress : callable
+        Receives a line of text a generation.
+
+    Returns
+    -------
+    points : list of ndarray, shape (n,)
+        The one with the most room first, then others that lie apart from those before; empty where there is none.
+    simulations : int
+        Candidates simulated.
+    """
+    kept, rooms = list[Array](), list[float]()
+
+    def record(points: Array) -> Array:
+        values = excess(points)
+        kept.extend(points[values <= 0])
+        rooms.extend(values[values <= 0].tolist())
+        return values
+
+    _, count = _minimise_excess(
+        record,
+        space,
+        lambda _: False,
+        lambda excess: progress(f"searching for other designs that keep all limits: {_describe_closest(excess)}"),
+    )
+    chosen = list[Array]()
+    for k in np.argsort(rooms, kind="stable").tolist():
+        unit = space.to_unit(kept[k])
+        if all(np.max(np.abs(unit - space.to_unit(other))) > CANDIDATE_DISTANCE for other in chosen):
+            chosen.append(kept[k])
+    return chosen[:MAX_CANDIDATES], count
+
+
+def _minimise_excess(
+    excess: Callable[[Array], Array], space: Space, is_enough: Callable[[float], bool], report: Callable[[float], None]
+) -> tuple[Array, int]:
+    """The point with the least excess that SciPy's differential evolution finds, shape (n,), and how many it tried."""
+    count = 0
+
+    def cost(unit: Array) -> Any:
+        nonlocal count
+        count += unit.shape[1]
+        return excess(space.from_unit(np.clip(unit.T, 0.0, 1.0)))
+
+    def is_found(intermediate_result: OptimizeResult) -> bool:
+        report(float(intermediate_result.fun))
+        return is_enough(float(intermediate_result.fun))
+
+    settings: Any = {
+        "bounds": [(0.0, 1.0)] * len(space.names),
+        "popsize": MEMBERS_A_GAIN,
+        "maxiter": TRIALS_A_GAIN // MEMBERS_A_GAIN,
+        "x0": space.to_unit(space.start),
+        "init": "sobol",
+        "polish": False,
+        "vectorized": True,
+        "updating": "deferred",
+        "seed": SEED,
+        "callback": is_found,
+    }
+    found: Any = differential_evolution(cost, **settings)
+    return space.from_unit(np.clip(found.x, 0.0, 1.0)), count
+
+
+def _describe_closest(excess: float) -> str:
+    """How far the best candidate so far lies beyond its limits, or within them, in words.
+
+    Examples
+    --------
+    >>> _describe_closest(0.123), _describe_closest(-0.61)
+    ('the closest is 12.3 % beyond them', 'the best stays 61 % below them')
+    """
+    share = f"{100 * abs(excess):.3g} %"
+    return f"the closest is {share} beyond them" if excess > 0 else f"the best stays {share} below them"
+
+
+def describe_confirmation(simulations: int) -> str:
+    """Say in words by what an infeasible answer, or a refusal, is confirmed.
+
+    Examples
+    --------
+    >>> describe_confirmation(3600)
+    "a second search, SciPy's differential evolution over 3600 simulations"
+    """
+    return f"a second search, SciPy's differential evolution over {simulations} simulations"

@@ -3,43 +3,42 @@
 A linear loop whose response shooting nodes follow closely is tuned by them (`TwoPhase`); any other, with friction, clip
 or sampling, by compiled simulation (`Racing`). The gains are rounded first and certified then, so that the printed
 numbers are proven.
+
+`METHODS`: the methods of `tune`, where a new one is registered; `choose_method` takes the first that suits.
 """
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import inf
+from types import MappingProxyType
 
 from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.dynamics.simulate import MAX_STEPS
-from pneuopt.evaluation.budget import check_steps
-from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
-from pneuopt.evaluation.dither_effect import describe_swing
+from pneuopt.evaluation.dither import describe_swing
 from pneuopt.evaluation.evaluate import metric_limits, relevant_units
-from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
+from pneuopt.evaluation.plants import ExpectedPlants, expected_plants
 from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTime
+from pneuopt.evaluation.response import cases, check_steps
 from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify, specify_limits
-from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.quantities.status import Code, ProgressCallback, Status
-from pneuopt.tuning.certifier import Certifier, certified_objective
+from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_parameters
+from pneuopt.quantities.status import Code, Progress, ProgressCallback, ProgressReporter, Status
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
-from pneuopt.tuning.methods import choose_method
 from pneuopt.tuning.on_rig import certify_on_rig, check_rig
-from pneuopt.tuning.refusal import confirm_refusal
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
-from pneuopt.tuning.search import UNTRIED, Search, relax
+from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
+from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuning.validation import validate_design
 
 __all__ = ["TuningResult", "certify", "prepare_search", "prepare_task", "tune"]
@@ -383,3 +382,12 @@ def prepare_search(task: TuningTask, method: Method | None = None, progress: Pro
     require(len(names) > 0, f"{free}: without effect on a linear loop; free a gain as well")
     space = Space(task.space.parameters, names)
     return Search(replace(task, space=space), method, progress or (lambda _: None))
+
+
+# By their key in a tuning's file; the first that suits a task is chosen: `Racing` suits every task.
+METHODS: Mapping[str, type[TwoPhase] | type[Racing]] = MappingProxyType({"two_phase": TwoPhase, "racing": Racing})
+
+
+def choose_method(task: TuningTask) -> Method:
+    """Choose the first method in `METHODS` that suits a task."""
+    return next(method for method in (kind() for kind in METHODS.values()) if method.suits(task))

@@ -7,9 +7,8 @@ from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Reference
 from pneuopt.evaluation.specification import Objective
-from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet, check_parameters
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.tune import tune
 

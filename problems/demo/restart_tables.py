@@ -37,10 +37,9 @@ from pneuopt.dynamics.system import System, discretise, names
 from pneuopt.export.languages import make_reference_run, write_c99, write_python, write_structured_text
 from pneuopt.export.program import ControllerProgram, controller_program
 from pneuopt.export.writer import make_header
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive, RotaryDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.models.rotary import RotaryDrive
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from problems.shared.claims import Claim, arguments, finish, frame

@@ -25,8 +25,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.logs.checks.findings import StatedAxis
-from pneuopt.logs.doctor import CHECKS, examine
+from pneuopt.logs.doctor import CHECKS, StatedAxis, examine
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame
 

@@ -13,7 +13,7 @@ import numpy as np
 
 import pneuopt as po
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
-from pneuopt.dynamics.runge_kutta import rk4
+from pneuopt.dynamics.integrators import rk4
 from problems.shared.arrays import Array
 from problems.shared.p32 import PRESSURE_NOISE, SAMPLE_TIME, TOLERANCE
 from problems.shared.p32_moves import Outing

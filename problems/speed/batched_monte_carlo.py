@@ -28,11 +28,10 @@ from scipy.integrate import solve_ivp
 import pneuopt as po
 from pneuopt.dynamics.compiled.functions import compile_rate
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
+from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
-from pneuopt.studies.fleet import RATE_MARGIN
-from pneuopt.tuning.readings import loop_pieces
-from pneuopt.tuning.space import fastest_eigenvalue, rk4_substeps
+from pneuopt.studies.batch import RATE_MARGIN
+from pneuopt.tuning.space import fastest_eigenvalue, loop_pieces, rk4_substeps
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame
 from problems.shared.t32 import SPREADS, STEP, benchmark

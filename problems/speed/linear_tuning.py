@@ -27,7 +27,7 @@ from scipy.optimize import differential_evolution
 
 import pneuopt as po
 from pneuopt.evaluation.specification import specify
-from pneuopt.tuning.merit import compute_merits
+from pneuopt.tuning.racing import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.two_phase import solve_two_phase

@@ -24,9 +24,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import pneuopt as po
+from pneuopt.dynamics.compiled.compiler import find_compiler
 from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
-from pneuopt.dynamics.compiled.toolchain import find_compiler
 from pneuopt.quantities.errors import require
 from problems.shared.arrays import Array, names, parameter_vector
 from problems.shared.b32 import FREE, VALVE, generate

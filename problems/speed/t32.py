@@ -40,9 +40,8 @@ from scipy.optimize import differential_evolution
 import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.plotting import BLUE, GREY, RED, axes_grid, legend_above
-from pneuopt.tuning.race import Race
+from pneuopt.tuning.racing import Race, SuccessHistory, first_population
 from pneuopt.tuning.search import Search
-from pneuopt.tuning.shade import SuccessHistory, first_population
 from pneuopt.tuning.tune import prepare_search, prepare_task
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame

@@ -29,7 +29,7 @@ from scipy.optimize import differential_evolution
 import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.plotting import plot_front
-from pneuopt.tuning.merit import compute_merits
+from pneuopt.tuning.racing import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.two_phase import two_phase_path

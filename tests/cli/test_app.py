@@ -1,5 +1,8 @@
+"""Each command has a line and examples that it would take, within 80 columns; the shell completes."""
+
 import json
 import os
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -9,16 +12,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from pneuopt.cli import identify as identify_module
 from pneuopt.cli import tune as tune_module
-from pneuopt.cli.app import app
+from pneuopt.cli.app import COMMAND_HELP, app
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning
 from pneuopt.logs.read_log import read_log
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.least_squares import LeastSquares
@@ -374,3 +378,39 @@ def test_a_valve_for_0_to_10_V_is_simulated_as_one_about_zero_and_written_as_its
     np.testing.assert_array_equal(wire["position"], about["position"])
     shown = [json.loads(Path(f"{name}.json").read_text(encoding="utf-8"))["certified"] for name in ("wire", "about")]
     assert shown[0] == shown[1]
+
+
+COMMANDS = get_command(app).commands  # type: ignore[attr-defined]  # of a click.Group
+
+
+def test_every_command_has_its_line_and_no_other_has() -> None:
+    assert set(COMMAND_HELP) == set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMAND_HELP)
+def test_examples_are_shown_whole_and_would_be_taken(name: str) -> None:
+    shown = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "80"}).output
+    assert all(len(line) <= 80 for line in shown.splitlines())
+    for example in COMMAND_HELP[name].examples:
+        assert f"    {example}\n" in shown
+        program, command, *arguments = shlex.split(example)
+        assert (program, command) == ("pneuopt", name)
+        COMMANDS[name].make_context(name, arguments)  # raises where an option or an argument is not there
+
+
+def test_the_list_of_commands_cuts_no_line() -> None:
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
+    assert all(said.line in shown for said in COMMAND_HELP.values())
+
+
+def test_a_shell_completes_commands_and_options() -> None:
+    code = "import sys; sys.argv = ['pneuopt']; from pneuopt.__main__ import main; main()"
+
+    def complete(words: str) -> list[str]:
+        asked = {"_PNEUOPT_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=os.environ | asked, capture_output=True, text=True, check=True)
+        return done.stdout.split()
+
+    assert complete("pneuopt id") == ["identify"]
+    assert "--report" in complete("pneuopt tune --re")

@@ -17,7 +17,7 @@ from pneuopt.control.sensor import Encoder
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.tuning import Tuning
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Viscous
 
 

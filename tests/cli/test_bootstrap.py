@@ -10,8 +10,7 @@ import pytest
 
 import pneuopt.cli.identify as identify_module
 from pneuopt.identification.identify import identify
-from pneuopt.identification.marks import Mark
-from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.studies.bootstrap import Bootstrap
 from tests.cli.test_check import folder, run, write
 from tests.logs.bad_logs import swing

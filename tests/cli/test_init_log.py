@@ -9,10 +9,9 @@ import pytest
 from pneuopt.files.drive import read_drive
 from pneuopt.files.first_files import first_files, first_kinds
 from pneuopt.files.tuning import read_tuning
-from pneuopt.identification.checks import check_logs
+from pneuopt.identification.problem import check_logs
 from pneuopt.logs.read_log import read_log
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Intersample, ParameterSet
 from tests.cli.test_init import run
 
 

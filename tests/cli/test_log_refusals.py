@@ -8,7 +8,7 @@ from typer.testing import CliRunner, Result
 from pneuopt.cli import identify as identify_module
 from pneuopt.cli.app import app
 from pneuopt.cli.shared import write_csv
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from tests.logs.bad_logs import BAD_LOGS
 
 DRIVE = """

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
+from pneuopt.cli.run import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import Outputs, finish, warn_of_status
 from pneuopt.files.drive import read_fit
 from pneuopt.quantities.status import Code, Status

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from pneuopt.cli import study as study_module
-from pneuopt.cli import study_sensitivity
+from pneuopt.cli import study as study_sensitivity
 from pneuopt.studies.batch import evaluate_batch
 from pneuopt.studies.sensitivity import sensitivity
 from pneuopt.studies.sweep import sweep

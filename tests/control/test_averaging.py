@@ -18,7 +18,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, define, names
 from pneuopt.models.catalog import r25, t32
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, LuGre, Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.models.pneumatic.valve import opening

@@ -10,7 +10,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, Form
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.trajectories import Trajectory

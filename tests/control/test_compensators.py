@@ -36,15 +36,14 @@ from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.margins import frequency_response, margins, noise_gain
-from pneuopt.evaluation.record import record
 from pneuopt.evaluation.requirements import Overshoot, SettlingTime
 from pneuopt.evaluation.response import loop_inputs
-from pneuopt.evaluation.rig import Actuator, Rig, Sensor
+from pneuopt.evaluation.rig import Actuator, Rig, Sensor, record
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.tuned import write_tuned
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models import catalog
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import SecondOrder
@@ -53,8 +52,8 @@ from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.unit_algebra import unit_ratio
-from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
+from pneuopt.quantities.units import unit_ratio
+from pneuopt.tuning.gradients import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space

@@ -31,14 +31,13 @@ from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.margins import frequency_response, margins, noise_gain
-from pneuopt.evaluation.record import record
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
-from pneuopt.evaluation.rig import Rig, Sensor
+from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.evaluation.specification import specify
 from pneuopt.export.languages import Language, export_controller
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models import catalog
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
@@ -46,7 +45,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
+from pneuopt.tuning.gradients import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space

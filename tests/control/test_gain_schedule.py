@@ -19,13 +19,12 @@ from pneuopt.dynamics.system import names
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.margins import frequency_response, margins, sensitivity_terms
-from pneuopt.evaluation.record import record
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
-from pneuopt.evaluation.rig import Rig, Sensor
+from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models import catalog
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet

@@ -13,7 +13,7 @@ from pneuopt.dynamics.system import System
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.margins import margins, sensitivity_terms
 from pneuopt.models import catalog
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.parameters import ParameterSet

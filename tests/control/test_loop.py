@@ -18,7 +18,7 @@ from pneuopt.dynamics.system import System, define, names
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.margins import frequency_response
 from pneuopt.evaluation.requirements import Overshoot, PeakControl, Requirement, SettlingTime
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError

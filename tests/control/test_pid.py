@@ -38,7 +38,7 @@ from pneuopt.evaluation.margins import frequency_response, sensitivity_terms
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.tuning import read_tuning
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, SecondOrder
@@ -47,7 +47,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
+from pneuopt.tuning.gradients import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space

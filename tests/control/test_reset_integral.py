@@ -16,7 +16,7 @@ from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.margins import margins
 from pneuopt.files.tuning import read_tuning
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import SecondOrder

@@ -16,7 +16,7 @@ from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.evaluation.scenarios import Scenarios, corners
 from pneuopt.evaluation.specification import specify
 from pneuopt.identification.logged_loop import LoggedLoop
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive

@@ -10,15 +10,14 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.hooks import Contact, Log, Start, Starts, ValidityLimit
+from pneuopt.dynamics.hooks import Contact, Excitation, Log, Start, Starts, ValidityLimit
 from pneuopt.dynamics.simulate import contacts, simulate
 from pneuopt.dynamics.system import System, define, names
-from pneuopt.evaluation.record import record
 from pneuopt.evaluation.requirements import SettlingTime
-from pneuopt.evaluation.rig import Rig, Sensor
+from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.identification.identify import identify
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.pneumatic.cylinder import Cylinder
@@ -217,3 +216,11 @@ def test_a_drive_regresses_the_candidates_of_friction_one_by_one(monkeypatch: py
     assert "stribeck velocity 0.025 m/s" in starts[0].label
     assert set(tried) == {0.025}  # also where the window of the filter was chosen
     assert len(starts) > 1
+
+
+def test_parameters_in_order_keep_their_order_in_a_plant() -> None:
+    own = Excitation(at_least={"static": "coulomb"}) | Excitation(at_least={"second": "load.force"})
+    assert own.with_prefix("friction").at_least == {
+        "friction.static": "friction.coulomb",
+        "friction.second": "load.force",
+    }

@@ -18,14 +18,13 @@ from pneuopt.dynamics import smooth
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, define
 from pneuopt.evaluation.metrics import step_metrics
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, UnknownNameError
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from problems.shared.paper2015 import paper_plant
 

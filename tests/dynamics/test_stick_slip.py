@@ -18,15 +18,14 @@ from pneuopt.dynamics import stick_slip
 from pneuopt.dynamics.simulate import StickSlipResult, simulate, simulate_stick_slip
 from pneuopt.dynamics.stick_slip import EventKind
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, define
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 BREAK_AWAY, STANDSTILL, REVERSAL = EventKind

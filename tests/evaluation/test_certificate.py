@@ -1,4 +1,9 @@
-"""What a certificate refuses, whatever was asked of a design, and the figures of designs that it certifies."""
+"""What a certificate refuses, whatever was asked of a design, and the figures of designs that it certifies.
+
+How a response ends, read off records that are made by hand.
+
+A settling band below what an encoder's counts show is noted beside the certificate's figures.
+"""
 
 from collections.abc import Mapping
 from functools import cache
@@ -8,18 +13,29 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.simulate import continue_simulation, simulate
 from pneuopt.dynamics.system import System, define
-from pneuopt.evaluation import continuation
-from pneuopt.evaluation.certificate import Certificate, Defect, certificate
-from pneuopt.evaluation.continuation import ContinuedResponse, continue_response
+from pneuopt.evaluation import certificate as continuation
+from pneuopt.evaluation.certificate import (
+    Certificate,
+    ContinuedResponse,
+    Defect,
+    Ending,
+    certificate,
+    continue_response,
+    describe_counts,
+    find_defects,
+)
 from pneuopt.evaluation.evaluate import evaluate_cases
+from pneuopt.evaluation.metric import Tolerance, longest_stay
 from pneuopt.evaluation.response import loop_inputs
-from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Stribeck
+from pneuopt.models.drives import ForceDrive
+from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
@@ -231,3 +247,157 @@ def test_a_design_that_takes_many_horizons_creeps() -> None:
     late = certificate(loop, Step(1.0, horizon=1.5), p)
     assert late.findings == ()
     assert any("beyond the horizon" in note for note in late.notes)
+
+
+STEP, BAND = Step(1.0, horizon=1.0), 0.02
+
+
+def ending(t: Array, error: Array) -> Ending:
+    """The ending of a response with this error that the end of the stroke cuts."""
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    return Ending(
+        ContinuedResponse(loop, STEP, None, t, 1.0 + error, np.ones_like(t), "the piston left the stroke"), BAND, "a"
+    )
+
+
+def decay(t: Array, dip: float) -> Array:
+    """A decay into the band that touches its edge at .8 s, is outside once more until .9 s, and then dies out."""
+    error = -np.exp(-t / 0.2)
+    return np.asarray(np.where((t > 0.84) & (t < 0.9), -dip, error))
+
+
+@pytest.mark.parametrize(("dip", "settled"), [(0.01, 0.78), (0.0205, 0.9)])
+def test_a_response_that_leaves_the_band_for_a_moment_has_settled(dip: float, settled: float) -> None:
+    """The record ends at 1.5 s; this was "creeps: 1.1 s after the step it is .3 % of the step away"."""
+    t = np.linspace(0.0, 1.5, 3001)
+    found = ending(t, decay(t, dip))
+    assert found.is_settled
+    assert found.settling_time == pytest.approx(settled, abs=5e-3)
+    assert list(find_defects(found)) == []
+
+
+def test_a_response_that_is_inside_as_long_as_ever_hunts_on() -> None:
+    """Of 1 s: .3 s inside, .3 s outside, and .25 s inside again, as in slow hunting."""
+    t = np.linspace(0.0, 1.0, 2001)
+    error = np.where(t < 0.15, -1.0, np.where((t < 0.45) | (t > 0.75), 0.01, 0.03 + 0.01 * t))
+    found = ending(t, np.asarray(error))
+    assert longest_stay(t, found.is_inside(error)) == pytest.approx(0.3, abs=2e-3)
+    assert not found.is_settled
+    assert [f.defect for f in find_defects(found)] != []
+    assert found.returns(0.0) == 1
+
+
+@pytest.mark.parametrize(("share", "inside"), [(1.0, True), (1.0005, False), (1.01, False)])
+def test_a_response_that_rests_beyond_the_band_is_outside(share: float, inside: bool) -> None:
+    """Exactly on the edge is inside; half a thousandth of the band beyond it is outside, as in the metrics."""
+    t = np.linspace(0.0, 1.5, 3001)
+    found = ending(t, -np.maximum(np.exp(-t / 0.1), share * BAND))
+    assert found.is_settled == inside
+    assert ([f.defect for f in find_defects(found)] == []) == inside
+    late = ending(t, np.where(t > 1.2, share * BAND, 0.0))  # the horizon is 1 s
+    assert late.refutes(0.5) != inside
+
+
+@pytest.mark.parametrize(("horizons", "refused"), [(0.9, False), (3.0, False), (5.0, True), (9.0, True)])
+def test_a_response_must_be_in_its_band_for_good_within_a_few_horizons(horizons: float, refused: bool) -> None:
+    """Three horizons are a user's who underrated the settling; five are none that a user would wait for."""
+    t = np.linspace(0.0, 30.0, 30001)
+    found = ending(t, np.where(t < horizons * STEP.horizon, -0.05, -0.5 * BAND))
+    assert found.is_settled
+    assert [f.defect for f in find_defects(found)] == [Defect.CREEPS] * refused
+
+
+def test_a_response_that_never_was_in_the_band_has_no_stay() -> None:
+    t = np.linspace(0.0, 1.0, 1001)
+    error = -0.5 * np.exp(-t / 5.0)
+    found = ending(t, error)
+    assert longest_stay(t, found.is_inside(error)) == 0.0
+    assert [f.defect for f in find_defects(found)] == [Defect.CREEPS]
+
+
+@pytest.mark.parametrize(("settled", "defects"), [(3.9, []), (4.1, [Defect.CREEPS])])
+def test_who_needs_more_than_four_horizons_creeps(settled: float, defects: list[Defect]) -> None:
+    """The step's horizon is 1 s; what comes in within four is settled, later than its user thought."""
+    t = np.linspace(0.0, 16.0, 8001)
+    found = ending(t, np.where(t < settled, -0.05, 0.0))
+    assert found.settling_time == pytest.approx(settled, abs=5e-3)
+    assert [f.defect for f in find_defects(found)] == defects
+
+
+@pytest.mark.parametrize(("ratio", "settles"), [(1.8, False), (2.2, True)])
+def test_who_came_in_late_must_stay_twice_as_long_as_before(ratio: float, settles: bool) -> None:
+    """Of the 1 s that is judged: .15 s inside, then outside until the last stay, which lasts a multiple of that."""
+    t = np.linspace(0.0, 1 / 0.9, 4001)
+    inside = ((t > 0.3) & (t < 0.45)) | (t > 1 - ratio * 0.15)
+    assert ending(t, np.where(inside, 0.01, 0.05)).is_settled == settles
+
+
+STEP_COUNTS = Step(0.02, horizon=0.05)
+
+
+def counted(measured: str = "position", resolution: float = 1e-3, dither: Dither | None = None) -> ClosedLoop:
+    sensor = Encoder(resolution)
+    return ClosedLoop(ForceDrive(Viscous()).system(), PID(1e-3), dither, measured=measured, sensor=sensor)
+
+
+def test_a_certificate_notes_a_band_below_half_a_count() -> None:
+    loop = counted()
+    given = loop.parameters.with_values({"pid.Kp": 100.0, "pid.Kd": 20.0, "pid.Tf": 0.01})
+    (note,) = [n for n in certificate(loop, STEP_COUNTS, given).notes if "narrower" in n]
+    assert note == (
+        "at 0 to 0.02 the settling band of +-0.4 mm is narrower than half the encoder's count of 1 mm, the controller "
+        "cannot tell inside from outside; take band = 0.025 or more, a larger step or a finer encoder"
+    )
+
+
+def test_a_reading_within_half_a_count_is_blind() -> None:
+    """Within half a count of the reference, outside the band too, the controller sees the reference."""
+    loop = counted()
+    given = loop.parameters.with_values({"pid.Kp": 100.0, "pid.Ki": 50.0})
+    assert describe_counts(loop, given, STEP_COUNTS, 0.024) is not None
+    starts = [loop.initial(given, [0.02 + off, 0.0], reference=0.02) for off in (-0.49e-3, 0.0, 0.49e-3)]
+    reading = [q.name for q in loop.states].index("sensor.reading")
+    assert [x[reading] for x in starts] == pytest.approx([0.02] * 3, abs=1e-15)
+
+
+@pytest.mark.parametrize(("band", "resolution"), [(0.025, 1e-3), (0.02, 8e-4), (1e-6, 0.0)])
+def test_a_band_of_half_a_count_is_seen(band: float, resolution: float) -> None:
+    loop = counted(resolution=resolution)
+    assert describe_counts(loop, loop.parameters, STEP_COUNTS, band) is None
+
+
+def test_a_tolerance_below_half_a_count_is_named_in_its_unit() -> None:
+    loop = ClosedLoop(
+        ForceDrive(Viscous()).system(), PID(sample_time=1e-3), measured="position", sensor=Encoder(resolution=1e-3)
+    )
+    told = describe_counts(loop, loop.parameters, Step(0.1), Tolerance(1e-4))
+    assert told is not None
+    assert told.startswith("the settling band of +-0.1 mm is narrower than half the encoder's count of 1 mm")
+    assert "take band = 0.5 mm or more" in told
+    assert describe_counts(loop, loop.parameters, Step(0.1), Tolerance(5e-4)) is None
+
+
+def test_a_sensor_without_counts_shows_every_band() -> None:
+    for sensor in (None, SensorLag(5e-3)):
+        loop = ClosedLoop(ForceDrive(Viscous()).system(), PID(1e-3), measured="position", sensor=sensor)
+        assert describe_counts(loop, loop.parameters, STEP_COUNTS, 1e-6) is None
+
+
+def test_a_dither_may_show_what_lies_between_counts() -> None:
+    loop = counted(dither=Dither(20.0))
+    for amplitude, ripple in ((0.0, False), (1.0, True)):
+        told = describe_counts(loop, loop.parameters.with_values({"dither.amplitude": amplitude}), STEP_COUNTS, 0.02)
+        assert told is not None
+        assert ("only by its dither's ripple" in told) == ripple
+
+
+def test_a_count_of_a_speed_is_that_of_its_filter() -> None:
+    """A count of 1 mm is 1/6 m/s behind a filter of 5 ms at 1 ms."""
+    loop, step = counted("speed"), Step(1.0, horizon=0.2)
+    assert loop.sensor_resolution(loop.parameters) == pytest.approx(1 / 6, rel=1e-12)
+    told = describe_counts(loop, loop.parameters, step, 0.02)
+    assert told == (
+        "the settling band of +-20 mm/s is narrower than half the 0.167 m/s by which one count changes the reading; "
+        "take band = 0.0834 or more, a finer encoder or a longer filter of the sensor"
+    )
+    assert describe_counts(loop, loop.parameters, step, 0.0834) is None

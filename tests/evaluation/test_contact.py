@@ -8,9 +8,8 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.certificate import certificate
-from pneuopt.evaluation.continuation import ContinuedResponse
-from pneuopt.evaluation.dither_verdict import Usefulness, judge_dither
+from pneuopt.evaluation.certificate import ContinuedResponse, certificate
+from pneuopt.evaluation.dither import Usefulness, judge_dither
 from pneuopt.models.friction import Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from problems.dither import dither_map

@@ -17,7 +17,7 @@ from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.requirements import IAE
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.models.catalog import r25
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import Load

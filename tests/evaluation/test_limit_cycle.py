@@ -9,7 +9,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.limit_cycle import find_limit_cycle
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import LuGre
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError

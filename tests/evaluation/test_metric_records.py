@@ -13,13 +13,12 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate, metric_units, relevant_units, report_metrics
-from pneuopt.evaluation.metric import AtMost, Metric, Requirement, Sense, Source
+from pneuopt.evaluation.metric import AtMost, Metric, Requirement, Sense, Source, StepRecord
 from pneuopt.evaluation.metrics import BandCentre, batch_metrics
 from pneuopt.evaluation.requirements import METRICS, REQUIREMENT_KINDS, StepEnvelope, user_limit
-from pneuopt.evaluation.step_record import StepRecord
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.catalog import t32
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import Integrator
 from pneuopt.quantities.errors import InputError

@@ -16,7 +16,7 @@ from pneuopt.control.sensor import Encoder
 from pneuopt.evaluation.rest_check import RestCheck, RestKind, check_rest
 from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.files.results import load_result
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.arrays import Array

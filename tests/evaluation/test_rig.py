@@ -14,10 +14,9 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.evaluation.record import Recording, record
-from pneuopt.evaluation.rig import Actuator, Rig, Sensor
+from pneuopt.evaluation.rig import Actuator, Recording, Rig, Sensor, record
 from pneuopt.identification.identify import identify
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator

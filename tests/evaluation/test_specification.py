@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from pneuopt.evaluation.band import Tolerance
+from pneuopt.evaluation.metric import Tolerance
 from pneuopt.evaluation.requirements import (
     GainMargin,
     MaxComplementarySensitivity,

@@ -13,10 +13,8 @@ from scipy.stats import rankdata
 from scipy.stats import t as student
 
 import pneuopt
-from pneuopt.evaluation.expected_plants import expected_plants
-from pneuopt.evaluation.monte_carlo import monte_carlo
-from pneuopt.evaluation.sampling import Sampling, Seed, further, generator
-from pneuopt.evaluation.scenarios import Factor, draws, samples, tolerances
+from pneuopt.evaluation.plants import expected_plants, monte_carlo
+from pneuopt.evaluation.scenarios import Factor, Sampling, Seed, draws, further, generator, samples, tolerances
 from pneuopt.files.tuning import read_scenarios, read_validation_scenarios
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
@@ -153,8 +151,8 @@ def test_a_seed_is_a_whole_number(seed: Seed) -> None:
 
 
 OTHER_GENERATORS = {  # what else is seeded by a number that is no constant, and draws no plant
-    "evaluation/record.py": "the noise of one log",
-    "evaluation/sampling.py": "makes them",
+    "evaluation/rig.py": "the noise of one log",
+    "evaluation/scenarios.py": "makes them",
     "studies/bootstrap.py": "a number a log, by the draw and the log, of which its noise is drawn",
     "tuning/racing.py": "the candidates of a search",
     "tuning/two_phase.py": "the candidates of a search",

@@ -27,7 +27,7 @@ from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.export.blocks import export_settings, run_as_block
 from pneuopt.export.languages import Language, export_controller
 from pneuopt.export.makers import BLOCK_FORMS, Block
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError

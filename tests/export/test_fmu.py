@@ -19,7 +19,7 @@ from pneuopt.dynamics.system import System, names
 from pneuopt.export.fmu import export_fmu
 from pneuopt.export.languages import Language, export_controller
 from pneuopt.models import catalog
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import InputError

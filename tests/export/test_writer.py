@@ -16,7 +16,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, Form
 from pneuopt.export.languages import PYTHON, Language, export_controller
 from pneuopt.export.writer import Names, Written, comment_text, make_header, write_expressions
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, ModelError

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 import tomlkit
 
-from pneuopt.evaluation.cases import cases
+from pneuopt.evaluation.response import cases
 from pneuopt.files.certificate import CertificateCheck, check_certificate, checksum_section
 from pneuopt.files.drive import read_drive, read_fit
 from pneuopt.files.toml import read_toml

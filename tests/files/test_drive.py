@@ -19,7 +19,7 @@ from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_scenarios
 from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.models.declaration import Drive
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pneuopt.evaluation.excitation_run import ExcitationRun, excitation_run
+from pneuopt.evaluation.moves import ExcitationRun, excitation_run
 from pneuopt.files.first_files import PLAYED_FILE, RUN_FILE, run_files
 from pneuopt.files.tuning import read_path, read_tuning
 from pneuopt.models.catalog import s25

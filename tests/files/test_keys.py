@@ -16,7 +16,7 @@ from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_study
 from pneuopt.files.tuning import read_tuning
 from pneuopt.logs.read_log import read_log
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.friction_laws import FRICTION_LAWS, FRICTION_WRAPPERS
 from pneuopt.quantities.errors import InputError

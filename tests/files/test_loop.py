@@ -11,7 +11,7 @@ from pneuopt.control.sensor import Encoder
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuned import write_tuned
 from pneuopt.files.tuning import read_tuning
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import SecondOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive

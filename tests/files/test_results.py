@@ -14,18 +14,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pandas.testing import assert_frame_equal
 
-from pneuopt.dynamics.excitation import Excitation, SeparatingRun
-from pneuopt.evaluation.certificate import Certificate
-from pneuopt.evaluation.defects import Defect, Finding
-from pneuopt.evaluation.expected_plants import PlantAxis
+from pneuopt.dynamics.hooks import Excitation, SeparatingRun
+from pneuopt.evaluation.certificate import Certificate, Defect, Finding
+from pneuopt.evaluation.plants import PlantAxis
 from pneuopt.evaluation.scenarios import Factor
 from pneuopt.files.results import RESULT_KINDS, load_result
-from pneuopt.identification.marks import Mark
-from pneuopt.identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Verdict
+from pneuopt.identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
 from pneuopt.identification.select_model import ModelSelection
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.shown import Result
+from pneuopt.quantities.results import Result
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.result import TuningResult

@@ -11,7 +11,7 @@ from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.files.drive import read_drive
 from pneuopt.files.rig import read_rig
 from pneuopt.files.tuning import read_tuning
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 

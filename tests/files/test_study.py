@@ -4,10 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pneuopt.evaluation.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
-from pneuopt.evaluation.monte_carlo import monte_carlo
-from pneuopt.evaluation.sampling import Sampling
-from pneuopt.evaluation.scenarios import Spread, corners
+from pneuopt.evaluation.plants import monte_carlo
+from pneuopt.evaluation.scenarios import Distribution, LogNormal, LogUniform, Normal, Sampling, Spread, Uniform, corners
 from pneuopt.files.study import (
     CASE_KEYS,
     Cases,
@@ -21,7 +19,7 @@ from pneuopt.files.study import (
 )
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies.cases import read_cases
+from pneuopt.studies.sweep import read_cases
 
 RIG = ParameterSet(
     {

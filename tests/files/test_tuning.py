@@ -19,8 +19,8 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.moves import MotionPath, Move, MoveProfile, MoveSequence
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.band import Tolerance
 from pneuopt.evaluation.certificate import Defect
+from pneuopt.evaluation.metric import Tolerance
 from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
@@ -46,7 +46,7 @@ from pneuopt.files.drive import read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuned import write_tuned
 from pneuopt.files.tuning import Tuning, move_paths, read_path, read_scenarios, read_tuning, read_validation_scenarios
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, PressureDependent, Stribeck
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError

@@ -9,7 +9,7 @@ import pytest
 from pneuopt.dynamics.compiled.rollout import Gram, Rollout
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet

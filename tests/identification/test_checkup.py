@@ -10,10 +10,10 @@ import pytest
 from pneuopt.files.drive import read_drive
 from pneuopt.identification.checkup import check
 from pneuopt.identification.identify import identify
-from pneuopt.logs.checks.findings import Severity
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.doctor import Severity
+from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import read_log
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet

@@ -7,11 +7,11 @@ import pytest
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.compare_logs import _disagreements, compare_logs
 from pneuopt.identification.identify import identify
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import LogError
-from pneuopt.quantities.intersample import Intersample
+from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}

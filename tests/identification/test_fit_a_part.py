@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification import multistart
+from pneuopt.identification import search as multistart
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.least_squares import Fit, solve_least_squares
-from tests.identification.test_multistart import VELOCITY, posed
+from tests.identification.test_search import VELOCITY, posed
 
 
 def optimum() -> tuple[EstimationProblem, Fit]:

@@ -7,12 +7,12 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification import identify as identify_module
 from pneuopt.identification.examination import pose_problem
 from pneuopt.identification.identifiability import foresee_unidentifiable
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import PhysicsWarning
-from pneuopt.quantities.intersample import Intersample
+from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
 

@@ -10,13 +10,12 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.identifiability import identifiability
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, Stage
 

@@ -13,13 +13,12 @@ from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, LogError
-from pneuopt.quantities.intersample import Intersample, usual_intersample
-from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, usual_intersample
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares

@@ -12,14 +12,12 @@ from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Coulomb
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
+from pneuopt.models.friction import Coulomb, LoadDependent
 from pneuopt.models.linear import FirstOrder
-from pneuopt.models.load_dependent import LoadDependent
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import Quantity
+from pneuopt.quantities.parameters import Intersample, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 MASS, COULOMB, VISCOUS, SMOOTHING, NOISE = 5.0, 20.0, 80.0, 5e-3, 5e-6

@@ -17,9 +17,9 @@ from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.identify import identify
 from pneuopt.identification.logged_loop import LoggedLoop
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.models.catalog import s25
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array

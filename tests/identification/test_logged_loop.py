@@ -15,8 +15,8 @@ from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.logged_loop import LoggedLoop
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import LogError, ModelError
 from pneuopt.quantities.parameters import ParameterSet

@@ -9,11 +9,11 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.identify import identify
 from pneuopt.identification.losses import Huber, Loss, SoftL1
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.intersample import Intersample
+from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}

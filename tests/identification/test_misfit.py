@@ -1,5 +1,12 @@
-"""Marks, widened intervals and ranges of fits to logs whose residuals are, or are not, noise."""
+"""Marks, widened intervals and ranges of fits to logs whose residuals are, or are not, noise.
 
+Cluster-robust covariances against literal refits, against the definitions row by row, and by coverage.
+
+Widths over which a smooth model turns friction round, and which the logs reject.
+"""
+
+import itertools
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -8,25 +15,43 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.linalg import fractional_matrix_power
 from scipy.signal import lfilter
 from scipy.stats import ttest_1samp
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_fit, write_fit
 from pneuopt.identification import identify as identification
+from pneuopt.identification import misfit as width_bias
 from pneuopt.identification.identify import identify
-from pneuopt.identification.misfit import Misfit, _hotelling_p
+from pneuopt.identification.misfit import (
+    TIME_BLOCKS,
+    Clusters,
+    Misfit,
+    RejectedWidth,
+    RobustCovariance,
+    _hotelling_p,
+    between_clusters,
+    diagnose_misfit,
+    disagreement_p,
+    jackknife,
+    robust_covariance,
+    score_widths,
+    suspect_widths,
+    t_quantile,
+)
+from pneuopt.identification.problem import EstimationProblem, check_logs, input_behaviour
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Coulomb
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
+from pneuopt.models.friction import Coulomb, FrictionModel, Viscous
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
 
 TIME = np.arange(0, 4.0, 2e-3)
 FORCE = 150 * np.sin(2 * np.pi * 1.3 * TIME) + 60 * np.sin(2 * np.pi * 3.1 * TIME + 1)
@@ -231,3 +256,268 @@ def test_windows_that_start_anew_where_whole_logs_do_not_fit_leave_a_bias_possib
     assert anew.sentences == (
         "over whole logs the model misses more than their noise: estimates from windows may be biased",
     )
+
+
+Rows = list[tuple[Array, Array]]
+DRAWS = 100
+NAMES = ("coulomb", "viscous", "offset")
+
+
+def friction_columns(n: int, rng: np.random.Generator) -> Array:
+    """Columns of Coulomb and viscous friction and of an offset over two seconds of motion of four frequencies."""
+    t = np.linspace(0, 2, n)
+    v = sum(0.1 * np.cos(2 * np.pi * rng.uniform(0.5, 3) * t + rng.uniform(0, 2 * np.pi)) for _ in range(4))
+    return np.stack([np.tanh(np.asarray(v) / 0.01), v, np.ones(n)], axis=1)
+
+
+def autoregression(n: int, time: float, rng: np.random.Generator) -> Array:
+    """An AR(1) process of unit variance with a correlation time in samples."""
+    a = np.exp(-1 / time)
+    e = lfilter([np.sqrt(1 - a**2)], [1, -a], rng.standard_normal(n + round(5 * time)))
+    return np.asarray(e)[-n:]
+
+
+def cut(logs: Rows, blocks: int = TIME_BLOCKS) -> tuple[Rows, list[int]]:
+    """The rows in blocks of time, and the log of each."""
+    rows: Rows = []
+    own: list[int] = []
+    for i, (X, y) in enumerate(logs):
+        count = max(1, round(blocks * len(y) / sum(len(e) for _, e in logs)))
+        rows += list(zip(np.array_split(X, count), np.array_split(y, count), strict=True))
+        own += [i] * count
+    return rows, own
+
+
+def fit_of_clusters(rows: Rows) -> Array:
+    X, y = (np.concatenate(a) for a in zip(*rows, strict=True))
+    return np.asarray(np.linalg.lstsq(X, y, rcond=None)[0])
+
+
+def clusters_of(rows: Rows, logs: list[int], estimate: Array) -> Clusters:
+    return Clusters(
+        np.array([X.T @ (X @ estimate - y) for X, y in rows]), np.array([X.T @ X for X, _ in rows]), np.array(logs)
+    )
+
+
+def solve(logs: Rows) -> tuple[Array, Array, RobustCovariance]:
+    """Estimates, their covariance for white residuals, and the robust one."""
+    rows, own = cut(logs)
+    estimate = fit_of_clusters(rows)
+    X, y = (np.concatenate(a) for a in zip(*rows, strict=True))
+    variance = float(np.sum((y - X @ estimate) ** 2)) / (len(y) - 3)
+    white = variance * np.linalg.inv(X.T @ X)
+    return estimate, white, robust_covariance(clusters_of(rows, own, estimate), white, variance, len(y) - 3.0)
+
+
+@pytest.fixture
+def uneven() -> tuple[Rows, list[int], Clusters]:
+    """Three logs of unequal lengths with correlated residuals."""
+    rng = np.random.default_rng(3)
+    logs = [(friction_columns(n, rng), autoregression(n, 5, rng)) for n in (60, 100, 140)]
+    rows, own = cut(logs)
+    return rows, own, clusters_of(rows, own, fit_of_clusters(rows))
+
+
+def test_jackknife_is_that_of_literal_refits(uneven: tuple[Rows, list[int], Clusters]) -> None:
+    rows, _, clusters = uneven
+    moved = np.array([fit_of_clusters(rows[:g] + rows[g + 1 :]) - fit_of_clusters(rows) for g in range(len(rows))])
+    found = jackknife(clusters)
+    size = np.abs(moved).max(axis=0)  # within the regularisation, a thousandth of the information
+    assert_allclose(found.changes / size, moved / size, rtol=0.01, atol=0.005)
+    assert_allclose(np.diag(found.covariance), 23 / 24 * np.sum(moved**2, axis=0), rtol=0.01)
+
+
+def test_between_clusters_is_bell_and_mccaffreys_definition(uneven: tuple[Rows, list[int], Clusters]) -> None:
+    """CR2 and its degrees of freedom with the matrices of all rows, as the paper writes them."""
+    rows, own, clusters = uneven
+    logs = [
+        tuple(np.concatenate(a) for a in zip(*(r for r, o in zip(rows, own, strict=True) if o == i), strict=True))
+        for i in range(3)
+    ]
+    X, y = (np.concatenate(a) for a in zip(*logs, strict=True))
+    inverse = np.linalg.inv(X.T @ X)
+    residuals, hat = y - X @ inverse @ X.T @ y, X @ inverse @ X.T
+    ends = np.cumsum([0, *(len(e) for _, e in logs)])
+    meat, columns = np.zeros((3, 3)), []
+    for a, b in itertools.pairwise(ends.tolist()):
+        root = np.real(fractional_matrix_power(np.eye(b - a) - hat[a:b, a:b], -0.5))
+        score = X[a:b].T @ root @ residuals[a:b]
+        meat += np.outer(score, score)
+        columns.append((np.eye(len(X)) - hat)[:, a:b] @ root @ X[a:b] @ inverse)
+    found = between_clusters(clusters.by_log())
+    assert_allclose(found.covariance, inverse @ meat @ inverse, rtol=1e-6)
+    for k in range(3):
+        G = np.stack([c[:, k] for c in columns], axis=1)
+        values = np.linalg.eigvalsh(G.T @ G)
+        assert found.dof[k] == pytest.approx(values.sum() ** 2 / (values**2).sum(), rel=1e-6)
+
+
+def test_halving_joins_neighbours_of_one_log_only() -> None:
+    blocks = Clusters(np.arange(5.0)[:, None], np.arange(5.0)[:, None, None], np.array([0, 0, 0, 1, 1]))
+    half = blocks.halve()
+    assert half.scores.ravel().tolist() == [1, 2, 7]
+    assert half.logs.tolist() == [0, 0, 1]
+    assert half.halve().scores.ravel().tolist() == [3, 7]
+    assert blocks.by_log().information.ravel().tolist() == [3, 7]
+
+
+def test_disagreement_of_white_residuals_is_uniform() -> None:
+    """Probabilities of Chow's test over many draws: as many below a tenth as chance has it."""
+    found = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        rows, own = cut([(friction_columns(480, rng), rng.standard_normal(480))])
+        found.append(disagreement_p(clusters_of(rows, own, fit_of_clusters(rows)), 1.0))
+    assert np.mean(found) == pytest.approx(0.5, abs=0.07)
+    assert np.mean(np.array(found) < 0.1) == pytest.approx(0.1, abs=0.06)
+
+
+def white(n: int, rng: np.random.Generator) -> Array:
+    return rng.standard_normal(n)
+
+
+def slow_of_clusters(share: float) -> Callable[[int, np.random.Generator], Array]:
+    return lambda n, rng: rng.standard_normal(n) + share * autoregression(n, n / 25, rng)
+
+
+def coloured(time: float) -> Callable[[int, np.random.Generator], Array]:
+    return lambda n, rng: rng.standard_normal(n) + autoregression(n, time, rng)
+
+
+def coverage(
+    logs: int, n: int, residuals: Callable[[int, np.random.Generator], Array], bad: int = 0, scatter: float = 0.0
+) -> tuple[Array, Array, float]:
+    """Coverage [%] of robust and of white intervals, the worst parameter's, and the share of draws widened."""
+    robust, plain, widened = [], [], 0
+    for seed in range(DRAWS):
+        rng = np.random.default_rng((seed, logs))
+        given: Rows = []
+        for i in range(logs):
+            X = friction_columns(n, rng)
+            y = residuals(n, rng) + (autoregression(n, 100, rng) if i < bad else 0.0)
+            y = y + X @ (scatter / np.linalg.norm(X, axis=0) * rng.standard_normal(3))
+            given.append((X, y))
+        estimate, plain_covariance, found = solve(given)
+        robust.append(np.abs(estimate) <= t_quantile(found.dof) * np.sqrt(np.diag(found.covariance)))
+        plain.append(np.abs(estimate) <= 1.96 * np.sqrt(np.diag(plain_covariance)))
+        widened += found.widened
+    return 100 * np.mean(robust, axis=0), 100 * np.mean(plain, axis=0), widened / DRAWS
+
+
+@pytest.mark.parametrize("logs", [1, 3, 8])
+def test_white_residuals_keep_their_intervals(logs: int) -> None:
+    robust, _, widened = coverage(logs, 960 // logs, white)
+    assert np.all(np.abs(robust - 95) <= 5)  # 2.3 binomial deviations of 100 draws
+    assert widened <= 0.08
+
+
+@pytest.mark.parametrize(
+    ("logs", "n", "residuals", "bad", "scatter"),
+    [
+        (1, 3000, slow_of_clusters(0.15), 0, 0.0),
+        (1, 3000, slow_of_clusters(0.2), 0, 0.0),
+        (1, 2000, coloured(5), 0, 0.0),
+        (1, 2000, coloured(20), 0, 0.0),
+        (1, 3000, coloured(60), 0, 0.0),
+        (8, 400, white, 1, 0.0),
+        (4, 400, white, 1, 0.0),
+        (3, 200, white, 0, 3.0),
+        (7, 200, white, 0, 3.0),
+        (20, 200, white, 0, 3.0),
+    ],
+)
+def test_intervals_hold_where_those_of_white_residuals_do_not(
+    logs: int, n: int, residuals: Callable[[int, np.random.Generator], Array], bad: int, scatter: float
+) -> None:
+    robust, plain, widened = coverage(logs, n, residuals, bad, scatter)
+    assert plain.min() < 75
+    assert robust.min() >= 90 - 6  # two binomial deviations of 100 draws
+    assert widened > 0.7
+
+
+WIDTH = "friction.smoothing"
+FREE_WIDTH_BIAS = ("friction.coulomb", "friction.viscous")
+NOISE_WIDTH_BIAS = 2e-6  # of the position [m]
+
+
+def fitted(friction: FrictionModel, width: float = 1.0) -> tuple[EstimationProblem, Fit]:
+    """Friction found in a pushed drive's log by a model whose width is so many times the drive's."""
+    system, t = ForceDrive(friction).system(), np.arange(1000) * 1e-3
+    truth = {n: v for n, v in {"friction.coulomb": 30.0, "friction.viscous": 60.0}.items() if n in system.parameters}
+    own = system.parameters.with_values(truth)
+    force = Trajectory(t, {"force": 60 * np.sin(2 * np.pi * 4 * t)})
+    behaviour = input_behaviour(system, Experiment(force.with_columns({"position": t}), {}, name="run"))
+    run = simulate(system, force, own, initial={"position": 0.0, "speed": 0.0}, intersample=behaviour)
+    position = run["position"] + NOISE_WIDTH_BIAS * np.random.default_rng(3).standard_normal(1000)
+    log = Experiment(force.with_columns({"position": position}), {"position": NOISE_WIDTH_BIAS}, name="run")
+    given = own.freed(*truth)
+    if WIDTH in given:
+        given = given.with_values({WIDTH: width * own.value(WIDTH)})
+    problem = EstimationProblem(system, tuple(check_logs(system, [log], given)), given, LeastSquares())
+    return problem, solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+
+
+def test_the_width_that_made_the_log_is_not_rejected() -> None:
+    (found,) = score_widths(*fitted(Coulomb()))
+    assert found.name == WIDTH
+    assert found.fall < 10.8
+
+
+def test_the_fall_and_the_shifts_are_those_of_a_fit_that_estimates_the_width() -> None:
+    problem, fit = fitted(Coulomb(), 1.1)
+    (found,) = score_widths(problem, fit)
+    freed = replace(problem, parameters=problem.parameters.freed(WIDTH))
+    refit = solve_least_squares(freed.transcription(freed.start_from(fit)), freed.method)
+    assert refit.parameters.value(WIDTH) == pytest.approx(problem.system.parameters.value(WIDTH), rel=0.02)
+    assert found.fall > 10.8
+    assert found.fall == pytest.approx(2 * (fit.stats["cost"] - refit.stats["cost"]), rel=0.2)
+    shifts = [refit.parameters.value(n) - fit.parameters.value(n) for n in FREE_WIDTH_BIAS]
+    assert dict(zip(FREE_WIDTH_BIAS, found.shifts, strict=True)) == pytest.approx(
+        dict(zip(FREE_WIDTH_BIAS, shifts, strict=True)), rel=0.2
+    )
+
+
+def test_noise_of_the_states_has_other_weights_and_a_model_without_a_width_none_to_reject() -> None:
+    problem, fit = fitted(Coulomb())
+    assert not list(score_widths(problem, replace(fit, jumps=np.zeros((1, 2)))))
+    assert not list(score_widths(*fitted(Viscous())))
+    free = replace(problem, parameters=problem.parameters.freed(WIDTH))
+    assert not list(score_widths(free, solve_least_squares(free.transcription(free.start_from(fit)), free.method)))
+
+
+@pytest.mark.parametrize(
+    ("fall", "shift", "inflation", "marked"),
+    [
+        (10.9, 0.6, 1.0, True),
+        (10.7, 0.6, 1.0, False),  # chi-square with one degree of freedom exceeds 10.8 once in a thousand
+        (10.9, 0.4, 1.0, False),  # no harm
+        (10.9, 0.6, 1.1, False),  # what scatters more between parts of the logs is told apart with more
+        (-1.0, 0.6, 1.0, False),
+    ],
+)
+def test_a_rejected_width_marks_the_estimates_that_it_moves(
+    fall: float, shift: float, inflation: float, marked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, fit = fitted(Coulomb())
+    plain = diagnose_misfit(problem, fit, 1.0, 900.0)
+    assert plain.covariance is not None
+    spread = np.sqrt(np.diag(plain.covariance))
+    suspect = replace(plain, widened=True, signals=(), inflation=inflation)
+    moved = RejectedWidth(WIDTH, fall, np.array([shift, 0.1]) * spread)
+    monkeypatch.setattr(width_bias, "score_widths", lambda *_: iter([moved]))
+    found = suspect_widths(suspect, problem, fit, 1.0)
+    assert (found.rejected_widths == (WIDTH,)) is marked
+    assert (None if found.biased is None else found.biased.tolist()) == ([True, False] if marked else None)
+    told = any(WIDTH in sentence for sentence in found.sentences)
+    assert told is marked
+
+
+def test_widths_are_asked_for_where_parts_of_the_logs_disagree_and_no_signal_is_behind_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, fit = fitted(Coulomb())
+    agreeing: Misfit = replace(diagnose_misfit(problem, fit, 1.0, 900.0), widened=False, signals=())
+    monkeypatch.setattr(width_bias, "score_widths", lambda *_: pytest.fail("asked"))
+    assert suspect_widths(agreeing, problem, fit, 1.0) is agreeing
+    signalled = replace(agreeing, widened=True, signals=("speed",))
+    assert suspect_widths(signalled, problem, fit, 1.0) is signalled

@@ -8,16 +8,14 @@ import pytest
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System
 from pneuopt.identification.identify import identify
-from pneuopt.identification.select_model import ModelSelection, _CandidateRow, _choose, select_model
-from pneuopt.identification.trials import try_candidate
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.identification.select_model import ModelSelection, _CandidateRow, _choose, select_model, try_candidate
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
 

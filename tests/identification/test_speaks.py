@@ -9,10 +9,10 @@ import pytest
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.select_model import select_model
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.progress import Progress
+from pneuopt.quantities.status import Progress
 from pneuopt.quantities.trajectories import Trajectory
 
 

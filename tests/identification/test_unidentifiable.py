@@ -14,11 +14,10 @@ from pneuopt.identification.identifiability import leans_on_prior, rests_on_prio
 from pneuopt.identification.identify import identify
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import LuGre, Stribeck
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 

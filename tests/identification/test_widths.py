@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import pneuopt as po
-from pneuopt.dynamics.excitation import Width
+from pneuopt.dynamics.hooks import Width
 from pneuopt.identification import widths
-from pneuopt.identification.checks import check_logs
-from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.problem import EstimationProblem, check_logs
 from pneuopt.identification.widths import CHOSEN_WIDTH, MAX_TRIAL_SAMPLES, advise_widths, choose_widths, excerpts
 from pneuopt.shooting import segments
 from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, Stage, solve_least_squares

@@ -21,14 +21,13 @@ from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, Viscous
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pneuopt.logs.checks.findings import PISTON
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.doctor import PISTON
+from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
 

@@ -11,4 +11,4 @@ def libraries_run_here(monkeypatch: pytest.MonkeyPatch) -> None:
     def run_here(read: Callable[[Path, bytes], object], path: Path, raw: bytes, kind: str) -> object:
         return read(path, raw)
 
-    monkeypatch.setattr("pneuopt.logs.mdf.run_apart", run_here)
+    monkeypatch.setattr("pneuopt.logs.foreign.run_apart", run_here)

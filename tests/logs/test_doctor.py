@@ -6,10 +6,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from pneuopt.logs.checks import balance, end_stops
-from pneuopt.logs.checks.findings import PISTON
-from pneuopt.logs.doctor import CHECKS, examine
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs import doctor as balance
+from pneuopt.logs import doctor as end_stops
+from pneuopt.logs.doctor import CHECKS, PISTON, examine
+from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import noise_level
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.arrays import Array

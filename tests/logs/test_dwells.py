@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pneuopt.logs.checks.dwells import _find_moves
+from pneuopt.logs.doctor import _find_moves
 from pneuopt.quantities.arrays import Array
 
 

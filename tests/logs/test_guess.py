@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.foreign import read_table
 from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.read_log import read_log
-from pneuopt.logs.readers import read_table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError
 

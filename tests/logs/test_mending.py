@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import tomlkit
 
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.mending import mend_log, write_mended
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.errors import LogError
-from pneuopt.quantities.intersample import Intersample
+from pneuopt.quantities.parameters import Intersample
 
 LINES = ["time [s],position [mm],force [N],note", *(f"{0.01 * k:.2f},{k},{k % 7},a" for k in range(300))]
 """Row k + 2 holds sample k."""

@@ -18,8 +18,8 @@ from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.models.declaration import Drive
-from pneuopt.models.drive import ForceDrive
 from pneuopt.models.drive_kinds import DRIVE_KINDS, stick_slip_drive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import LuGre, Stribeck, Viscous
 from pneuopt.models.friction_laws import friction_ladder
 from pneuopt.models.karnopp import Karnopp

@@ -10,13 +10,13 @@ from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names
 from pneuopt.identification.identify import identify
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiment import Experiment
 from pneuopt.models.catalog import b32
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.sensing import coarse_delay, with_sensors
 from pneuopt.quantities.errors import UnknownNameError
-from pneuopt.quantities.intersample import Intersample
+from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 

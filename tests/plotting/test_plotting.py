@@ -12,7 +12,7 @@ from pneuopt.control.moves import Move
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.margins import margins
-from pneuopt.logs.experiments import Experiment, split
+from pneuopt.logs.experiment import Experiment, split
 from pneuopt.plotting import (
     Response,
     plot_bode,

@@ -7,8 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pneuopt.quantities.errors import UnitError
-from pneuopt.quantities.unit_algebra import unit_ratio
-from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value, si_conversion, write_value
+from pneuopt.quantities.units import (
+    ATMOSPHERE,
+    count_gauge_from,
+    read_si,
+    read_value,
+    si_conversion,
+    unit_ratio,
+    write_value,
+)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +167,7 @@ def test_writes_what_reads_well() -> None:
 
 
 def test_pint_stays_out_of_import_time() -> None:
-    code = "import sys, pneuopt.quantities.units, pneuopt.logs.experiments\n"
+    code = "import sys, pneuopt.quantities.units, pneuopt.logs.experiment\n"
     code += "assert not {'pint', 'pandas', 'casadi'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -22,13 +22,12 @@ from pneuopt.evaluation.response import loop_inputs, sample_spacing
 from pneuopt.export.languages import write_loop_javascript
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.catalog import t32
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.report.fit_page import Source
-from pneuopt.report.live import live_script, to_script
-from pneuopt.report.live_rest import RestFinder
+from pneuopt.report.live import RestFinder, live_script, to_script
 from pneuopt.report.page import render_page
 from pneuopt.report.tuning_page import LoopView, simulation_page
 from problems.demo.moving_page import t32_loop

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
+from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import discretise, names
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.arrays import Array
 from pneuopt.shooting.segments import (

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pneuopt.dynamics.system import System, discretise
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre
 from pneuopt.models.load import Load
 from pneuopt.quantities.arrays import Array

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pneuopt.dynamics.system import discretise
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet

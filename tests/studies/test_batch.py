@@ -10,7 +10,7 @@ import pytest
 
 import pneuopt as po
 from pneuopt.quantities.arrays import Array, Indices
-from pneuopt.studies import fleet
+from pneuopt.studies import batch as fleet
 from problems.shared.t32 import SPREADS, STEP, benchmark
 
 GAINS = {"pid.Kp": 2.806, "pid.Ki": 83.63, "pid.Kd": 0.1103, "dither.offset": -0.07758}

@@ -8,12 +8,11 @@ import pytest
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.evaluation.record import record
-from pneuopt.evaluation.rig import Rig, Sensor
+from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import ForceDrive
+from pneuopt.logs.experiment import Experiment
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import InputError, ModelError

@@ -7,9 +7,8 @@ import pytest
 
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies.cases import grid
 from pneuopt.studies.neighbours import search_again, sweep_from_neighbours
-from pneuopt.studies.sweep import sweep
+from pneuopt.studies.sweep import grid, sweep
 
 GIVEN = ParameterSet({"a": Parameter(0.0, "1"), "b": Parameter(0.0, "1"), "gain": Parameter(0.0, "1", 0.0, 9.0)})
 PLACES = grid(GIVEN, {"a": [0.0, 1.0, 2.0], "b": [0.0, 1.0, 2.0]})

@@ -14,12 +14,11 @@ from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Reference, Step
 from pneuopt.control.sensor import Encoder
-from pneuopt.evaluation.band import Tolerance
-from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.evaluate import respond
-from pneuopt.evaluation.motion_requirements import FollowingError
+from pneuopt.evaluation.metric import Tolerance
 from pneuopt.evaluation.requirements import (
     IAE,
+    FollowingError,
     NoiseGain,
     Overshoot,
     PeakControl,
@@ -29,10 +28,11 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
+from pneuopt.evaluation.response import cases
 from pneuopt.evaluation.scenarios import NO_SCENARIOS
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import s32, t32
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive

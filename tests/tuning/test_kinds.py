@@ -33,7 +33,7 @@ from pneuopt.evaluation.requirements import (
     requirement_values,
     upper_limit,
 )
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.errors import InputError

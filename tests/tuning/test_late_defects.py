@@ -10,7 +10,7 @@ from pneuopt import catalog
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.defects import Defect, Finding
+from pneuopt.evaluation.certificate import Defect, Finding
 from pneuopt.evaluation.requirements import ITAE, Overshoot, RiseTime, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import SecondOrder

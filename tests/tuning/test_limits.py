@@ -14,10 +14,10 @@ from pneuopt.evaluation.requirements import (
     requirement_values,
 )
 from pneuopt.evaluation.specification import specify
-from pneuopt.tuning.advice import find_breaks
-from pneuopt.tuning.merit import compute_merits
-from pneuopt.tuning.readings import WORST_MERIT
+from pneuopt.tuning.racing import compute_merits
 from pneuopt.tuning.relaxation import limit_excess
+from pneuopt.tuning.space import WORST_MERIT
+from pneuopt.tuning.validation import find_breaks
 
 SPEC = specify(SettlingTime(max=0.5), [Overshoot(0.1), MaxSensitivity(1.6), GainMargin(2.0), PhaseMargin(40.0)])
 KEPT = {"SettlingTime": 0.4, "Overshoot": 5.0, "MaxSensitivity": 1.4, "GainMargin": 3.0, "PhaseMargin": 60.0}

@@ -15,7 +15,7 @@ from pneuopt.evaluation.requirements import IAE, Overshoot, SettlingTime
 from pneuopt.evaluation.rest_check import NoHunting, check_rest
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.evaluation.specification import specify
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import ConvergenceError, InputError

@@ -27,7 +27,7 @@ from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.status import Code, Status
-from pneuopt.tuning import certifier
+from pneuopt.tuning import search as certifier
 from pneuopt.tuning.method import SearchResult
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult

@@ -9,11 +9,11 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.requirements import PeakControl, SettlingTime
+from pneuopt.evaluation.response import cases
 from pneuopt.evaluation.scenarios import Factor, Scenarios, apply_scenario, corners, tolerances
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError

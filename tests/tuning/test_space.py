@@ -1,4 +1,9 @@
-"""What a search samples and searches: the dither's frequency as a gain like any other, and what bounds it."""
+"""What a search samples and searches: the dither's frequency as a gain like any other, and what bounds it.
+
+A search reads responses under dither as the certificate does: the same signal, with the same history.
+"""
+
+from math import pi
 
 import numpy as np
 import pytest
@@ -8,17 +13,19 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.metrics import BandCentre, step_metrics
 from pneuopt.evaluation.requirements import Ripple, SettlingTime
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
 from pneuopt.evaluation.specification import specify
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.tuning.gradients import Lanes
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import Space, dither_resolution_rate, search_space
+from pneuopt.tuning.space import ReferenceGrid, Space, dither_resolution_rate, read_metrics, search_space
 from pneuopt.tuning.tune import tune
 
 STEP = Step(0.1, horizon=0.4)
@@ -96,3 +103,35 @@ def test_a_gain_at_its_bound_is_printed_as_the_bound() -> None:
     space = Space(ParameterSet(gains), ("pid.Kp", "pid.Kd"))
     assert space.round_point(np.array([1.99999999, 3.1234567e-9]), 4).tolist() == [2.0, 0.0]
     assert space.round_point(np.array([0.51234567, 3.1234567e-4]), 4).tolist() == [0.5123, 3.123e-4]
+
+
+PERIOD, SPACING = 0.05, 2.5e-3
+METRICS = ("SettlingTime", "SettlingTimeRaw", "Undershoot", "RiseTime", "IAE", "Overshoot", "SteadyStateError")
+
+
+def response(reference: Step) -> tuple[ReferenceGrid, np.ndarray]:
+    """A lag of .1 s under a ripple of 10 % of the step: signal, command, and the signal's integral."""
+    t = np.linspace(0.0, reference.horizon, round(reference.horizon / SPACING) + 1, dtype=np.float64)
+    lag, rate = 0.1, 2 * pi / PERIOD
+    y = reference.final - reference.size * np.exp(-t / lag) + 0.1 * np.sin(rate * t)
+    whole = reference.final * t - reference.size * lag * (1 - np.exp(-t / lag)) + 0.1 * (1 - np.cos(rate * t)) / rate
+    grid = ReferenceGrid(reference, t, np.full((len(t), 1), reference.final), SPACING)
+    return grid, np.stack([y, np.zeros_like(t), whole], axis=-1)[None]
+
+
+@pytest.mark.parametrize("reference", [Step(1.0, horizon=1.0), Step(1.0, initial=3.0, horizon=1.0)])
+def test_search_and_certificate_read_a_dithered_step_alike(reference: Step) -> None:
+    """From motion too: a history of zeros before the step would move the mean in the first half period."""
+    grid, y = response(reference)
+    given = (grid.t, y[0, :, 0], reference.final, reference.initial)
+    proof = step_metrics(*given, band_centre=BandCentre.REFERENCE, dither_period=PERIOD)
+    found = read_metrics(grid, y, (0.02,), PERIOD, METRICS, ())
+    for name in METRICS:
+        assert found[name][0] == pytest.approx(proof[name], rel=5e-3, abs=5e-3, nan_ok=True), name
+    still = np.zeros((*y.shape, 1))
+    lanes = Lanes(grid, y, still, np.zeros((1, 1, 1)), [PERIOD], 2)
+    error, slopes = lanes.record.error
+    assert 100 * error.max() == pytest.approx(proof["Overshoot"], abs=5e-3)
+    assert proof["Undershoot"] == 0
+    assert error.min() >= -1
+    assert not slopes.any()

@@ -6,11 +6,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.band import Tolerance, band_share
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.motion_requirements import FollowingError, OvershootDistance
-from pneuopt.evaluation.requirements import PeakControl, SettlingTime
-from pneuopt.models.drive import ForceDrive
+from pneuopt.evaluation.metric import Tolerance, band_share
+from pneuopt.evaluation.requirements import FollowingError, OvershootDistance, PeakControl, SettlingTime
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet

@@ -6,7 +6,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import IAE, ControlRate, PeakControl
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.tuning.racing import Racing

@@ -9,9 +9,8 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.certificate import Defect
-from pneuopt.evaluation.expected_plants import PLANT_COUNT, expected_plants
+from pneuopt.evaluation.plants import PLANT_COUNT, expected_plants
 from pneuopt.evaluation.requirements import (
     IAE,
     MaxSensitivity,
@@ -20,6 +19,7 @@ from pneuopt.evaluation.requirements import (
     PhaseMargin,
     SettlingTime,
 )
+from pneuopt.evaluation.response import TuningCase
 from pneuopt.evaluation.scenarios import apply_scenario, corners, samples, tolerances
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder, Integrator

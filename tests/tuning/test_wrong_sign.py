@@ -23,7 +23,7 @@ from pneuopt.dynamics.system import System, define
 from pneuopt.evaluation.requirements import IAE, MaxSensitivity, Overshoot, SettlingTime, SteadyStateError
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import LuGre, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.quantities.errors import InputError

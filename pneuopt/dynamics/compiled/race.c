@@ -3,7 +3,7 @@
    that can only grow, its merit's bound with them. A candidate whose bound passes its rival's merit is dropped with all
    its lanes, and the next pair takes the lane. What a candidate that comes through has put out is recorded.
 
-   A response is read on its mean over a period (the same formula as `DitherPeriodMean` in evaluation/dither_mean.py), of
+   A response is read on its mean over a period (the same formula as `DitherPeriodMean` in evaluation/metric.py), of
    which the last output is the integral, or, with a period of 0, on itself. */
 
 enum { SIGNAL, CONTROL };                                  /* of the outputs */

@@ -3,18 +3,183 @@
 Many segments run as operations on arrays (`ArrayProgram`), few in CasADi's virtual machine. There a Function is called
 on memory that stays in its place (`bind_function`): a call by CasADi's matrices takes fifty times as long as the
 arithmetic of a small model.
+
+`ArrayProgram`: an SX Function as calls of NumPy, each for one number of many segments at once.
+
+CasADi's virtual machine takes 3 to 6 ns for an operation of one segment. NumPy takes half a microsecond for a call, and
+then a tenth of that for a segment: some hundred segments at once run several times as fast.
+
+`bind_array_step`: an RK4 step of many segments with its sensitivities, all columns of these in one operation.
+
+Written out, a step takes an operation of NumPy for each column of the sensitivities, and half a microsecond for each:
+more than half of its time.
 """
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from pneuopt.dynamics.compiled.array_program import ArrayProgram
-from pneuopt.dynamics.compiled.array_step import bind_array_step
+from pneuopt.dynamics.compiled.c_writer import Instruction, read_instructions
 from pneuopt.quantities.arrays import Array
+
+Operation = Callable[..., Any]
+
+
+def _if_else_zero(condition: Array, value: Array, out: Array) -> None:
+    """The value where the condition holds, 0 elsewhere, even where the value is not a number."""
+    out[...] = np.where(condition != 0, value, 0.0)
+
+
+def _twice(value: Array, out: Array) -> None:
+    np.add(value, value, out)
+
+
+def _erf(value: Array, out: Array) -> None:
+    from scipy.special import erf
+
+    erf(value, out)
+
+
+OPERATIONS: dict[int, Operation] = {
+    ca.OP_ASSIGN: np.positive,
+    ca.OP_ADD: np.add,
+    ca.OP_SUB: np.subtract,
+    ca.OP_MUL: np.multiply,
+    ca.OP_DIV: np.divide,
+    ca.OP_NEG: np.negative,
+    ca.OP_SQ: np.square,
+    ca.OP_TWICE: _twice,
+    ca.OP_INV: np.reciprocal,
+    ca.OP_CONSTPOW: np.power,
+    ca.OP_POW: np.power,
+    ca.OP_SQRT: np.sqrt,
+    ca.OP_EXP: np.exp,
+    ca.OP_LOG: np.log,
+    ca.OP_LOG1P: np.log1p,
+    ca.OP_EXPM1: np.expm1,
+    ca.OP_ERF: _erf,
+    ca.OP_SIN: np.sin,
+    ca.OP_COS: np.cos,
+    ca.OP_TAN: np.tan,
+    ca.OP_ASIN: np.arcsin,
+    ca.OP_ACOS: np.arccos,
+    ca.OP_ATAN: np.arctan,
+    ca.OP_ATAN2: np.arctan2,
+    ca.OP_SINH: np.sinh,
+    ca.OP_COSH: np.cosh,
+    ca.OP_TANH: np.tanh,
+    ca.OP_ASINH: np.arcsinh,
+    ca.OP_ACOSH: np.arccosh,
+    ca.OP_ATANH: np.arctanh,
+    ca.OP_HYPOT: np.hypot,
+    ca.OP_FABS: np.fabs,
+    ca.OP_FLOOR: np.floor,
+    ca.OP_CEIL: np.ceil,
+    ca.OP_SIGN: np.sign,
+    ca.OP_FMOD: np.fmod,
+    ca.OP_COPYSIGN: np.copysign,
+    ca.OP_FMIN: np.fmin,
+    ca.OP_FMAX: np.fmax,
+    ca.OP_IF_ELSE_ZERO: _if_else_zero,
+    ca.OP_LT: np.less,
+    ca.OP_LE: np.less_equal,
+    ca.OP_EQ: np.equal,
+    ca.OP_NE: np.not_equal,
+    ca.OP_AND: np.logical_and,
+    ca.OP_OR: np.logical_or,
+    ca.OP_NOT: np.logical_not,
+}
+"""What computes an operation of CasADi, with the array for its result as the last argument."""
+
+
+class _Place(NamedTuple):
+    """Where a number is: in a row of an array, of the program's own, of an input or of a result."""
+
+    owner: str
+    array: int
+    row: int
+
+
+class _Step(NamedTuple):
+    operation: Operation
+    places: tuple[_Place, ...]
+
+
+class ArrayProgram:
+    """An SX Function as operations on arrays, each result in a row that a later one may take over.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        SX, with dense results.
+
+    Attributes
+    ----------
+    n_rows : int
+        Numbers of a segment that it holds at once, constants included.
+
+    Raises
+    ------
+    NotImplementedError
+        For an operation of CasADi that NumPy has not.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        self._places, self._constants, self._steps = dict[int, _Place](), dict[int, float](), list[_Step]()
+        self._free = list[int]()
+        self.n_rows = 0
+        instructions = list(read_instructions(function))
+        self._last_use = {s: k for k, i in enumerate(instructions) if i.operation != ca.OP_INPUT for s in i.sources}
+        for k, instruction in enumerate(instructions):
+            self._add(k, instruction)
+
+    def bind(self, inputs: Sequence[Array], results: Sequence[Array]) -> Callable[[], None]:
+        """A call without arguments that computes results from inputs, arrays of shape (numbers, segments)."""
+        own = np.empty((self.n_rows, inputs[0].shape[1]))
+        for row, value in self._constants.items():
+            own[row] = value
+        arrays = {"input": inputs, "result": results, "own": [own]}
+        calls = [
+            (operation, tuple(arrays[place.owner][place.array][place.row] for place in places))
+            for operation, places in self._steps
+        ]
+
+        def call() -> None:
+            for operation, rows in calls:
+                operation(*rows)
+
+        return call
+
+    def _add(self, k: int, i: Instruction) -> None:
+        """Add the k-th instruction; an input is where it is, a constant stays."""
+        if i.operation == ca.OP_INPUT:
+            self._places[i.target[0]] = _Place("input", *i.sources)
+            return
+        if i.operation == ca.OP_CONST:
+            self.n_rows += 1
+            self._constants[self.n_rows - 1] = i.constant
+            self._places[i.target[0]] = _Place("own", 0, self.n_rows - 1)
+            return
+        sources = tuple(self._places[s] for s in i.sources)
+        self._free += {self._places[s].row for s in i.sources if self._last_use[s] == k and self._is_reusable(s)}
+        if i.operation == ca.OP_OUTPUT:
+            self._steps.append(_Step(np.positive, (*sources, _Place("result", *i.target))))
+            return
+        if i.operation not in OPERATIONS:
+            raise NotImplementedError(f"CasADi's operation {i.operation}")
+        if not self._free:
+            self.n_rows += 1
+            self._free.append(self.n_rows - 1)
+        self._places[i.target[0]] = _Place("own", 0, self._free.pop())
+        self._steps.append(_Step(OPERATIONS[i.operation], (*sources, self._places[i.target[0]])))
+
+    def _is_reusable(self, value: int) -> bool:
+        place = self._places[value]
+        return place.owner == "own" and place.row not in self._constants
+
 
 # Operations, segments times those of the model, that a thread is started for, half a millisecond. Fewer, and starting
 # it (50 us) takes the time that it saves; more leave cores idle.
@@ -246,3 +411,72 @@ def _find_program(function: ca.Function) -> ArrayProgram | None:
 def _count_parts(operations: int, m: int, threads: int) -> int:
     """Threads that pay for so many operations of m segments in CasADi's machine."""
     return max(1, min(threads, m * operations // OPERATIONS_A_THREAD))
+
+
+LATER_STAGES = ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0))
+"""Where a step's later stages stand, a fraction of it, and their weights."""
+
+
+def bind_array_step(
+    rate: ca.Function, program: ArrayProgram, inputs: Sequence[Array], results: Sequence[Array]
+) -> Callable[[], None]:
+    """A call without arguments that takes a step of all segments from inputs to results.
+
+    Parameters
+    ----------
+    rate : casadi.Function
+        ``(t, x, u, p) -> (xdot, d(xdot)/dx, d(xdot)/d(chosen parameters))``, the last two sparse.
+    program : ArrayProgram
+        Its program.
+    inputs, results : sequence of ndarray
+        t, h, x, u, p, S and x, S after the step, of shape (numbers, segments); S column by column.
+    """
+    at, size, x, u, p, flat = inputs
+    nx, m = x.shape
+    S, S_next = (a.reshape(-1, nx, m) for a in (flat, results[1]))
+    time, stage_x, stage_S, k, slope = (np.empty_like(a) for a in (at, x, S, x, S))
+    share, part_x, part_S = np.empty_like(size), np.empty_like(x), np.empty_like(S)
+    sums, jacobians = (np.empty_like(x), np.empty_like(S)), [np.empty((rate.nnz_out(i), m)) for i in (1, 2)]
+    evaluate = program.bind((time, stage_x, u, p), (k, *jacobians))
+
+    def call() -> None:
+        time[:], stage_x[:] = at, x
+        evaluate()
+        spread(S)
+        sums[0][:], sums[1][:] = k, slope
+        for fraction, weight in LATER_STAGES:
+            np.multiply(size, fraction, out=share)
+            np.add(at, share, out=time)
+            np.add(x, np.multiply(k, share, out=stage_x), out=stage_x)
+            np.add(S, np.multiply(slope, share, out=stage_S), out=stage_S)
+            evaluate()
+            spread(stage_S)
+            for total, own, part in ((sums[0], k, part_x), (sums[1], slope, part_S)):
+                np.add(total, np.multiply(own, weight, out=part) if weight != 1 else own, out=total)
+        np.divide(size, 6, out=share)
+        np.add(x, np.multiply(sums[0], share, out=part_x), out=results[0])
+        np.add(S, np.multiply(sums[1], share, out=part_S), out=S_next)
+
+    spread = _bind_spread(rate, jacobians, slope)
+    return call
+
+
+def _bind_spread(rate: ca.Function, jacobians: Sequence[Array], slope: Array) -> Callable[[Array], None]:
+    """What computes the slope of sensitivities S, of shape (columns, states, segments), from the rate's Jacobians."""
+    of_states, of_parameters = (list(zip(*rate.sparsity_out(i).get_triplet(), strict=True)) for i in (1, 2))
+    starts, part = slope.shape[0] - rate.size2_out(2), np.empty_like(slope[:, 0])
+    empty = sorted(set(range(slope.shape[1])) - {row for row, _ in of_states})
+
+    def spread(S: Array) -> None:
+        begun = set[int]()
+        for (row, column), value in zip(of_states, jacobians[0], strict=True):
+            if row in begun:
+                slope[:, row] += np.multiply(S[:, column], value, out=part)
+            else:
+                np.multiply(S[:, column], value, out=slope[:, row])
+                begun.add(row)
+        slope[:, empty] = 0.0
+        for (row, column), value in zip(of_parameters, jacobians[1], strict=True):
+            slope[starts + column, row] += value
+
+    return spread

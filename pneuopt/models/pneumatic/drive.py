@@ -1,34 +1,54 @@
-"""`PneumaticDrive`: supply, proportional valve, cylinder and load in one ODE."""
+"""`PneumaticDrive`: supply, proportional valve, cylinder and load in one ODE.
 
-from collections.abc import Mapping, Sequence
+Sections and keys of a pneumatic drive in a file, with a catalogue's nominal flow in place of a conductance.
+
+Rest and steady motion of a `PneumaticDrive`: spool position and pressures at which only the position changes.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
+from scipy.optimize import brentq
 
-from pneuopt.dynamics.excitation import Excitation, SeparatingRun, Width
-from pneuopt.dynamics.hooks import Axis, FinalElement, Log, LogWarningHook, Rest
+from pneuopt.dynamics.hooks import Axis, Excitation, FinalElement, Log, LogWarningHook, Rest, SeparatingRun, Width
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
-from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
-from pneuopt.models.friction import FrictionModel, Stribeck, law_inputs
+from pneuopt.models.declaration import Alias, DriveKind, DriveSections, FirstFiles
+from pneuopt.models.drives import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
+from pneuopt.models.friction import LOAD_EXCITATION, FrictionModel, Stribeck, law_inputs
+from pneuopt.models.friction_laws import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.linear import VALVE_VOLTAGE
-from pneuopt.models.load import LOAD_FORCE, Load
-from pneuopt.models.needs import LOAD_EXCITATION
-from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings
+from pneuopt.models.load import LOAD_FORCE, LOAD_KEYS, Load
+from pneuopt.models.pneumatic.chamber import (
+    MIN_CHAMBER_PRESSURE,
+    ChamberModel,
+    Inflow,
+    Polytropic,
+    Surroundings,
+    Thermal,
+)
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak, volumes
-from pneuopt.models.pneumatic.gas import GAS_CONSTANT
+from pneuopt.models.pneumatic.gas import (
+    CRITICAL_RATIO,
+    GAS_CONSTANT,
+    IsentropicNozzle,
+    Iso6358,
+    Smoothing,
+    conductance_of_nominal_flow,
+)
 from pneuopt.models.pneumatic.limits import check_hardware, check_start, cylinder_limits, position_warning
-from pneuopt.models.pneumatic.line_pressure import LinePressureCheck
-from pneuopt.models.pneumatic.pressure_zero import PressureZeroCheck
-from pneuopt.models.pneumatic.rest import BALANCE_RATES, MotionBalance, solve_steady_motion
+from pneuopt.models.pneumatic.log_checks import LinePressureCheck, PressureZeroCheck
 from pneuopt.models.pneumatic.starts import PneumaticStarts
-from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve
+from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve, Spool
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import require
+from pneuopt.quantities.errors import UnitError, require
+from pneuopt.quantities.keys import Key, choice, flag, table
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import read_value
 
 SIDES = ("a", "b")
 PRESSURE_SIGNALS = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
@@ -363,3 +383,234 @@ def _air_force(p: Mapping[str, Any], a: Any, b: Any) -> Any:
 
 def _piston_areas(p: Symbols) -> tuple[ca.SX, ca.SX]:
     return areas(p["cylinder.bore"], p["cylinder.rod"])
+
+
+_CRITICAL_RATIO = "valve.critical_ratio"
+_SMOOTHING_KEYS = {
+    "corner": Key("rounding of the corner where the flow chokes", usual=Smoothing.corner, least=0.0, is_open=True),
+    "zero": Key("rounding of the flow law at no flow", usual=Smoothing.zero, least=0.0, is_open=True),
+    "pressure": Key(
+        "rounding of the larger of two pressures", unit="Pa", usual=Smoothing.pressure, least=0.0, is_open=True
+    ),
+}
+_SECTIONS: Mapping[str, Mapping[str, Key]] = {
+    "cylinder": {"stops": flag("whether the covers stop the piston", usual=True)},
+    "valve": {
+        "law": choice("flow law of the edges", {"iso6358": Iso6358, "isentropic": IsentropicNozzle}, "iso6358"),
+        "spool": choice("lag of the spool", {spool.name.lower(): spool for spool in Spool}, "second_order"),
+        "smoothing": table("widths over which the flow law is rounded", _SMOOTHING_KEYS),
+    },
+    "supply": {},
+    "gas": {},
+    "chamber": {
+        "model": choice("change of state of the air", {"polytropic": Polytropic, "thermal": Thermal}, "polytropic"),
+        "mixed": flag("whether inflow, outflow and volume have an exponent each"),
+    },
+    "ambient": {},
+    "load": LOAD_KEYS,
+    "friction": FRICTION_KEYS,
+}
+
+
+def _build_drive(sections: DriveSections) -> PneumaticDrive:
+    options = sections.options("valve")
+    valve = ProportionalValve(options["law"](), options["spool"], Smoothing(**options["smoothing"]))
+    cylinder, load = Cylinder(**sections.options("cylinder")), Load(**sections.options("load"))
+    return PneumaticDrive(valve, read_friction(sections), load, _read_chamber(sections), cylinder)
+
+
+def _read_chamber(sections: DriveSections) -> ChamberModel:
+    options = sections.options("chamber")
+    if options["model"] is Polytropic:
+        return Polytropic(options["mixed"])
+    message = f"{sections.place('chamber', 'mixed')}: a thermal chamber has no exponents; leave it out"
+    require(not sections.has("chamber", "mixed"), message)
+    return Thermal()
+
+
+def _read_nominal_flow(entry: Any, values: Mapping[str, float], where: str) -> float:
+    """Conductance [m^3/(s*Pa)] of a nominal flow in l/min(ANR), 6 to 5 bar(g), at the critical ratio in `values`."""
+    is_anr = isinstance(entry, str) and entry.strip().endswith("(ANR)")
+    advice = 'a nominal flow, 6 to 5 bar(g), is written at ANR (20 degC, 100 kPa): "700 l/min(ANR)"'
+    require(is_anr, f"{where}: {entry!r}: {advice}", UnitError)
+    flow = read_value(entry.strip().removesuffix("(ANR)"), "m^3/s", where=where)
+    require(flow > 0, f"{where}: a flow is positive, got {entry!r}")
+    return conductance_of_nominal_flow(flow, values.get(_CRITICAL_RATIO, CRITICAL_RATIO))
+
+
+PNEUMATIC_KIND = DriveKind(
+    PneumaticDrive.kind,
+    _SECTIONS,
+    _build_drive,
+    aliases=(
+        Alias(
+            "valve",
+            "nominal_flow",
+            "valve.conductance",
+            (_CRITICAL_RATIO,),
+            _read_nominal_flow,
+            "nominal flow of a catalogue, from 6 to 5 bar(g)",
+            "l/min(ANR)",
+            '"700 l/min(ANR)"',
+        ),
+    ),
+    first=FirstFiles(
+        options={"friction": {"model": "stribeck"}},
+        unknowns=("valve.conductance", "valve.dead_zone", *STRIBECK_UNKNOWNS),
+        gains={"Kp": (0.5, 0.05, 4), "Ki": (5, 0.5, 60), "Kd": (0, 0, 0.15), "Tf": (5e-3, 2e-3, 0.02)},
+        limit=5.0,
+        dither=(100.0, 1.5),
+        steps=(0.1, 0.25),
+        horizon=0.45,
+        swept="load.mass",
+        values={"cylinder.start": 0.25},
+    ),
+)
+
+
+BALANCE_RATES = ("pressure_a", "pressure_b", "speed")
+MAX_COMPRESSION_RATIO = 20.0  # largest chamber pressure over supply pressure [1] that is searched in steady motion
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBalance:
+    """Rates of a drive at a position [m] and speed [m/s] as functions of spool position and pressures.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        ``(position, speed, spool, pressure_a, pressure_b, p) -> (BALANCE_RATES; states)``.
+    """
+
+    function: ca.Function
+    p: Array
+    position: float
+    speed: float
+
+    def rates(self, spool: float, a: float, b: float) -> tuple[float, float, float]:
+        """Rates of both pressures [Pa/s] and of the speed [m/s^2]."""
+        rate_a, rate_b, acceleration = self._evaluate(spool, a, b)[0].tolist()
+        return rate_a, rate_b, acceleration
+
+    def states(self, spool: float, a: float, b: float) -> list[float]:
+        """States of the drive."""
+        found: list[float] = self._evaluate(spool, a, b)[1].tolist()
+        return found
+
+    @cached_property
+    def _evaluate(self) -> Callable[[float, float, float], list[Array]]:
+        """The function on buffers of its own: a call costs 6 us instead of 70, and a rest takes hundreds of them."""
+        buffer, run = self.function.buffer()
+        inputs: list[Array] = [np.array([v]) for v in (self.position, self.speed, 0.0, 0.0, 0.0)]
+        inputs.append(np.array(self.p, dtype=float))
+        results: list[Array] = [np.zeros(self.function.size1_out(i)) for i in range(2)]
+        setters: tuple[tuple[Any, list[Array]], ...] = ((buffer.set_arg, inputs), (buffer.set_res, results))
+        for setter, arrays in setters:
+            for i, array in enumerate(arrays):
+                setter(i, array.data)
+
+        def evaluate(spool: float, a: float, b: float) -> list[Array]:
+            inputs[2][0], inputs[3][0], inputs[4][0] = spool, a, b
+            run()
+            return results
+
+        evaluate.keep_alive = buffer  # type: ignore[attr-defined]
+        return evaluate
+
+
+def solve_steady_motion(glide: MotionBalance, p: ParameterSet, pressure_b: float | None) -> tuple[list[float], float]:
+    """States and valve voltage at which only the position changes.
+
+    Parameters
+    ----------
+    p : ParameterSet
+        All parameters of the drive.
+    pressure_b : float, optional
+        Pressure that a closed valve has trapped [Pa(a)]; chamber a balances it.
+
+    Raises
+    ------
+    InputError
+        If no spool position balances the load, or there is no such motion.
+    """
+    if glide.speed:
+        _check_motion(p, glide.speed, pressure_b)
+    if pressure_b is None:
+        spool, a, b = _solve_balance(glide, p)
+    else:
+        spool, a, b = 0.0, _balance_pressure_a(glide, p, pressure_b), pressure_b
+    return glide.states(spool, a, b), p.value("valve.centre") + spool * p.value("valve.span")
+
+
+def _check_motion(p: ParameterSet, speed: float, pressure_b: float | None) -> None:
+    verdict = f"no steady motion at speed = {speed:g} m/s: "
+    require(pressure_b is None, verdict + "trapped air (pressure_b) holds a drive still; give only one of the two")
+    spring = p.value("load.stiffness") if "load.stiffness" in p else 0.0
+    require(spring == 0, verdict + f"load.stiffness = {spring:g} N/m pulls more the farther it goes; start at rest")
+
+
+def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float, float]:
+    """Spool position and pressures at which nothing changes, by nested root searches on functions with one zero each.
+
+    In motion a chamber may exceed the supply pressure: the piston compresses the air that the spool throttles.
+    """
+    low, high, rates = p.value("ambient.pressure"), p.value("supply.pressure"), glide.rates
+    if glide.speed:
+        low, high = MIN_CHAMBER_PRESSURE, MAX_COMPRESSION_RATIO * high
+
+    def pressures(spool: float) -> tuple[float, float]:
+        def pressure_b_at(a: float) -> float:
+            return _zero_crossing_or_end(lambda pressure_b_at: rates(spool, a, pressure_b_at)[1], low, high)
+
+        if p.value("cylinder.leak") == 0:
+            return _zero_crossing_or_end(lambda a: rates(spool, a, low)[0], low, high), pressure_b_at(low)
+        a = _zero_crossing_or_end(lambda a: rates(spool, a, pressure_b_at(a))[0], low, high)
+        return a, pressure_b_at(a)
+
+    def acceleration_at(spool: float) -> float:
+        return rates(spool, *pressures(spool))[2]
+
+    mass = p.value("load.mass")
+    ends = [acceleration_at(end) * mass for end in (-1.0, 1.0)]
+    what = f"no steady motion at speed = {glide.speed:g} m/s" if glide.speed else "no equilibrium exists"
+    require(
+        ends[0] <= 0 <= ends[1],
+        f"{what}: beyond {'friction and ' if glide.speed else ''}load the cylinder pushes with {ends[0]:.4g} to "
+        f"{ends[1]:.4g} N at supply.pressure = {p.value('supply.pressure'):g} Pa(a), never with 0; "
+        f"lower the {'speed or the ' if glide.speed else ''}load, raise the supply or the bore",
+    )
+    spool = 0.0 if abs(acceleration_at(0.0)) * mass < 1e-9 else _brent_root(acceleration_at, -1.0, 1.0)
+    a, pressure_b_at = pressures(spool)
+    inside = not glide.speed or (low < min(a, pressure_b_at) and max(a, pressure_b_at) < high)
+    require(
+        inside,
+        f"{what}: a chamber would need {a if low < pressure_b_at < high else pressure_b_at:g} Pa(a); lower the speed",
+    )
+    return spool, a, pressure_b_at
+
+
+def _balance_pressure_a(glide: MotionBalance, p: ParameterSet, b: float) -> float:
+    """Pressure in chamber a that balances pressure b; the force is linear in it."""
+    require(
+        b > MIN_CHAMBER_PRESSURE,
+        f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {MIN_CHAMBER_PRESSURE:g} Pa",
+    )
+    low, high = p.value("ambient.pressure"), p.value("supply.pressure")
+    at_low, at_high = (glide.rates(0.0, a, b)[2] for a in (low, high))
+    a = low - at_low * (high - low) / (at_high - at_low)
+    require(
+        a > MIN_CHAMBER_PRESSURE,
+        f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more",
+    )
+    return a
+
+
+def _zero_crossing_or_end(rate: Callable[[float], float], low: float, high: float) -> float:
+    """Pressure at which its rate falls through zero; an end of the range where it does not."""
+    if rate(high) >= 0:
+        return high
+    return low if rate(low) <= 0 else _brent_root(rate, low, high)
+
+
+def _brent_root(function: Callable[[float], float], low: float, high: float) -> float:
+    return float(brentq(function, low, high, xtol=1e-14 * (high - low), rtol=1e-15))

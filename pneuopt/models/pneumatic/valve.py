@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from pneuopt.dynamics.excitation import DEFAULT_WIDTH
+from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY, REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity

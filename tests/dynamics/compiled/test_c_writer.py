@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pneuopt.dynamics.compiled import c_writer as emission
 from pneuopt.dynamics.compiled.c_writer import CFunction, write_c
+from pneuopt.dynamics.compiled.compiler import find_compiler
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
-from pneuopt.dynamics.compiled.toolchain import find_compiler
 from pneuopt.quantities.arrays import Array
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -1,3 +1,9 @@
+"""What stays in the cache of compiled models.
+
+Which compiler is found, and how it is called.
+"""
+
+import importlib.util
 import logging
 import os
 import platform
@@ -8,8 +14,10 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -17,9 +25,23 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pneuopt.dynamics.compiled import compiler, library_cache, toolchain
+from pneuopt.dynamics.compiled import compiler
+from pneuopt.dynamics.compiled import compiler as library_cache
+from pneuopt.dynamics.compiled import compiler as toolchain
+from pneuopt.dynamics.compiled.compiler import (
+    NOTICE_TIME,
+    Compiler,
+    explain_missing_compiler,
+    find_compiler,
+    find_library,
+    keep_library,
+    trim_cache,
+)
 from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.dynamics.system import discretise, parameter_vector
+from pneuopt.models.drives import ForceDrive
+from pneuopt.models.friction import Stribeck
 
 Forget = Callable[[], None]
 needs_compiler = pytest.mark.skipif(toolchain.find_compiler() is None, reason="no C compiler")
@@ -301,3 +323,170 @@ def test_two_processes_may_build_the_same_at_once(tmp_path: Path) -> None:
     running = [subprocess.Popen([sys.executable, "-c", program], env=settings) for _ in range(2)]
     assert [process.wait(60) for process in running] == [0, 0]
     assert len(list(tmp_path.iterdir())) == 1
+
+
+DAY = 24 * 3600.0
+
+
+def library(folder: Path, name: str, days: float, size: int = 100) -> Path:
+    path = folder / f"{name}.so"
+    path.write_bytes(b"x" * size)
+    then = time.time() - days * DAY
+    os.utime(path, (then, then))
+    return path
+
+
+def left(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_what_was_not_used_for_half_a_year_goes(tmp_path: Path) -> None:
+    library(tmp_path, "new", 0)
+    library(tmp_path, "spring", 170)
+    library(tmp_path, "winter", 190)
+    (tmp_path / "zig").mkdir()
+    trim_cache(tmp_path)
+    assert left(tmp_path) == {"new.so", "spring.so", "zig"}
+
+
+def test_too_many_go_from_the_one_unused_for_longest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library_cache, "LARGEST_SIZE", 250)
+    for k in range(4):
+        library(tmp_path, f"l{k}", k)
+    trim_cache(tmp_path)
+    assert left(tmp_path) == {"l0.so", "l1.so"}
+
+
+def test_what_a_killed_process_left_goes_after_a_day(tmp_path: Path) -> None:
+    for name, days in (("compile-a", 0.1), ("compile-b", 2.0)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "model.c").touch()
+        then = time.time() - days * DAY
+        os.utime(tmp_path / name, (then, then))
+    trim_cache(tmp_path)
+    assert left(tmp_path) == {"compile-a"}
+
+
+def test_a_use_counts_and_a_new_library_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    product = tmp_path / "product"
+    product.write_bytes(b"one")
+    one = keep_library(tmp_path, "one", product)
+    then = time.time() - 2 * NOTICE_TIME
+    os.utime(one, (then, then))
+    assert find_library(tmp_path, "one") == one
+    assert time.time() - one.stat().st_mtime < NOTICE_TIME
+    monkeypatch.setattr(library_cache, "LARGEST_SIZE", 2)
+    product.write_bytes(b"two")
+    two = keep_library(tmp_path, "two", product)
+    assert left(tmp_path) == {two.name}
+
+
+GCC = shutil.which("gcc") or shutil.which("clang")
+needs_gcc = pytest.mark.skipif(GCC is None or os.name == "nt", reason="no C compiler on the path")
+
+
+@pytest.fixture
+def bare(monkeypatch: pytest.MonkeyPatch, forget: Forget, tmp_path: Path) -> Path:
+    """No compiler on the path, in the environment, or as a package."""
+    for name in ("PNEUOPT_CC", "CC"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    return tmp_path
+
+
+def program(path: Path, text: str = "#!/bin/sh\n") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+def test_without_any_it_is_said_what_to_install(bare: Path) -> None:
+    assert find_compiler() is None
+    assert explain_missing_compiler().startswith("no C compiler found: ")
+    assert 'pip install "pneuopt[compiler]"' in explain_missing_compiler()
+    assert "\n" not in explain_missing_compiler()
+
+
+def test_a_chosen_one_that_is_not_there_is_named(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PNEUOPT_CC", "no-such-compiler -v")
+    assert find_compiler() is None
+    assert explain_missing_compiler().startswith("PNEUOPT_CC='no-such-compiler -v' names no program: ")
+    monkeypatch.setenv("PNEUOPT_CC", "'half quoted")
+    assert find_compiler() is None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the compilers here are shell scripts")
+def test_the_order_is_chosen_named_on_the_path_packaged(
+    bare: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    zig = program(bare / "site" / "ziglang" / "zig")
+    spec = SimpleNamespace(submodule_search_locations=[str(zig.parent)])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: spec)
+    forget()
+    assert find_compiler() == Compiler((str(zig), "cc"))
+    clang = program(bare / "clang")
+    assert find_compiler() == Compiler((str(clang),))
+    mine = program(bare / "my folder" / "cc of mine")
+    monkeypatch.setenv("CC", "gone")  # a name of another machine is passed over
+    assert find_compiler() == Compiler((str(clang),))
+    monkeypatch.setenv("CC", "clang -m64")
+    assert find_compiler() == Compiler((str(clang), "-m64"))
+    monkeypatch.setenv("PNEUOPT_CC", str(mine))  # a path with blanks is no command with arguments
+    assert find_compiler() == Compiler((str(mine),))
+    monkeypatch.setenv("PNEUOPT_CC", f"'{mine}' -v 'a b'")
+    assert find_compiler() == Compiler((str(mine), "-v", "a b"))
+    monkeypatch.setenv("PNEUOPT_CC", "")
+    assert find_compiler() is None
+
+
+def test_apple_s_placeholder_is_no_compiler(bare: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget) -> None:
+    """Without Apple's tools a call of /usr/bin/gcc opens a window that offers to install them."""
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(toolchain, "_has_apple_tools", lambda: False)
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
+    assert find_compiler() is None
+    monkeypatch.setattr(toolchain, "_has_apple_tools", lambda: True)
+    assert find_compiler() == Compiler(("/usr/bin/gcc",))
+
+
+def run_stribeck() -> tuple[Rollout, dict[str, np.ndarray]]:
+    """A drive with friction over 40 samples, with its sensitivities."""
+    system = discretise(ForceDrive(Stribeck()).system(), 5)
+    p = parameter_vector(system.parameters, system.parameters)
+    rollout = Rollout(system.pieces, (0, 1), start=True, threads=1)
+    t, h = np.tile(np.arange(40) * 1e-3, (5, 1)), np.full((5, 40), 1e-3)
+    u = np.linspace(-80, 80, 200).reshape(5, 40, 1)
+    found = rollout.run(np.zeros((5, 2)), u, p, t, h, substeps=5)
+    assert found.dx_end is not None
+    return rollout, {"x_end": found.x_end, "y": found.y, "dx_end": found.dx_end}
+
+
+@needs_gcc
+def test_a_command_with_arguments_compiles(monkeypatch: pytest.MonkeyPatch, forget: Forget, tmp_path: Path) -> None:
+    monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path))
+    monkeypatch.setenv("PNEUOPT_CC", f"{GCC} -DMINE=1")
+    rollout, _ = run_stribeck()
+    assert rollout.uses_machine_code
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="the extra compiler is not installed")
+def test_the_packaged_compiler_gives_what_the_vm_gives(
+    monkeypatch: pytest.MonkeyPatch, forget: Forget, tmp_path: Path
+) -> None:
+    """Where there is neither a compiler on the path nor a home; it leaves nothing beside the cache."""
+    monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path / "cache"))
+    for name in ("PNEUOPT_CC", "CC", "HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    rollout, compiled = run_stribeck()
+    assert rollout.uses_machine_code
+    assert [path.name for path in tmp_path.iterdir()] == ["cache"]
+    forget()
+    monkeypatch.setenv("PNEUOPT_CC", "")
+    rollout, interpreted = run_stribeck()
+    assert not rollout.uses_machine_code
+    for name, expected in interpreted.items():
+        assert_allclose(compiled[name], expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max(), err_msg=name)

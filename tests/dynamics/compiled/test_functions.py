@@ -14,7 +14,7 @@ from pneuopt.dynamics.compiled.functions import (
     compile_rows,
 )
 from pneuopt.dynamics.system import parameter_vector
-from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import ModelError
 

@@ -14,10 +14,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.compiled import compiler, vm
 from pneuopt.dynamics.compiled import rollout as codegen
+from pneuopt.dynamics.compiled.compiler import find_compiler
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
-from pneuopt.dynamics.compiled.toolchain import find_compiler
 from pneuopt.dynamics.system import DiscreteSystem, discretise, parameter_vector
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError

@@ -6,13 +6,14 @@ import pytest
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import DiscreteSystem, discretise, names, parameter_vector
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.load import Load
-from pneuopt.models.starts.filters import FILTER_TIMES, filter_motion
 from pneuopt.models.starts.friction import (
+    FILTER_TIMES,
     RegressionRows,
     choose_filter_time,
+    filter_motion,
     force_misfit,
     load_columns,
 )

@@ -1,0 +1,709 @@
+"""`dither_effect`: what a dither moves, by harmonic balance of the nonlinear plant, and why it acts as it does.
+
+`read_ending`: how a response ends with its ripple: its error over the last cycles, its settling, its ripple.
+
+`judge_dither`: whether a dither is useful: the loop's metrics with and without it, and what the dither moves.
+
+`judge_compensators`: whether what is added to a command against friction is useful, judged as a dither is.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from math import inf, isfinite, isnan, nan, pi
+from typing import TYPE_CHECKING, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from pneuopt.control.averaging import ripple
+from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET
+from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.reference import Reference, as_references
+from pneuopt.dynamics.hooks import Axis, FinalElement, Rest
+from pneuopt.dynamics.system import System, names
+from pneuopt.evaluation.certificate import ContinuedResponse, Ending, continue_response
+from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases
+from pneuopt.evaluation.metric import (
+    FINAL_PERIODS,
+    TAIL_SHARE,
+    Band,
+    band_share,
+    describe_ripple,
+    entry_for_good,
+    measure_ripple,
+    period_mean,
+)
+from pneuopt.evaluation.requirements import METRICS
+from pneuopt.evaluation.response import command_range
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ConvergenceError, InputError, require
+from pneuopt.quantities.parameters import ParameterSet, check_parameters
+from pneuopt.quantities.report import Report, Tone, report_verdict
+from pneuopt.quantities.results import Result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+# Share of the static friction below which a dither's force on a body at rest is said not to loosen it: the
+# command gives the rest of the force, so a dither may loosen with less than all of it; lower promises too much.
+MIN_LOOSENING_FORCE = 0.5
+
+
+@dataclass(frozen=True)
+class DitherEffect:
+    """Amplitudes that a dither causes, by harmonic balance of the nonlinear plant; NaN where they are not known.
+
+    Attributes
+    ----------
+    amplitude, frequency : float
+        [command's unit], [Hz]
+    spool : float
+        Amplitude of the final element's moving part, a valve's spool [half travels].
+    valve_gain : float
+        Ratio of the spool's amplitude to the command's, which the valve's lag reduces [1].
+    force : float
+        Amplitude of the force on a body held fast at rest [the axis's unit of force].
+    speed, travel : float
+        Amplitudes of a body that moves at the reference's final speed [its speed's unit], [that times s].
+    drive_frequency : float
+        Natural frequency of the load on the element's medium, the air in the chambers, without friction [Hz].
+    """
+
+    amplitude: float
+    frequency: float
+    spool: float = nan
+    valve_gain: float = nan
+    force: float = nan
+    speed: float = nan
+    travel: float = nan
+    drive_frequency: float = nan
+
+
+def dither_effect(
+    loop: ClosedLoop, reference: Reference, parameters: ParameterSet, *, speed: float | None = None
+) -> DitherEffect:
+    """Amplitudes that the dither causes: the motion and, behind a final element, its travel and force.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    reference : Reference
+        The body is held at its start.
+    parameters : ParameterSet
+        Values with the dither's amplitude and frequency.
+    speed : float, optional
+        Speed at which the body moves [its unit]; by default the reference's final value where the loop feeds back a
+        speed, and otherwise the step's size over the time that is left to make it.
+    """
+    full = loop.complete(parameters)
+    found = DitherEffect(full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY))
+    axis = loop.plant.axis or Axis()
+    moves, held = _operating_points(loop, axis, reference, speed)
+    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
+    if axis.speed in moving:
+        swing = abs(moving[axis.speed])
+        found = replace(found, speed=swing, travel=swing / (2 * pi * found.frequency))
+    if axis.final_element is None:
+        return found
+    return _add_effect_at_rest(found, loop, axis, axis.final_element, held, full)
+
+
+def describe_swing(
+    loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, band: Band
+) -> str | None:
+    """Sentence for a dither that moves the measured signal out of the settling band; None for others.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : sequence of Reference
+    parameters : ParameterSet
+        Values with the dither's amplitude and frequency.
+    band : float or Tolerance
+        Half width of the settling band, a fraction of the step or in the measured unit.
+    """
+    full, step = loop.complete(parameters), min(references, key=lambda r: abs(r.nominal_size))
+    if loop.dither_period(full) is None:
+        return None
+    moves, _ = _operating_points(loop, loop.plant.axis or Axis(), step, None)
+    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
+    share = band_share(band, step)
+    swing, half = abs(moving.get(loop.feedback.name, 0.0)), share * abs(step.nominal_size)
+    if swing <= half:
+        return None
+    signal, command = loop.feedback, loop.command
+    amplitude, frequency = full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY)
+    swings, allowed = (format_with_prefix(v, signal.unit) for v in (swing, half))
+    return (
+        f"the given dither of {amplitude:.3g} {command.unit} at {frequency:.4g} Hz swings the {signal.name} by "
+        f"+-{swings}, beyond the settling band of +-{allowed} (+-{100 * share:.3g} % of step {step.label}): only the "
+        f"mean over its period can settle; lower {DITHER_AMPLITUDE}, raise {DITHER_FREQUENCY}, or widen the band"
+    )
+
+
+def _operating_points(
+    loop: ClosedLoop, axis: Axis, reference: Reference, speed: float | None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """What is known of the plant where the body moves, half way of a step in position, and where it is held."""
+    if loop.feedback.name == axis.position:
+        half = (reference.initial + reference.final) / 2
+        fast = reference.size / (reference.horizon - reference.at) if speed is None else speed
+        return {axis.position: half, axis.speed: fast}, {axis.position: reference.origin, **reference.start}
+    start = {n: v for n, v in reference.start.items() if n == axis.position}
+    fast = (reference.final or reference.initial) if speed is None else speed
+    return {axis.speed: fast, **start}, {axis.speed: reference.origin, **reference.start}
+
+
+def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
+    """Sentences on why the dither acts as it does: clipping, lag and dead zone, static friction, motion.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    effect : DitherEffect
+    parameters : ParameterSet
+        Every parameter of the loop.
+    """
+    p, e, sentences = parameters, effect, list[str]()
+    sentences += _describe_clipping(loop, p)
+    axis = loop.plant.axis or Axis()
+    if axis.final_element is not None and not isnan(e.valve_gain):
+        sentences.append(_describe_final_element(axis.final_element, e, p))
+    static = next((p.value(f"friction.{n}") for n in ("static", "coulomb") if f"friction.{n}" in p), nan)
+    if not isnan(e.force):
+        against = "" if isnan(static) else f" against a static friction of {static:.3g} {axis.force}"
+        weak = ": too little to loosen it" if e.force < MIN_LOOSENING_FORCE * static else ""
+        force = format_with_prefix(e.force, axis.force)
+        sentences.append(f"the force on a {axis.noun} at rest swings by +-{force}{against}{weak}")
+    if not isnan(e.speed):
+        unit = next(q.unit for q in loop.plant.states if q.name == axis.speed)
+        speed, travel = format_with_prefix(e.speed, unit), format_with_prefix(e.travel, unit.removesuffix("/s"))
+        sentences.append(f"a moving {axis.noun} swings by +-{speed} and +-{travel}")
+    if axis.final_element is not None and not isnan(e.drive_frequency):
+        ratio = e.frequency / e.drive_frequency
+        natural = f"the {e.drive_frequency:.3g} Hz at which the load swings on the {axis.final_element.medium}"
+        sentences.append(f"the dither's {e.frequency:.3g} Hz are {ratio:.2g} times {natural}")
+    return tuple(sentences)
+
+
+def format_with_prefix(value: float, unit: str) -> str:
+    """Value with its unit and an SI prefix that avoids leading zeros.
+
+    Examples
+    --------
+    >>> format_with_prefix(0.00076, "N"), format_with_prefix(6.4e-11, "m"), format_with_prefix(12.1, "N")
+    ('0.76 mN', '0.064 nm', '12 N')
+    """
+    for factor, prefix in ((1.0, ""), (1e3, "m"), (1e6, "u"), (1e9, "n")):
+        if abs(value) * factor >= 0.1 or prefix == "n" or value == 0:
+            break
+    return f"{value * factor:.2g} {prefix}{unit}"
+
+
+def _add_effect_at_rest(
+    found: DitherEffect,
+    loop: ClosedLoop,
+    axis: Axis,
+    element: FinalElement,
+    known: Mapping[str, float],
+    full: ParameterSet,
+) -> DitherEffect:
+    """Add what the dither moves where the body is held at rest: the final element, and the force behind it."""
+    rest = _try_rest(loop.plant, full, known)
+    held = _state_harmonics(loop, _clamp_body(loop.plant, axis), full, rest)
+    if rest is None or not held:
+        return found
+    command = found.amplitude / full.value(element.limit)
+    spool = abs(held[element.stroke]) if element.stroke in held else min(1.0, command)
+    linear = loop.plant.linearise(np.array([*rest.states.values()]), rest.inputs, full)
+    row = dict(zip(linear.states, linear.A[linear.states.index(axis.speed)], strict=True))
+    force = full.value(axis.inertia) * abs(sum(row[n] * held[n] for n in element.pushing))
+    kept = [linear.states.index(n) for n in (axis.speed, *element.pushing)]
+    block = linear.A[np.ix_(kept, kept)]
+    block[0, 0] = 0.0  # without friction
+    rate = float(np.abs(np.linalg.eigvals(block)).max())
+    return replace(found, spool=spool, valve_gain=spool / command, force=float(force), drive_frequency=rate / (2 * pi))
+
+
+def _describe_final_element(element: FinalElement, e: DitherEffect, p: ParameterSet) -> str:
+    """Sentence on how far the final element follows the dither, and on its dead zone."""
+    dead = p.value(element.dead_zone)
+    lag = f" at {p.value(element.bandwidth):.3g} Hz bandwidth" if element.bandwidth in p else ""
+    zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
+    follows = f"the {element.moving_part} follows {100 * e.valve_gain:.0f} % of the dither{lag}"
+    return f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}"
+
+
+def _describe_clipping(loop: ClosedLoop, p: ParameterSet) -> list[str]:
+    """Sentence where offset and amplitude alone exceed the limits of command or final element; none otherwise."""
+    low, high, whose = command_range(loop, p)
+    least, most = (p.value(DITHER_OFFSET) + side * p.value(DITHER_AMPLITUDE) for side in (-1, 1))
+    if low <= least and most <= high:
+        return []
+    unit = loop.command.unit
+    return [
+        f"offset and amplitude alone reach {least:.3g} to {most:.3g} {unit}, and {whose} ends at {low:.3g} and "
+        f"{high:.3g} {unit}: the peaks are cut"
+    ]
+
+
+def _try_rest(plant: System, p: ParameterSet, known: Mapping[str, float]) -> Rest | None:
+    """Rest or steady motion of the plant with these values; None where there is none."""
+    if plant.rest_hook is None:
+        return None
+    try:
+        return plant.rest_hook(p, known)
+    except (InputError, ConvergenceError):
+        return None
+
+
+def _state_harmonics(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Rest | None) -> dict[str, complex]:
+    """First harmonics of the states about a rest; empty where the harmonic balance does not converge."""
+    assert loop.dither is not None
+    at = None if rest is None else {**rest.states, **rest.inputs}
+    try:
+        return ripple(plant, p, at=at, actuated=loop.command.name, waveform=loop.dither.waveform)
+    except ConvergenceError:
+        return {}
+
+
+def _clamp_body(plant: System, axis: Axis) -> System:
+    """The plant with its body clamped: position, speed and friction states have no rate."""
+    t, x, u, p = (ca.SX.sym(n, plant.ode.size1_in(k)) for k, n in enumerate("txup"))
+    xdot, y = plant.ode(t, x, u, p)
+    clamped = [n in (axis.position, axis.speed) or n.startswith("friction.") for n in names(plant.states)]
+    rates = ca.vertcat(*(ca.SX(0) if c else xdot[k] for k, c in enumerate(clamped)))
+    return replace(plant, ode=ca.Function("ode", [t, x, u, p], [rates, y], ["t", "x", "u", "p"], ["xdot", "y"]))
+
+
+# Cycles of a hunting loop, at its end, over which its error is the largest one: fewer miss the worst of irregular
+# cycles, more reach back into the transient.
+LAST_CYCLES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class DitheredEnding:
+    """How a response ends.
+
+    Attributes
+    ----------
+    metrics : dict of str to float
+        Those of `evaluate`, with the settling times and the error of the continued response, infinite where it never
+        settles, and RemainingError, the largest error of the signal itself over the last cycles [% of the step].
+    ending : Ending
+        Of the response, continued until it is decided.
+    ripple : float
+        Peak to peak of its dither's ripple in the end [measured unit].
+    speed : float or None
+        The largest mean speed of a body that is positioned [its unit]; None where the reference is a speed.
+    ripple_note : str or None
+        Sentence where only the mean settles.
+    """
+
+    metrics: dict[str, float]
+    ending: Ending
+    ripple: float
+    speed: float | None
+    ripple_note: str | None
+
+    def describe(self, which: str) -> Iterator[str]:
+        """What a table of metrics does not show, a sentence each; `which` is "with" or "without" the dither."""
+        course, cycle = self.ending.course, self.ending.cycle
+        if cycle is not None:
+            yield f"{which} it the loop ends in {cycle.describe(course.loop.feedback.unit)}"
+        if self.ripple_note is not None:
+            yield self.ripple_note
+        if course.contact and self.ending.hunts:
+            until = f"{course.t[-1]:.3g} s after the step"
+            yield f"{which} it the response is judged until {until}: {course.contact}"
+
+
+def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
+    """Continue a response until it stands, shows whether it hunts or meets a limit, and read how it ends.
+
+    Parameters
+    ----------
+    found : CaseEvaluation
+    band : float or Tolerance
+        Half width of the settling band, a fraction of the step or in the measured unit.
+
+    Raises
+    ------
+    ConvergenceError
+        If the simulation stops.
+    """
+    share = band_share(band, found.case.reference)
+    course, size = continue_response(found, share), abs(found.case.reference.nominal_size)
+    ending = Ending(course, share, found.case.label)
+    begin, mean = begin_of_end(ending), np.abs(course.error)
+    t, raw = (
+        course.t[course.before_contact],
+        np.abs(course.signal[course.before_contact] - course.reference.final) / size,
+    )
+    errors = {
+        "RemainingError": 100 * float(raw[t >= begin].max()),
+        "SteadyStateError": 100 * float(mean[course.at >= begin].max()),
+    }
+    settled = {
+        "SettlingTime": _settling_time(ending, found.metrics["SettlingTime"], course.at, mean),
+        "SettlingTimeRaw": _settling_time(ending, found.metrics["SettlingTimeRaw"], t, raw),
+    }
+    return DitheredEnding(
+        {**found.metrics, **errors, **settled},
+        ending,
+        _ripple(course),
+        _largest_speed(found),
+        describe_ripple(found.metrics, size, share),
+    )
+
+
+def begin_of_end(ending: Ending) -> float:
+    """Instant from which the error counts as the one in the end: that of the last cycles of a loop that hunts [s].
+
+    It lies before the last instant at which a mean over the dither's period is known.
+    """
+    end, cycle = float(ending.course.at[-1]), ending.cycle
+    if cycle is not None:
+        return end - LAST_CYCLES / cycle.frequency
+    if ending.stands or ending.drifts:
+        return end - max(TAIL_SHARE * end, FINAL_PERIODS * (ending.course.period or 0.0))
+    return end / 2
+
+
+def _settling_time(ending: Ending, within_horizon: float, t: Array, error: Array) -> float:
+    """That within the horizon, if the continuation does not refute it; else its own; infinite for never [s]."""
+    inside = ending.is_inside(error)
+    if isfinite(within_horizon) and inside[t > ending.course.horizon].all():
+        return within_horizon
+    return entry_for_good(t, inside)
+
+
+def _ripple(course: ContinuedResponse) -> float:
+    """Peak to peak of what repeats with the dither in the end [measured unit]."""
+    if course.period is None:
+        return 0.0
+    signal, k = course.signal[None], len(course.at)
+    means = period_mean(course.t, signal, course.reference.initial, course.period, course.at)
+    return float(measure_ripple(course.at, signal[:, :k] - means, course.period)[0])
+
+
+def _largest_speed(found: CaseEvaluation) -> float | None:
+    """The largest mean speed of a positioned body within the horizon [its unit]; None for other loops."""
+    axis, period, run = found.loop.plant.axis, found.loop.dither_period(found.parameters), found.response
+    if axis is None or found.loop.feedback.name != axis.position or axis.speed not in run:
+        return None
+    speed = run[axis.speed]
+    if period is not None and period <= run.t[-1] - run.t[0]:
+        at = run.t[run.t <= run.t[-1] - period / 2]
+        speed = period_mean(run.t, speed[None], float(speed[0]), period, at)[0]
+    return float(speed[np.abs(speed).argmax()])
+
+
+# Share by which a dither has to reduce the error of a loop that goes on hunting, to count as better: with less, one
+# that shakes a hunting loop a little is useful; with more, no dither is that does not cure it.
+MIN_CURE = 0.5
+# Ripple from peak to peak, a share of the step, from which a dither is harmful whatever else it does: above, the motion
+# goes to and fro instead of along the step; far below, a dither that cures hunting as large is refused.
+MAX_RIPPLE_SHARE = 0.5
+
+
+class Usefulness(Enum):
+    """Verdict on a dither."""
+
+    USEFUL = "useful"
+    HELPS_THESE_GAINS = "useful with these gains"
+    USELESS = "useless"
+    HARMFUL = "harmful"
+
+
+VERDICT_TONES = {
+    Usefulness.USEFUL: Tone.GOOD,
+    Usefulness.HELPS_THESE_GAINS: Tone.DOUBTFUL,
+    Usefulness.USELESS: Tone.DOUBTFUL,
+    Usefulness.HARMFUL: Tone.BAD,
+}
+
+
+class Criterion(NamedTuple):
+    """A criterion on dithers: a metric's label and the changes of which the larger counts, absolute and relative."""
+
+    label: str
+    absolute: float
+    relative: float
+    counts_in_hunting: bool = True
+
+
+CRITERIA: Mapping[str, Criterion] = {  # where some improve and others do not, the first that changes decides
+    "RemainingError": Criterion("largest error in the end, ripple included", 0.5, 0.05),  # [%]
+    "SettlingTimeRaw": Criterion("settling time, ripple included", 0.0, 0.05),
+    "SettlingTime": Criterion("settling time of the mean", 0.0, 0.05),
+    "SteadyStateError": Criterion("error of the mean in the end", 0.5, 0.0),  # [%]
+    "IAE": Criterion("integral of the error", 0.0, 0.05, counts_in_hunting=False),
+    "Overshoot": Criterion("overshoot", 1.0, 0.0, counts_in_hunting=False),  # [%]
+}
+NO_RIVAL = "gains tuned without dither may do as well: none were compared (tune_without_dither finds them)"
+PRICE_METRICS = {
+    "Ripple": "ripple",
+    "AirUse": "air consumption",
+    "ValveTravel": "valve travel",
+    "PeakControl": "largest command",
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DitherVerdict(Result):
+    """Verdict of `judge_dither`: as text, the verdict in the first line and a reason in each further line.
+
+    Attributes
+    ----------
+    usefulness : Usefulness
+    reasons : tuple of str
+        What decided, the price and the mechanism, a sentence each.
+    table : DataFrame
+        A row for each metric of `evaluate`, columns "without" and "with": the worst over the references. Settling times
+        and errors are those of the continued response, infinite where it never settles; RemainingError is the largest
+        error over the last cycles, ripple included [% of the step].
+    effect : DitherEffect
+    baseline : str
+        What "without" stands for: the same gains, or gains tuned without dither.
+    unit : str
+        Unit of the command.
+    """
+
+    usefulness: Usefulness
+    reasons: tuple[str, ...]
+    table: "pd.DataFrame"
+    effect: DitherEffect
+    baseline: str
+    unit: str
+
+    def __str__(self) -> str:
+        dither = f"the dither of {self.effect.amplitude:.4g} {self.unit} at {self.effect.frequency:.4g} Hz"
+        head = f"{dither} is {self.usefulness.value}, against {self.baseline}"
+        return "\n".join([head, *(f"  {reason}" for reason in self.reasons)])
+
+    def summary(self) -> Report:
+        """The verdict, then a reason a line."""
+        return report_verdict(str(self), VERDICT_TONES[self.usefulness])
+
+
+def judge_dither(
+    loop: ClosedLoop,
+    references: Reference | Sequence[Reference],
+    parameters: ParameterSet,
+    *,
+    without: ParameterSet | None = None,
+    band: Band = 0.02,
+) -> DitherVerdict:
+    """Evaluate a loop with its dither and a rival without one, and say whether the dither is useful, and why.
+
+    Responses are continued beyond their horizons until they stand or show at least three cycles of their hunting, or
+    the stroke ends (`continue_response`). The signal itself counts, with the ripple: first its largest error over the
+    last cycles, as far as it exceeds the settling band, then its settling time, then the mean's settling time and
+    error, the integral of the absolute error and the overshoot. Where some improve and others do not, the first that
+    changes decides; a change counts from 0.5 % of the step for errors, 1 % for the overshoot, and 5 % of the rest. A
+    dither with which the loop hunts has to halve the error to be useful. One that ripples by half the step or more,
+    from peak to peak, is harmful whatever else it does.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : Reference or sequence of Reference
+    parameters : ParameterSet
+        Values of the design with dither, whose amplitude is positive.
+    without : ParameterSet, optional
+        The rival: values tuned without dither (`tune_without_dither`); its dither is switched off. By default the same
+        gains, which are tuned for the dither, so that the verdict is "useful with these gains" at best.
+    band : float
+        Half width of the settling band, a fraction of the step.
+
+    Returns
+    -------
+    DitherVerdict
+
+    Raises
+    ------
+    InputError
+        If there is no dither to judge.
+    ConvergenceError
+        If a simulation stops.
+    """
+    check_closed_loop(loop)
+    check_parameters(parameters)
+    steps = as_references(references)
+    full = loop.complete(parameters)
+    require(loop.dither is not None, "there is no dither to judge: ClosedLoop(plant, pid, Dither())")
+    require(full.value(DITHER_AMPLITUDE) > 0, "there is no dither to judge: dither.amplitude is 0")
+    plain = full if without is None else full | without
+    plain = plain.with_bounds({DITHER_AMPLITUDE: (0.0, plain[DITHER_AMPLITUDE].upper)})
+    plain = plain.with_values({DITHER_AMPLITUDE: 0.0})
+    before, after = (read_endings(loop, steps, p, band) for p in (plain, full))
+    table = worst_metrics(before, after)
+    effect = dither_effect(loop, steps[0], full, speed=after[0].speed)
+    objections = [
+        text for step, found in zip(steps, after, strict=True) for text in _object_to_swing(step, found, effect)
+    ]
+    hunts, narrowest = any(e.ending.hunts for e in after), min(band_share(band, r) for r in steps)
+    usefulness, changes = weigh_changes(table, narrowest, loop, objections, hunts=hunts)
+    notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
+    rival = "gains tuned without it"
+    if without is None:
+        usefulness = Usefulness.HELPS_THESE_GAINS if usefulness is Usefulness.USEFUL else usefulness
+        rival, notes = "the same gains without it", [*notes, NO_RIVAL]
+    reasons = (*changes, *dict.fromkeys(notes), *explain_effect(loop, effect, full))
+    return DitherVerdict(usefulness, reasons, table, effect, rival, loop.command.unit)
+
+
+def read_endings(
+    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, band: Band
+) -> list[DitheredEnding]:
+    """How a loop's response to each reference ends."""
+    return [read_ending(found, band) for found in evaluate_cases(loop, steps, parameters, band=band)]
+
+
+def worst_metrics(before: Sequence[DitheredEnding], after: Sequence[DitheredEnding]) -> "pd.DataFrame":
+    """Worst metrics over the references, without and with dither."""
+    import pandas as pd
+
+    designs = {"without": before, "with": after}
+    return pd.DataFrame({n: pd.DataFrame([e.metrics for e in endings]).max() for n, endings in designs.items()})
+
+
+def _object_to_swing(reference: Reference, found: DitheredEnding, effect: DitherEffect) -> Iterator[str]:
+    """Objection to a dither that swings the signal by a large part of the step, in the end or while the body moves."""
+    loop = found.ending.course.loop
+    signal, axis = loop.feedback, loop.plant.axis or Axis()
+    moving = {axis.speed: effect.speed, axis.position: effect.travel}.get(signal.name, nan)
+    swing, size = max(found.ripple, 0.0 if isnan(moving) else 2 * moving), abs(reference.nominal_size)
+    if swing >= MAX_RIPPLE_SHARE * size:
+        text = f"worse: the dither swings {signal.name} by {format_with_prefix(swing, signal.unit)} from peak to peak"
+        yield f"{text}, {100 * swing / size:.0f} % of the step"
+
+
+def weigh_changes(
+    table: "pd.DataFrame", band: float, loop: ClosedLoop, objections: list[str], *, hunts: bool
+) -> tuple[Usefulness, tuple[str, ...]]:
+    """Verdict and its reasons, from the objections that are known beforehand and the changes of the metrics.
+
+    Of a loop that hunts with the dither only settling and errors count.
+    """
+    reasons, signs = [*objections], [-1] * len(objections)
+    for metric, criterion in CRITERIA.items():
+        if hunts and not criterion.counts_in_hunting:
+            continue
+        least = 100 * band if metric == "RemainingError" else 0.0  # inside the band no error counts
+        before, after = (max(least, float(table[c][metric])) for c in ("without", "with"))
+        share = MIN_CURE if hunts and after < before else criterion.relative
+        room = max(criterion.absolute, share * max(before, after))
+        if before == after or (isfinite(before) == isfinite(after) and abs(after - before) <= room):
+            continue
+        signs.append(1 if after < before else -1)
+        shown = [_format_metric(metric, float(table[c][metric]), loop) for c in ("without", "with")]
+        word = "better" if after < before else "worse"
+        reasons.append(f"{word}: {criterion.label} {shown[0]} without, {shown[1]} with it")
+    if not signs:
+        kept = ("RemainingError",) if hunts else ("SettlingTimeRaw", "SteadyStateError")
+        figures = [f"{CRITERIA[m].label} {_format_metric(m, float(table['with'][m]), loop)}" for m in kept]
+        reasons.append(f"nothing changes: {'it still hunts, ' if hunts else ''}{', '.join(figures)}")
+    reasons.append("price: " + ", ".join(_price_clause(n, table, loop) for n in PRICE_METRICS if n in table.index))
+    verdict = Usefulness.USELESS if not signs else Usefulness.USEFUL if signs[0] > 0 else Usefulness.HARMFUL
+    return verdict, tuple(reasons)
+
+
+def _price_clause(metric: str, table: "pd.DataFrame", loop: ClosedLoop) -> str:
+    before, after = (_format_metric(metric, float(table[c][metric]), loop) for c in ("without", "with"))
+    return f"{PRICE_METRICS[metric]} {after} (without {before})"
+
+
+def _format_metric(metric: str, value: float, loop: ClosedLoop) -> str:
+    if metric == "RemainingError":
+        return f"{value:.3g} %"
+    if metric in ("SettlingTime", "SettlingTimeRaw") and value == inf:
+        return "never"
+    if metric == "Ripple":
+        return format_with_prefix(value, loop.feedback.unit)
+    return f"{value:.3g} {METRICS[metric].shown_unit(loop.command.unit, loop.feedback.unit)}".rstrip()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CompensatorVerdict(Result):
+    """Verdict of `judge_compensators`: as text, the verdict in the first line and a reason in each further line.
+
+    Attributes
+    ----------
+    usefulness : Usefulness
+    reasons : tuple of str
+        What decided, the price, and how the loops end, a sentence each.
+    table : DataFrame
+        As that of a `DitherVerdict`: a row for each metric, columns "without" and "with".
+    baseline : str
+        What "without" stands for: the same gains, or gains tuned without the compensators.
+    names : tuple of str
+        Of the compensators, as in a tuning's file.
+    """
+
+    usefulness: Usefulness
+    reasons: tuple[str, ...]
+    table: "pd.DataFrame"
+    baseline: str
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        parts = " and ".join(f"the {name.replace('_', ' ')}" for name in self.names)
+        head = f"{parts} {'are' if len(self.names) > 1 else 'is'} {self.usefulness.value}, against {self.baseline}"
+        return "\n".join([head, *(f"  {reason}" for reason in self.reasons)])
+
+    def summary(self) -> Report:
+        """The verdict, then a reason a line."""
+        return report_verdict(str(self), VERDICT_TONES[self.usefulness])
+
+
+def judge_compensators(
+    loop: ClosedLoop,
+    references: Reference | Sequence[Reference],
+    parameters: ParameterSet,
+    *,
+    without: ParameterSet | None = None,
+    band: Band = 0.02,
+) -> CompensatorVerdict:
+    """Evaluate a loop with its compensators and a rival without them, and say whether they are useful, and why.
+
+    The criteria are those of `judge_dither`, in the same order. A dither that the loop has besides is in both.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : Reference or sequence of Reference
+    parameters : ParameterSet
+        Values of the design with the compensators.
+    without : ParameterSet, optional
+        The rival: values tuned without them. By default the same gains, which are tuned for the compensators, so that
+        the verdict is "useful with these gains" at best.
+    band : float
+        Half width of the settling band, a fraction of the step.
+
+    Raises
+    ------
+    InputError
+        If there is no compensator to judge.
+    ConvergenceError
+        If a simulation stops.
+    """
+    check_closed_loop(loop)
+    check_parameters(parameters)
+    require(bool(loop.compensators), "there is nothing to judge: ClosedLoop(plant, pid, compensators=(Knocker(),))")
+    steps, full, bare = as_references(references), loop.complete(parameters), replace(loop, compensators=())
+    plain = (full if without is None else full | without).select(bare.parameters)
+    before, after = (read_endings(one, steps, p, band) for one, p in ((bare, plain), (loop, full)))
+    table, hunts = worst_metrics(before, after), any(e.ending.hunts for e in after)
+    narrowest = min(band_share(band, r) for r in steps)
+    usefulness, changes = weigh_changes(table, narrowest, loop, [], hunts=hunts)
+    notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
+    rival = "gains tuned without it"
+    if without is None:
+        usefulness = Usefulness.HELPS_THESE_GAINS if usefulness is Usefulness.USEFUL else usefulness
+        rival, notes = "the same gains without it", [*notes, NO_RIVAL]
+    names = tuple(c.section for c in loop.compensators)
+    return CompensatorVerdict(usefulness, (*changes, *dict.fromkeys(notes)), table, rival, names)

@@ -1,0 +1,509 @@
+"""`check_move`: refuse a move that no controller can make, with what can be made; `shortest_move`: the fastest left.
+
+Two bounds that hold whatever the controller does. In steady motion at the move's largest speed the command must lie
+within its limits: what the valve lets through at the supply's pressure. And at full command, from rest, the body must
+have come half way, and have accelerated as much, as the first half of the move asks for: what supply, valve, friction
+and load leave of the force. A move that passes may still be followed badly.
+
+`excitation_run`: moves that a plain position controller can play, and whose log shows friction, valve and mass.
+
+What each part of the run is for: fast and medium moves over most of the stroke, both ways, show the valve's
+conductance, viscous friction and the mass; slow ones stick and slip, or creep along the falling branch of a Stribeck
+curve; the shortest ones, each from a dwell, break away from rest and cross the valve's dead zone.
+"""
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import ceil, copysign, inf, log
+
+import numpy as np
+
+from pneuopt.control.linear_loop import open_loop
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.moves import Move, MoveSequence
+from pneuopt.control.pid import PID
+from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.dynamics.hooks import Axis
+from pneuopt.dynamics.runnable import command_centre
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System, names
+from pneuopt.evaluation.margins import margins
+from pneuopt.evaluation.response import TuningCase, check_travel, command_range
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
+
+# Share of a move over which full command is tried first, and the factor on it where that is too short to come half
+# way: larger ones run far beyond the move's end, where a cylinder's model ends; smaller ones try again more often.
+FIRST_PUSH, PUSH_FACTOR = 0.1, 1.4
+# Instants at which full command is read: fewer blur its times and its peak; more cost time in proportion.
+PUSH_SAMPLES = 300
+LONGEST_PUSH = 60.0  # [s], of what hardly moves: a shorter one refuses creeping drives, a longer one takes long
+PUSH_TOLERANCE = 1e-7  # of the simulation: its figures are shown with three digits
+# Bisections of a speed or a share of the limits. Fewer make the figures coarse; each more costs an equilibrium.
+MOVE_BISECTIONS = 20
+# Largest factor on a move's speeds that is tried for the shortest move: a larger one would end beyond any drive.
+MOST_FACTOR = 64.0
+# Share of what full command can that a message and the shortest move allow: nearer 1 the samples of a run refuse what
+# was advised; lower it gives speed away.
+ALLOWED_SHARE = 0.98
+
+
+def check_move(loop: ClosedLoop, move: Move | MoveSequence, parameters: ParameterSet) -> None:
+    """Refuse a move that the stroke, the valve or the force cannot make.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        On the position of an axis; others are not checked, nor is a command without limits.
+    move : Move or MoveSequence
+    parameters : ParameterSet
+
+    Raises
+    ------
+    InputError
+        One message with what can be made: the distance left, the largest speed, or acceleration, or the shortest time.
+    """
+    case, full = TuningCase(move), loop.complete(parameters)
+    check_travel(loop, case, full)
+    check_motion(loop, case, full)
+
+
+def check_motion(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> None:
+    """Refuse a case whose move the valve or the force cannot make; `check_travel` sees to the stroke."""
+    reference = case.reference
+    moves = reference.chain if isinstance(reference, MoveSequence) else (reference,)
+    for move in (m for m in moves if isinstance(m, Move)):
+        can = _abilities(loop, replace(case, reference=move), parameters)
+        obstacle = "" if can is None else can.find_obstacle(move)
+        require(not obstacle, f"reference {case.label}: {obstacle}")
+
+
+def shortest_move(loop: ClosedLoop, move: Move, parameters: ParameterSet) -> Move:
+    """The fastest move of the same shape that passes `check_move`: time is scaled, and the three limits with it.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        On the position of an axis, with a command that is limited.
+    move : Move
+        Feasible or not.
+    parameters : ParameterSet
+
+    Returns
+    -------
+    Move
+        With speed, acceleration and jerk scaled by k, k^2 and k^3.
+
+    Raises
+    ------
+    InputError
+        If the stroke is too short, nothing limits the command, or full command does not move the body so far.
+    """
+    case, full = TuningCase(move), loop.complete(parameters)
+    check_travel(loop, case, full)
+    can = _abilities(loop, case, full)
+    if can is None:
+        raise InputError("shortest_move: nothing limits this move; it needs an axis under a command with limits")
+    low, high = 0.0, 1.0
+    while high < MOST_FACTOR and not can.find_obstacle(scale_move(move, high)):
+        low, high = high, 2 * high
+    for _ in range(MOVE_BISECTIONS if low < MOST_FACTOR else 0):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if can.find_obstacle(scale_move(move, middle)) else (middle, high)
+    require(low > 0, f"reference {move.label}: {can.find_obstacle(move)}")
+    return scale_move(move, ALLOWED_SHARE * low)
+
+
+def scale_move(move: Move, factor: float) -> Move:
+    """The same move, `factor` times as fast.
+
+    Examples
+    --------
+    >>> scale_move(Move(0.2, speed=0.5, acceleration=5.0, jerk=100.0), 2.0).duration
+    0.275
+    """
+    speed, acceleration, jerk = move.speed * factor, move.acceleration * factor**2, move.jerk * factor**3
+    return replace(move, speed=speed, acceleration=acceleration, jerk=jerk)
+
+
+@dataclass(frozen=True, eq=False)
+class _Abilities:
+    """What a plant can at most, forwards along a move.
+
+    Attributes
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+        Of the case.
+    limits : tuple of (float, float, str)
+        Of the command, and whose they are.
+    position : float
+        At the start [its unit].
+    side : float
+        The direction of the move, 1 or -1.
+    push : Trajectory
+        From rest at full command: "way", "speed" and "acceleration" along the move.
+    """
+
+    loop: ClosedLoop
+    parameters: ParameterSet
+    limits: tuple[float, float, str]
+    position: float
+    side: float
+    push: Trajectory
+
+    def find_obstacle(self, move: Move) -> str:
+        """The reason why a move cannot be made, with what can; empty where none is found."""
+        half = move.duration / 2
+        speed, acceleration = (float(np.abs(a).max()) for a in move.motion(move.at + np.linspace(0, half, 200))[1:])
+        return self._speed_obstacle(speed) or self._force_obstacle(move, acceleration, half)
+
+    def _speed_obstacle(self, speed: float) -> str:
+        """Where no command within the limits keeps up the speed."""
+        if self._moves_steadily(speed):
+            return ""
+        low, high = 0.0, speed
+        for _ in range(MOVE_BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._moves_steadily(middle) else (low, middle)
+        most, wanted = (self._write(v, "/s") for v in (low, speed))
+        least, most_allowed, whose = self.limits
+        of = f"{whose}'s limits {least:.3g} and {most_allowed:.3g} {self.loop.command.unit}"
+        return f"it moves at {wanted}, within {of} the plant moves at {most} at most; lower its speed"
+
+    def _moves_steadily(self, speed: float) -> bool:
+        hook, axis = self.loop.plant.rest_hook, self.loop.plant.axis
+        if hook is None or axis is None:
+            return True
+        try:
+            rest = hook(self.parameters, {axis.position: self.position, axis.speed: self.side * speed})
+        except (InputError, ConvergenceError):
+            return False
+        low, high, _ = self.limits
+        return low <= rest.inputs.get(self.loop.command.name, 0.0) <= high
+
+    def _force_obstacle(self, move: Move, acceleration: float, half: float) -> str:
+        """Where full command from rest does not come so far, or not accelerate so much."""
+        way, reached = abs(move.distance) / 2, float(self.push["acceleration"].max())
+        told = f"full command ({self._full_command}) from rest"
+        if acceleration > reached:
+            wanted, most = (self._write(v, "/s^2") for v in (acceleration, ALLOWED_SHARE * reached))
+            return f"it accelerates with {wanted}, {told} with {most}; lower its acceleration"
+        ahead = np.maximum.accumulate(self.push["way"])
+        time = float(np.interp(way, ahead, self.push.t)) if ahead[-1] >= way else inf
+        if time > half:
+            best = f"takes {time:.3g} s" if time < inf else f"has not come so far in {self.push.t[-1]:.3g} s"
+            least = f", so that the move takes {2 * time:.3g} s at least" if time < inf else ""
+            return f"its first half takes {half:.3g} s, {told} {best}{least}; lower its acceleration and speed"
+        return ""
+
+    @cached_property
+    def _full_command(self) -> str:
+        return f"{self.limits[1 if self.side > 0 else 0]:.3g} {self.loop.command.unit}"
+
+    def _write(self, value: float, per: str) -> str:
+        return write_value(value, f"{self.loop.feedback.unit}{per}", 3)
+
+
+def _abilities(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> _Abilities | None:
+    """What the plant of a case can; None where the loop is not on an axis's position, or nothing limits the command."""
+    own, axis, move = case.case_parameters(parameters), loop.plant.axis, case.reference
+    limits = command_range(loop, own)
+    if axis is None or loop.feedback.name != axis.position or not np.isfinite(limits[:2]).all():
+        return None
+    assert isinstance(move, Move)
+    side = copysign(1.0, move.distance)
+    x = case.initial(loop, parameters)[: len(loop.plant.states)]
+    forwards = limits[1] if side > 0 else limits[0]
+    push = _push_half_way(loop, own, x, forwards, move)
+    if push["way"].max() <= 0:  # the actuator is turned
+        push = _push_half_way(loop, own, x, limits[0] if side > 0 else limits[1], move)
+    return _Abilities(loop, own, limits, move.initial, side, push)
+
+
+def _push_half_way(loop: ClosedLoop, own: ParameterSet, x: Array, command: float, move: Move) -> Trajectory:
+    """The plant from rest at a constant command, along the move, until it has come half way or hardly moves."""
+    duration, half = FIRST_PUSH * move.duration, abs(move.distance) / 2
+    while True:
+        run = _push(loop, own, x, command, duration)
+        side, position = copysign(1.0, move.distance), run[_axis(loop).position]
+        way, speed = side * (position - position[0]), side * run[_axis(loop).speed]
+        if way.max() >= half or duration >= LONGEST_PUSH or run.t[-1] < duration:
+            return Trajectory(run.t, {"way": way, "speed": speed, "acceleration": np.gradient(speed, run.t)})
+        duration *= PUSH_FACTOR
+
+
+def _push(loop: ClosedLoop, own: ParameterSet, x: Array, command: float, duration: float) -> Trajectory:
+    """The plant's run at a constant command; shorter where the model ends, beyond an end stop for instance."""
+    inputs = {q.name: np.full(2, command if q.name == loop.command.name else 0.0) for q in loop.plant.inputs}
+    ends, t = np.array([0.0, duration]), np.linspace(0.0, duration, PUSH_SAMPLES + 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PhysicsWarning)  # it may well meet an end stop, later than it matters
+        try:
+            return simulate(
+                loop.plant, Trajectory(ends, inputs), own, initial=x, t_out=t, rtol=PUSH_TOLERANCE, atol=PUSH_TOLERANCE
+            )
+        except ConvergenceError as error:
+            if isinstance(error.solution, Trajectory) and len(error.solution) > 2:
+                return error.solution
+            raise
+
+
+def _axis(loop: ClosedLoop) -> Axis:
+    axis = loop.plant.axis
+    assert axis is not None
+    return axis
+
+
+# Share of the stroke kept free at either end, and the least length of it [m]: less leaves a wrong guess of the gain no
+# room to overshoot, more leaves no way to become fast on.
+MARGIN_SHARE, LEAST_MARGIN = 0.1, 0.01
+# Shortest way between the margins [m]: on a shorter one the fast moves end before the following error has settled.
+LEAST_SPAN = 0.03
+# Share of the fastest move that the drive's file allows: more, and a drive half as strong as its file says cannot
+# follow; less leaves conductance and viscous friction to a part of the valve's travel.
+FAST_SHARE = 0.5
+# Least speed of the fastest moves [m/s], several Stribeck speeds of usual seals: with less, viscous friction is taken
+# for Coulomb's.
+LEAST_FAST_SPEED = 0.05
+# Speeds of the medium, calm and slow moves over that of the fast ones [1].
+MEDIUM, CALM, SLOW = 0.4, 0.15, 0.03
+# Lengths of the calm, the slow and the short moves over the span [1].
+CALM_WAY, SLOW_WAY, SHORT_WAY = 0.4, 0.08, 0.01
+# Largest sensitivity of the plain controller on the plant as guessed [1], sliding: a gain half as large again, which a
+# wrong conductance makes of it, is then still stable.
+GUESSED_SENSITIVITY = 2.0
+# Share of the command per span from which the gain is sought downwards, and the factor between two tries [1].
+FIRST_GAIN, GAIN_STEP, MOST_TRIES = 100.0, 0.85, 80
+REST_BEFORE = 0.5  # [s] before the first move: pressures at rest are read from it
+# A dwell lasts until the error of a following at the move's speed would be this share of the span [1], and so long at
+# least [s]: after shorter ones the axis still moves, longer ones show nothing more.
+SETTLED_SHARE, LEAST_DWELL = 0.005, 0.3
+LONGEST_STEP = 2e-5  # [s] of the simulation as guessed: longer ones are unstable where friction turns over .1 mm/s
+# Part of the way from the run's ends to the stops that the simulated overshoot may take: more leaves none to a drive
+# that is not as guessed.
+MOST_OVERSHOOT = 0.5
+PLACE_DIGITS, DWELL_DIGITS = 5, 2  # of places [m] and dwells [s] after the point: so a file shows them whole
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationRun:
+    """A run that excites what an identification needs.
+
+    Attributes
+    ----------
+    loop : ClosedLoop
+        The plant under the proportional position controller for which the run is made.
+    parameters : ParameterSet
+        Of the plant as guessed, and the controller's.
+    moves : MoveSequence
+    between : tuple of (float, float)
+        Positions that the reference stays between [m].
+    response : Trajectory
+        The run simulated on the plant as guessed: "position", "control" and so on.
+    centre : float
+        What is on the wire to the valve while the loop's command is zero [the command's unit].
+    """
+
+    loop: ClosedLoop
+    parameters: ParameterSet
+    moves: MoveSequence
+    between: tuple[float, float]
+    response: Trajectory
+    centre: float = 0.0
+
+    @property
+    def duration(self) -> float:
+        """Of the run [s]."""
+        return self.moves.horizon
+
+    @property
+    def fastest(self) -> float:
+        """Largest speed of the reference [m/s]."""
+        return max(move.speed for move in self.moves.moves)
+
+    @property
+    def following_error(self) -> float:
+        """Largest distance of the simulated position from the reference [m]."""
+        position = self.response[self.loop.feedback.name]
+        return float(np.abs(self.moves.values(self.response.t) - position).max())
+
+
+def excitation_run(
+    plant: System,
+    parameters: ParameterSet,
+    *,
+    sample_time: float = 1e-3,
+    between: tuple[float, float] | None = None,
+    speed: float = inf,
+) -> ExcitationRun:
+    """Plan a run of moves from which friction, valve and mass of an axis are identified.
+
+    Parameters
+    ----------
+    plant : System
+        A drive whose valve moves an axis between two end stops.
+    parameters : ParameterSet
+        As guessed; the run leaves the drive half of its speed for a guess that is wrong.
+    sample_time : float
+        Of the controller [s].
+    between : (float, float), optional
+        Positions that the reference stays between [m]; by default the stroke less a tenth at either end.
+    speed : float
+        Limit of the moves' speed [m/s]; by default half of what the drive can.
+
+    Returns
+    -------
+    ExcitationRun
+
+    Raises
+    ------
+    ModelError
+        If the plant is no such drive.
+    InputError
+        If there is no room, the limit is too slow, or the controller cannot move the drive so; with what can be.
+    """
+    loop, known = _position_loop(plant, sample_time), plant.parameters | parameters
+    plant.check(known)
+    ends = _room(plant, known, between)
+    told = f"a run with a speed of {write_value(speed, 'm/s', 3)} at most does not tell viscous friction from Coulomb's"
+    least = write_value(LEAST_FAST_SPEED, "m/s")
+    require(speed >= LEAST_FAST_SPEED, f"{told}; allow {least} or more")
+    low, high, _ = command_range(loop, loop.complete(known))
+    p = loop.complete(known).with_values({"pid.lower": low, "pid.upper": high})
+    fast = _fast_move(loop, p, ends, speed)
+    p = p.with_values({"pid.Kp": _plain_gain(loop, p, ends, fast.speed)})
+    moves = _sequence(ends, fast, _speed_gain(loop, p, fast.speed))
+    for move in {(abs(m.distance), m.speed): m for m in moves.chain}.values():
+        check_move(loop, replace(move, at=0.0), p)
+    run = ExcitationRun(loop, p, moves, ends, _simulate(loop, p, moves, sample_time), command_centre(plant, known))
+    _check_response(run)
+    return run
+
+
+def _position_loop(plant: System, sample_time: float) -> ClosedLoop:
+    axis, stops = plant.axis, [g for g in plant.validity_limits if g.state == "position"]
+    told = 'an excitation run needs a drive whose valve moves an axis between two end stops, kind = "pneumatic"'
+    fits = axis is not None and axis.final_element is not None and len(stops) == 2 and plant.rest_hook is not None
+    require(fits, f"{told}; for another drive plan one with pneuopt next-experiment", ModelError)
+    return ClosedLoop(plant, PID(sample_time), measured=_excited_axis(plant).position)
+
+
+def _excited_axis(plant: System) -> Axis:
+    return plant.axis or Axis()
+
+
+def _room(plant: System, p: ParameterSet, between: tuple[float, float] | None) -> tuple[float, float]:
+    """The positions that the reference stays between."""
+    rear, front = _end_stops(plant, p)
+    margin = max(MARGIN_SHARE * (front - rear), LEAST_MARGIN)
+    low, high = (rear + margin, front - margin) if between is None else between
+    low, high = (round(x, PLACE_DIGITS) for x in (low, high))
+    shown = [write_value(x, "m", 3) for x in (low, high, rear, front)]
+    inside = rear < low and high < front
+    told = f"the run would go from {shown[0]} to {shown[1]}, and the end stops are at {shown[2]} and {shown[3]}"
+    require(inside, f"{told}; keep the run between them")
+    way = f"{write_value(max(high - low, 0.0), 'm', 3)} from {shown[0]} to {shown[1]}"
+    room = f"an excitation run needs a way of {write_value(LEAST_SPAN, 'm')}, there are {way}"
+    require(high - low >= LEAST_SPAN, f"{room}; correct [cylinder] stroke, or say between which positions it may move")
+    return low, high
+
+
+def _fast_move(loop: ClosedLoop, p: ParameterSet, ends: tuple[float, float], speed: float) -> Move:
+    """The fastest move of the run: a share of what the drive can both ways, within the limit of speed."""
+    low, high = ends
+    shape = Move(high - low, speed=1.0, acceleration=10.0 / (high - low), initial=low)
+    both = (shape, replace(shape, distance=low - high, initial=high))
+    fastest = [shortest_move(loop, move, p) for move in both]
+    own = FAST_SHARE * min(move.speed for move in fastest)
+    least, most = (write_value(v / FAST_SHARE, "m/s", 3) for v in (LEAST_FAST_SPEED, own))
+    told = f"the drive moves at {most} at most, by its file, and an excitation run needs {least}"
+    require(own >= LEAST_FAST_SPEED, f"{told}; correct valve, supply and load in the drive's file")
+    acceleration = FAST_SHARE**2 * min(move.acceleration for move in fastest)
+    return replace(shape, speed=_round(min(own, speed)), acceleration=_round(acceleration))
+
+
+def _plain_gain(loop: ClosedLoop, p: ParameterSet, ends: tuple[float, float], speed: float) -> float:
+    """The largest proportional gain that keeps the sensitivity at both ends and in the middle, sliding both ways."""
+    places = [(x, side * v) for x in (*ends, sum(ends) / 2) for side in (1, -1) for v in (speed, MEDIUM * speed)]
+    points = [_sliding(loop, p, x, v) for x, v in places]
+    gain = FIRST_GAIN * p.value("pid.upper") / (ends[1] - ends[0])
+    for _ in range(MOST_TRIES):
+        tried = p.with_values({"pid.Kp": gain})
+        found = (margins(open_loop(loop, tried, x, u)) for x, u in points)
+        if all(m.stable and m.max_sensitivity <= GUESSED_SENSITIVITY for m in found):
+            return _round(gain)
+        gain *= GAIN_STEP
+    message = "no proportional gain moves this drive with a sensitivity of"
+    raise InputError(f"{message} {GUESSED_SENSITIVITY:g}; correct mass, friction and valve in the drive's file")
+
+
+def _sliding(loop: ClosedLoop, p: ParameterSet, position: float, speed: float) -> tuple[Array, dict[str, float]]:
+    """The plant's state and inputs in steady motion."""
+    hook, axis = loop.plant.rest_hook, _excited_axis(loop.plant)
+    assert hook is not None
+    rest = hook(p, {axis.position: position, axis.speed: speed})
+    return np.array([rest.states[n] for n in names(loop.plant.states)]), dict(rest.inputs)
+
+
+def _speed_gain(loop: ClosedLoop, p: ParameterSet, speed: float) -> float:
+    """Speed of the axis over its following error in steady motion [1/s]."""
+    middle = sum(_end_stops(loop.plant, p)) / 2
+    return p.value("pid.Kp") * speed / abs(_sliding(loop, p, middle, speed)[1][loop.command.name])
+
+
+def _sequence(ends: tuple[float, float], fast: Move, gain: float) -> MoveSequence:
+    """The moves, which begin and end in the middle, under a loop with a gain of speed over error [1/s]."""
+    (low, high), v = ends, fast.speed
+    span, middle = high - low, round((low + high) / 2, PLACE_DIGITS)
+    calm, slow, short = CALM_WAY * span, SLOW_WAY * span, SHORT_WAY * span
+    stops = [
+        *((high, v), (low, v), (middle, MEDIUM * v), (high, MEDIUM * v), (low, MEDIUM * v)),
+        *((low + calm, CALM * v), (low, CALM * v), (low + slow, SLOW * v), (low, SLOW * v), (middle, v)),
+        *((middle + short, CALM * v), (middle, CALM * v), (middle - short, CALM * v), (middle, CALM * v)),
+        *((high, v), (high - slow, SLOW * v), (high, SLOW * v), (middle, MEDIUM * v)),
+    ]
+    at, moves = middle, []
+    for place, speed in stops:
+        dwell = max(LEAST_DWELL, log(speed / (gain * SETTLED_SHARE * span)) / gain)
+        stop = round(place, PLACE_DIGITS)
+        way, pause = round(stop - at, PLACE_DIGITS), round(dwell, DWELL_DIGITS)
+        moves.append(Move(way, speed=_round(speed), acceleration=fast.acceleration, dwell=pause))
+        at = stop
+    return MoveSequence([replace(moves[0], at=REST_BEFORE, initial=middle), *moves[1:]])
+
+
+def _simulate(loop: ClosedLoop, p: ParameterSet, moves: MoveSequence, sample_time: float) -> Trajectory:
+    """The loop along the moves in fixed steps: what is read from it has three digits."""
+    given = moves.trajectory(sample_time)
+    x0, u = loop.initial(p, reference=moves.origin)[None], given["reference"][None, :, None]
+    h, discrete = np.full((1, len(given)), sample_time), loop.discrete()
+    substeps = ceil(sample_time / LONGEST_STEP)
+    run = Rollout(discrete.pieces).run(x0, u, loop.parameter_vector(p), given.t[None], h, substeps=substeps)
+    sound = bool(np.isfinite(run.y).all())
+    require(sound, "the run cannot be simulated: the drive in the file meets its end stops or cannot be controlled so")
+    return Trajectory(given.t, dict(zip(names(discrete.outputs), run.y[0].T, strict=True)))
+
+
+def _check_response(run: ExcitationRun) -> None:
+    """Refuse a run that leads the axis out of its stroke on the plant as guessed."""
+    position, (low, high) = run.response[run.loop.feedback.name], run.between
+    rear, front = _end_stops(run.loop.plant, run.parameters)
+    beyond = max(low - float(position.min()), float(position.max()) - high)
+    told = f"the plain controller overshoots the run by {write_value(beyond, 'm', 3)}"
+    spare = MOST_OVERSHOOT * min(low - rear, front - high)
+    require(beyond < spare, f"{told}; allow a lower speed, or correct mass and valve in the drive's file")
+
+
+def _end_stops(plant: System, p: ParameterSet) -> tuple[float, float]:
+    rear, front = sorted(float(g.limit(p)) for g in plant.validity_limits if g.state == "position")
+    return rear, front
+
+
+def _round(value: float, digits: int = 3) -> float:
+    """To digits that count, as the run's file shows them."""
+    return float(f"{value:.{digits}g}")

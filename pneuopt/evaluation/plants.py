@@ -1,0 +1,332 @@
+"""`monte_carlo`: plants within what a fit leaves open and what is stated of the other parameters, in one draw.
+
+`expected_plants`: the plants that a model may stand for, within what a fit leaves open and what hardware varies by.
+
+A parameter that a fit has estimated is drawn from the fit's covariance, by Student's t where few degrees of freedom
+tell it; one that the fit gave a range in place of an interval is drawn from anywhere in that range. Of the others,
+those named in `TOLERANCES` vary by the usual tolerance of such hardware, and each tuned gain by `GAIN_TOLERANCE`.
+"""
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pneuopt.evaluation.scenarios import (
+    NO_SCENARIOS,
+    AxisNames,
+    Factor,
+    SampleSpreads,
+    Sampling,
+    Scenarios,
+    ScenarioValues,
+    Seed,
+    draws,
+    further,
+    generator,
+    samples,
+    tolerances,
+)
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.results import Shown
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def monte_carlo(
+    parameters: ParameterSet,
+    count: int,
+    *,
+    covariance: "pd.DataFrame | None" = None,
+    estimates: "pd.DataFrame | None" = None,
+    spreads: SampleSpreads = MappingProxyType({}),
+    seed: Seed = 0,
+    sampling: Sampling = Sampling.RANDOM,
+) -> ScenarioValues:
+    """Draw plants: what a fit has estimated from its covariance, other parameters from stated distributions.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        The nominal values, and the bounds within which every draw lies.
+    count : int
+    covariance, estimates : DataFrame, optional
+        `IdentificationResult.covariance`, and `.estimates`: with these the draws are as wide as the confidence
+        intervals (Student's t), and a parameter that has a range in place of an interval is drawn from anywhere in it.
+    spreads : mapping, optional
+        As for `samples`; a parameter in it is drawn by it, whatever the fit says.
+    seed : int or tuple
+        Plants of `samples` or `draws` are independent of these for the same seed, too.
+    sampling : Sampling
+        How the draws of `spreads` fill their box; those of the fit are independent.
+
+    Returns
+    -------
+    dict of str to dict of str to float
+        "sample 1" and so on.
+
+    Raises
+    ------
+    InputError
+        As from `samples` and `draws`, or if nothing varies.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from pneuopt.quantities.parameters import Parameter
+    >>> rig = ParameterSet({"friction.coulomb": Parameter(40.0, "N", 0.0), "load.mass": Parameter(5.0, "kg")})
+    >>> variance = pd.DataFrame([[4.0]], ["friction.coulomb"], ["friction.coulomb"])
+    >>> plants = monte_carlo(rig, 500, covariance=variance, spreads={"load.mass": 0.1})
+    >>> len(plants), sorted(plants["sample 1"])
+    (500, ['friction.coulomb', 'load.mass'])
+    """
+    require(count >= 1, f"count must be at least 1, got {count}")
+    own_seed = further(seed, "monte_carlo")
+    stated = samples(parameters, spreads, count, seed=own_seed, sampling=sampling) if spreads else {}
+    own = {n for values in stated.values() for n in values}
+    estimated, ranges = select_estimates(parameters, covariance, own), select_ranges(parameters, estimates, own)
+    nothing = "nothing varies: state how a parameter spreads, or give a fit that has estimated one of this loop"
+    require(bool(own or ranges) or estimated is not None, nothing)
+    dof = degrees_of_freedom(estimates)
+    fitted = {} if estimated is None else draws(parameters, estimated, count, seed=own_seed, dof=dof)
+    wide = draw_in_ranges(parameters, ranges, count, own_seed)
+    parts = zip(*(list(part.values()) or [{}] * count for part in (fitted, stated)), wide, strict=True)
+    return {f"sample {k}": {**a, **b, **c} for k, (a, b, c) in enumerate(parts, 1)}
+
+
+def select_estimates(
+    parameters: ParameterSet, covariance: "pd.DataFrame | None", others: Collection[str]
+) -> "pd.DataFrame | None":
+    """The part of a covariance that the plants are drawn from: what is identified, without the others."""
+    if covariance is None:
+        return None
+    spread = dict(zip(map(str, covariance.index), np.diag(covariance.to_numpy(dtype=float)).tolist(), strict=True))
+    names = [n for n, v in spread.items() if n in parameters and n not in others and v > 0]
+    return covariance.loc[names, names] if names else None
+
+
+def degrees_of_freedom(estimates: "pd.DataFrame | None") -> dict[str, float]:
+    """The degrees of freedom of each estimate's variance, where a fit tells them."""
+    if estimates is None or "dof" not in estimates:
+        return {}
+    return {str(n): float(v) for n, v in estimates["dof"].items() if math.isfinite(v) and v > 0}
+
+
+def select_ranges(
+    parameters: ParameterSet, estimates: "pd.DataFrame | None", others: Collection[str]
+) -> dict[str, tuple[float, float]]:
+    """The ranges within the bounds of what a fit has given one in place of an interval, without the others."""
+    if estimates is None or "range_low" not in estimates:
+        return {}
+    rows = estimates[estimates["stderr"].isna() & estimates["range_low"].notna() & estimates["range_high"].notna()]
+    ends = {str(n): (float(row["range_low"]), float(row["range_high"])) for n, row in rows.iterrows()}
+    return {
+        n: (max(low, parameters[n].lower), min(high, parameters[n].upper))
+        for n, (low, high) in ends.items()
+        if n in parameters and n not in others and low < high
+    }
+
+
+def draw_in_ranges(
+    parameters: ParameterSet, ranges: Mapping[str, tuple[float, float]], count: int, seed: Seed
+) -> list[dict[str, float]]:
+    """Values anywhere in each range, by their logarithm where the parameter is searched by it."""
+
+    def draw(name: str, low: float, high: float) -> list[float]:
+        share = generator(seed, "ranges", name).random(count)
+        drawn = low * (high / low) ** share if parameters[name].log else low + share * (high - low)
+        return [float(v) for v in drawn]
+
+    columns = {n: draw(n, *ends) for n, ends in ranges.items()}
+    return [{n: values[k] for n, values in columns.items()} for k in range(count)]
+
+
+# Plants on which a design is tried. If it holds on all of 100, at least 97 % of such plants hold with 95 % confidence
+# (0.05^(1/100)); fewer say less, more cost time in proportion.
+PLANT_COUNT = 100
+# By what share of its value a parameter differs from plant to plant where no fit has estimated it. Parameters on one
+# line vary together. Larger shares find fault with every design, smaller ones with none.
+TOLERANCES: Mapping[tuple[str, ...], float] = {
+    ("load.mass",): 0.05,  # a moving mass from drawings, without hoses, cables and what is clamped on
+    ("load.inertia",): 0.05,  # likewise
+    ("supply.pressure",): 0.05,  # droop and hysteresis of a regulator: 0.3 bar at 6 bar(g)
+    # Friction of one seal from run to run (problems/identify/seal_friction.py), and as it warms up.
+    ("friction.coulomb", "friction.static"): 0.1,
+    ("friction.viscous",): 0.1,
+    ("plant.gain",): 0.05,  # of a transfer function: as for mass and supply, on which it depends
+    ("plant.time_constant",): 0.05,
+    ("plant.natural_frequency",): 0.05,
+    ("plant.damping",): 0.1,  # friction's share in it
+    ("plant.dead_time",): 0.05,
+}
+# Share by which a controller's gain differs from the printed one: rounding to three digits, integer scaling in a PLC.
+GAIN_TOLERANCE = 0.01
+GAIN_PREFIXES = ("pid.", "feedforward.")
+FIT_SHARE = 0.95  # of the plants [1] that lie between the low and the high end of a fit's estimate
+
+
+@dataclass(frozen=True, eq=False)
+class PlantAxis:
+    """Parameters that vary together from plant to plant, on their own.
+
+    Attributes
+    ----------
+    names : tuple of str
+    share : float
+        By which fraction of the value they vary, either way.
+    low, high : mapping of str to float or Factor
+        The scenario in which they are at their low, and at their high end, and nothing else differs.
+    is_gain : bool
+        Whether it is the controller's.
+    """
+
+    names: tuple[str, ...]
+    share: float
+    low: Mapping[str, float | Factor]
+    high: Mapping[str, float | Factor]
+    is_gain: bool = False
+
+    @property
+    def label(self) -> str:
+        """Names and tolerance, "load.mass +-5 %"."""
+        return f"{' and '.join(self.names)} +-{100 * self.share:.2g} %"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ExpectedPlants(Shown):
+    """Plants that a model may stand for, and what they differ by.
+
+    Attributes
+    ----------
+    scenarios : mapping of str to mapping
+        "plant 1" and so on.
+    axes : tuple of PlantAxis
+        What varies, without the parameters of the scenarios that a tuning knows already.
+    from_fit : tuple of str
+        Parameters that are drawn from a fit's covariance, or from its ranges.
+    known : tuple of str
+        Parameters that vary as the tuning's own scenarios have them.
+    """
+
+    scenarios: Scenarios
+    axes: tuple[PlantAxis, ...]
+    from_fit: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What varies and by how much, a sentence a source."""
+        stated = [a for a in self.axes if not a.is_gain and not set(a.names) & set(self.from_fit)]
+        gains = [a for a in self.axes if a.is_gain]
+        fitted = [a.label for a in self.axes if set(a.names) & set(self.from_fit)]
+        parts = (
+            ("as the fit leaves them", fitted),
+            ("assumed tolerances", [a.label for a in stated]),
+            ("of the controller", [f"each gain +-{100 * a.share:.2g} %" for a in gains[:1]]),
+            ("as the scenarios have them", list(self.known)),
+        )
+        return tuple(f"{lead}: {', '.join(labels)}" for lead, labels in parts if labels)
+
+    def summary(self) -> Report:
+        """How many plants, and what they differ by."""
+        count = len(self.scenarios)
+        lead = Line(f"{count} plant{'s' if count != 1 else ''} that the model may stand for", Tone.HEADING)
+        return Report((lead, *(Line(sentence, indent=2) for sentence in self.sentences)))
+
+
+def expected_plants(
+    parameters: ParameterSet,
+    covariance: "pd.DataFrame | None" = None,
+    *,
+    estimates: "pd.DataFrame | None" = None,
+    scenarios: Scenarios = NO_SCENARIOS,
+    count: int = PLANT_COUNT,
+    seed: Seed = 0,
+) -> ExpectedPlants:
+    """Draw the plants that a model may stand for.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        Of plant and controller, as for `tune`: what is free counts as tuned.
+    covariance : DataFrame, optional
+        `IdentificationResult.covariance`, which also says which parameters the logs have identified.
+    estimates : DataFrame, optional
+        `IdentificationResult.estimates`: with its degrees of freedom the draws are as wide as the confidence intervals,
+        and a parameter that has a range in place of an interval is drawn from anywhere in it.
+    scenarios : mapping of str to mapping, optional
+        Plants that the design is meant for, the search's own or others from the same boxes: plant k differs from the
+        model as the k-th of them does, over and above what else varies; after the last one comes the first.
+    count : int
+    seed : int or tuple
+        No search has seen these plants, whatever seed its own were drawn with.
+
+    Returns
+    -------
+    ExpectedPlants
+
+    Examples
+    --------
+    >>> from pneuopt.quantities.parameters import Parameter
+    >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "pid.Kp": Parameter(2.0, "V*s/m", 0.1, 9.0, free=True)})
+    >>> plants = expected_plants(rig, count=20)
+    >>> len(plants.scenarios), plants.sentences
+    (20, ('assumed tolerances: load.mass +-5 %', 'of the controller: each gain +-1 %'))
+    """
+    require(count >= 1, f"count must be at least 1, got {count}")
+    known = {n for values in scenarios.values() for n in values}
+    others = {*known, *parameters.free_names}
+    estimated, dof = select_estimates(parameters, covariance, others), degrees_of_freedom(estimates)
+    ranges = select_ranges(parameters, estimates, others)
+    from_fit = (*(map(str, estimated.index) if estimated is not None else ()), *ranges)
+    shares = _usual_tolerances(parameters, {*known, *from_fit})
+    seed = further(seed, "expected_plants")
+    varied = tolerances(parameters, shares, count, seed=seed) if shares else {}
+    drawn = {} if estimated is None else draws(parameters, estimated, count, seed=seed, dof=dof)
+    own = list(scenarios.values()) or [{}]
+    parts = zip(*((list(part.values()) or [{}] * count) for part in (varied, drawn)), strict=True)
+    wide = draw_in_ranges(parameters, ranges, count, seed)
+    plants = {f"plant {k + 1}": {**a, **b, **wide[k], **own[k % len(own)]} for k, (a, b) in enumerate(parts)}
+    axes = [_tolerance_axis(names, share) for names, share in shares.items()]
+    if estimated is not None:
+        deviations = dict(zip(map(str, estimated.index), np.sqrt(np.diag(estimated)).tolist(), strict=True))
+        axes += [_estimate_axis(parameters, n, s, dof.get(n, math.inf)) for n, s in deviations.items()]
+    axes += [_range_axis(parameters, n, *ends) for n, ends in ranges.items()]
+    return ExpectedPlants(plants if axes or known else {}, tuple(axes), from_fit, tuple(sorted(known)))
+
+
+def _usual_tolerances(parameters: ParameterSet, others: Collection[str]) -> dict[AxisNames, float]:
+    """By which share the parameters vary that neither a fit nor a scenario speaks of; a value of 0 has no share."""
+    gains = [n for n in parameters.free_names if n.startswith(GAIN_PREFIXES)]
+    rows = [*TOLERANCES.items(), *(((n,), GAIN_TOLERANCE) for n in gains)]
+    found: dict[AxisNames, float] = {}
+    for names, share in rows:
+        own = tuple(n for n in names if n in parameters and n not in others and parameters.value(n) != 0)
+        found |= {own: share} if own else {}
+    return found
+
+
+def _tolerance_axis(names: AxisNames, share: float) -> PlantAxis:
+    low, high = ({n: Factor(1 + side * share) for n in names} for side in (-1, 1))
+    return PlantAxis(tuple(names), share, low, high, names[0].startswith(GAIN_PREFIXES))
+
+
+def _range_axis(parameters: ParameterSet, name: str, low: float, high: float) -> PlantAxis:
+    value = abs(parameters.value(name))
+    return PlantAxis((name,), (high - low) / 2 / value if value else 0.0, {name: low}, {name: high})
+
+
+def _estimate_axis(parameters: ParameterSet, name: str, deviation: float, dof: float) -> PlantAxis:
+    """An estimate with the interval that its standard deviation leaves, within its bounds."""
+    from scipy.stats import t
+
+    p, width = parameters[name], float(t.ppf((1 + FIT_SHARE) / 2, dof)) * deviation
+    ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
+    low, high = (float(min(max(end, p.lower), p.upper)) for end in ends)
+    return PlantAxis((name,), width / abs(p.value) if p.value else 0.0, {name: low}, {name: high})

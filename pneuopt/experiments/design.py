@@ -1,0 +1,486 @@
+"""`ExperimentDesign`: a planned experiment: what to play, what its log will tell, and what its log has told.
+
+`DOptimal`, `AOptimal`, `Precision`, `WantedPrecision`: what judges a planned experiment, by one number.
+
+A newcomer adds a class like these: the parameters that it is about, and its figure of their covariance. Source:
+Atkinson, Donev, Tobias, Optimum Experimental Designs, with SAS, 2007, chapter 10.
+
+`linked_information`: what a log that is cut into linked segments tells about parameters, once it is identified.
+
+`identify` weighs the gaps between segments as if the states jumped there a little, and its covariance is the sandwich
+B^-1 M B^-1 (`Equations.covariance`): B is the Gram matrix of data and gaps with the nodes eliminated, M that of the
+data alone with the nodes where B puts them, since true gaps carry no noise. Its inverse B M^-1 B is the information
+here: with B itself, a planned run of an EMPS axis promised intervals three times as wide as its fit had, and the search
+took other runs for the best (problems/identify/next_experiment.py). The sum over logs is that of a joint fit where the
+weights of the gaps lose little.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from pneuopt.identification.identifiability import UNIDENTIFIABLE_DEVIATION
+from pneuopt.identification.result import IdentificationResult, join_names
+from pneuopt.identification.statistics import confidence_interval
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import check_names, require
+from pneuopt.quantities.output import write_text
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, format_number, number_columns, text_columns
+from pneuopt.quantities.results import Result
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+REACHED_ROOM = (
+    0.02  # share of a limit's width [1] within which it counts as active: less misses what a sample just missed
+)
+SHOWN_BLOCKS = 8  # of a run [1], in its summary: more fill a screen, and a controller plays the file
+USEFUL_RATIO = 1.5  # times that a target's interval shrinks [1], below which the run is hardly worth its time
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ExperimentDesign(Result):
+    """A planned experiment.
+
+    Attributes
+    ----------
+    channel : str
+        What is excited: the loop's reference ("position_reference"), or the plant's command.
+    runs : tuple of Trajectory
+        Each run as the estimates predict it: excitation, command, outputs and states.
+    blocks : tuple of tuple of str
+        The blocks of each run in words; they are equally long.
+    table : DataFrame
+        A row a free parameter: value, unit, target; stderr_before, that of the logs in hand (NaN: they tell nothing);
+        stderr_after, with the planned runs; stderr_alone, by these runs alone; the ends of the 95 % interval before and
+        after; narrower, their ratio; identifiable, after the runs.
+    limits : mapping of str to (float, float)
+        What the runs keep.
+    room : mapping of str to float
+        By limit, how far the runs stay within, as a share of its width, negative; 0: they touch it.
+    criterion : str
+    stats : mapping of str to float
+        The criterion "before" and "after", as a relative standard deviation; the runs "tried"; "origin", the excitation
+        at the start; "plants", for which the runs were chosen.
+    units : mapping of str to str
+        Of the channels.
+    """
+
+    channel: str
+    runs: tuple[Trajectory, ...]
+    blocks: tuple[tuple[str, ...], ...]
+    table: "pd.DataFrame"
+    limits: Mapping[str, tuple[float, float]]
+    room: Mapping[str, float]
+    criterion: str
+    stats: Mapping[str, float]
+    units: Mapping[str, str]
+
+    @property
+    def excitation(self) -> Trajectory:
+        """What to play; of several runs take ``runs``."""
+        require(len(self.runs) == 1, f"{len(self.runs)} runs are planned: take design.runs[0], [1], ...")
+        return self.runs[0].select([self.channel])
+
+    @property
+    def active_limits(self) -> tuple[str, ...]:
+        """The limits that the runs touch."""
+        return tuple(n for n, room in self.room.items() if room > -REACHED_ROOM)
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Free parameters that stay unidentifiable, with the logs in hand and the planned runs."""
+        return tuple(str(n) for n, good in self.table["identifiable"].items() if not good)
+
+    def write_csv(self, path: str | Path, *, units: bool = True) -> tuple[Path, ...]:
+        """Write what a controller plays: time and excitation; several runs into files "name_1.csv", "name_2.csv", ...
+
+        Parameters
+        ----------
+        path : str or Path
+        units : bool
+            Whether the header holds the units, as `read_log` reads them.
+
+        Returns
+        -------
+        tuple of Path
+            The files.
+
+        Raises
+        ------
+        InputError
+            If a file cannot be written.
+        """
+        place, unit = Path(path), self.units[self.channel]
+        several = len(self.runs) > 1
+        files = tuple(place.with_stem(f"{place.stem}_{k}") if several else place for k in range(1, len(self.runs) + 1))
+        head = f"time [s],{self.channel} [{unit}]" if units else f"time,{self.channel}"
+        for file, run in zip(files, self.runs, strict=True):
+            rows = (f"{t:.9g},{v:.9g}" for t, v in zip(run.t.tolist(), run[self.channel].tolist(), strict=True))
+            write_text(file, "\n".join([head, *rows]) + "\n")
+        return files
+
+    def compare(self, fit: IdentificationResult, *, alone: bool = False) -> "pd.DataFrame":
+        """Predicted against achieved, once the run is logged and identified.
+
+        Parameters
+        ----------
+        fit : IdentificationResult
+            Of the logs in hand and the new ones together.
+        alone : bool
+            Whether it is of the new logs alone.
+
+        Returns
+        -------
+        DataFrame
+            A row a parameter: planned_value and value; stderr_before, stderr_predicted and stderr_achieved; ratio, the
+            achieved over the predicted one; shift, the change of the value in predicted standard deviations.
+        """
+        from pneuopt.quantities.frames import WideFrame
+
+        found = fit.estimates
+        check_names("parameter", self.table.index, [str(n) for n in found.index], "the fit's free parameters")
+        rows = {}
+        for name, row in self.table.iterrows():
+            predicted, achieved = row["stderr_alone" if alone else "stderr_after"], float(found["stderr"][str(name)])
+            value = float(found["value"][str(name)])
+            rows[str(name)] = {
+                "planned_value": row["value"],
+                "value": value,
+                "unit": row["unit"],
+                "stderr_before": row["stderr_before"],
+                "stderr_predicted": predicted,
+                "stderr_achieved": achieved,
+                "ratio": achieved / predicted,
+                "shift": (value - row["value"]) / predicted,
+            }
+        return WideFrame.from_dict(rows, orient="index")
+
+    def summary(self) -> Report:
+        """What the runs gain, the intervals before and after, the limits that they touch, and what to play."""
+        return Report((self._verdict(), *self._remarks(), self._intervals(), *self._steps()))
+
+    def _verdict(self) -> Line:
+        wanted = self.table[self.table["target"]]
+        lost = [str(n) for n in wanted.index if n in self.unidentifiable]
+        length = write_value(float(self.runs[0].t[-1] + self.runs[0].t[1]), "s", 3)
+        lead = f"{len(self.runs)} runs of {length}" if len(self.runs) > 1 else f"a run of {length}"
+        if lost:
+            return Line(
+                f"{lead} does not identify {join_names(lost)}, whatever is played within these limits", Tone.BAD
+            )
+        ratios = wanted["narrower"].dropna()
+        if not len(ratios):
+            worst = 100 * float((wanted["stderr_after"] / wanted["value"].abs()).max())
+            return Line(
+                f"{lead} gives {join_names(list(map(str, wanted.index)))} to {worst:.2g} % or better", Tone.GOOD
+            )
+        least, most = float(ratios.min()), float(ratios.max())
+        many = f"{least:.1f} to {most:.1f} times" if most > 1.05 * least else f"{least:.1f} times"
+        tone = Tone.GOOD if least >= USEFUL_RATIO else Tone.DOUBTFUL
+        return Line(f"{lead} makes the asked intervals {many} narrower", tone)
+
+    def _remarks(self) -> list[Line]:
+        """The criterion, what stays unidentifiable, and the active limits."""
+        figures = f"{self.stats['before']:.2g} to {self.stats['after']:.2g}"
+        tried = f"{self.stats['tried']:.0f} excitations of {self.stats['plants']:.0f} plants"
+        out = [Line(f"{self.criterion}: relative standard deviation from {figures}; {tried} were tried", indent=2)]
+        others = [n for n in self.unidentifiable if not self.table["target"][n]]
+        if others:
+            out.append(Line(f"still unidentifiable: {join_names(others)}, which nobody has asked for", indent=2))
+        if self.active_limits:
+            what = join_names(list(self.active_limits))
+            out.append(Line(f"limits that are reached: {what}; wider ones would allow more", indent=2))
+        return out
+
+    def _intervals(self) -> Table:
+        rows = []
+        for name, row in self.table.iterrows():
+            ends = [_join(row["before_low"], row["before_high"]), _join(row["after_low"], row["after_high"])]
+            mark = "asked" if row["target"] else "" if row["identifiable"] else "unidentifiable"
+            shrunk = format_number(row["narrower"], 3)
+            rows.append((str(name), format_number(row["value"], 4), *ends, shrunk, str(row["unit"]), mark))
+        heads = number_columns("value", "95 % now", "95 % after", "narrower")
+        return Table((*text_columns("parameter"), *heads, *text_columns("unit", "")), tuple(rows))
+
+    def _steps(self) -> list[Line]:
+        start = write_value(self.stats["origin"], self.units[self.channel], 4)
+        out = [Line(f"{self.channel} begins at {start}; about that, each block as long as the others:")]
+        for k, blocks in enumerate(self.blocks, 1):
+            lead = f"run {k}: " if len(self.blocks) > 1 else ""
+            more = f"; and {len(blocks) - SHOWN_BLOCKS} more" if len(blocks) > SHOWN_BLOCKS else ""
+            out.append(Line(lead + "; ".join(blocks[:SHOWN_BLOCKS]) + more, indent=2))
+        return out
+
+
+def tabulate_design(
+    parameters: ParameterSet, free: Sequence[str], targets: Sequence[str], known: Array, gained: Array
+) -> "pd.DataFrame":
+    """The table of an `ExperimentDesign` from the information of the logs in hand and of the planned runs."""
+    from pneuopt.quantities.frames import WideFrame
+
+    sizes = np.array([abs(parameters.value(n)) or 1.0 for n in free])
+    spreads = [_deviations(f, sizes) for f in (known, known + gained, gained)]
+    rows = {}
+    for i, name in enumerate(free):
+        p = parameters[name]
+        before, after, alone = (float(s[i]) for s in spreads)
+        ends = [confidence_interval(p.value, s, log=p.log) for s in (before, after)]
+        rows[name] = {
+            "value": p.value,
+            "unit": p.unit,
+            "target": name in targets,
+            "stderr_before": before,
+            "stderr_after": after,
+            "stderr_alone": alone,
+            **dict(zip(("before_low", "before_high", "after_low", "after_high"), (*ends[0], *ends[1]), strict=True)),
+            "narrower": before / after,
+            "identifiable": after <= UNIDENTIFIABLE_DEVIATION * sizes[i],
+        }
+    return WideFrame.from_dict(rows, orient="index")
+
+
+def _deviations(information: Array, sizes: Array) -> Array:
+    """Standard deviations by an information matrix, in the parameters' units; NaN where it tells nothing."""
+    scaled = information * np.outer(sizes, sizes)
+    values, vectors = np.linalg.eigh(scaled)
+    informed = values > 1e-12 * max(float(values[-1]), 1e-300)
+    if not informed.any():
+        return np.full(len(sizes), np.nan)
+    variance = (vectors[:, informed] ** 2 / values[informed]).sum(axis=1)
+    lost = (vectors[:, ~informed] ** 2).sum(axis=1) > 1e-6
+    return np.asarray(np.where(lost, np.nan, np.sqrt(variance)) * sizes)
+
+
+def _join(low: float, high: float) -> str:
+    """An interval with the digits that show a fiftieth of it."""
+    if not math.isfinite(low):
+        return "-"
+    share = (high - low) / max(abs(low), abs(high))
+    digits = min(12, max(3, 2 - math.floor(math.log10(share)))) if share > 0 else 5
+    return f"{low:.{digits}g}{TIED}to {high:.{digits}g}"
+
+
+_LARGEST = 6
+"""Power of the sum that stands for the largest [1]: with a higher one a search sees the worst alone, and is slow."""
+
+
+class Criterion(Protocol):
+    """What a planned experiment is to make small."""
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names or shell patterns of the parameters; empty: all free ones."""
+        ...
+
+    def deviation(self, covariance: Array) -> Array:
+        """The figure of covariances of the targets, each in units of its value; shape (..., k, k) -> (...)."""
+        ...
+
+
+class DOptimal:
+    """The volume of the targets' joint confidence region: the geometric mean of its half axes.
+
+    Parameters
+    ----------
+    *targets : str
+        Names or shell patterns, "friction.*"; none: every free parameter.
+
+    Examples
+    --------
+    >>> round(float(DOptimal().deviation(np.diag([0.01, 0.04]) ** 2)), 4)
+    0.02
+    """
+
+    def __init__(self, *targets: str) -> None:
+        self.targets = targets
+
+    def __repr__(self) -> str:
+        return f"DOptimal({', '.join(map(repr, self.targets))})"
+
+    def deviation(self, covariance: Array) -> Array:
+        """See `Criterion`."""
+        sign, log = np.linalg.slogdet(covariance)
+        return np.asarray(np.where(sign > 0, np.exp(log / (2 * covariance.shape[-1])), np.inf))
+
+
+class AOptimal:
+    """The root mean square of the targets' relative standard deviations: the worst-known ones count most.
+
+    Parameters
+    ----------
+    *targets : str
+        As for `DOptimal`.
+
+    Examples
+    --------
+    >>> round(float(AOptimal().deviation(np.diag([0.01, 0.07]) ** 2)), 4)
+    0.05
+    """
+
+    def __init__(self, *targets: str) -> None:
+        self.targets = targets
+
+    def __repr__(self) -> str:
+        return f"AOptimal({', '.join(map(repr, self.targets))})"
+
+    def deviation(self, covariance: Array) -> Array:
+        """See `Criterion`."""
+        variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.sqrt(np.mean(variances, axis=-1)))
+
+
+@dataclass(frozen=True)
+class Precision:
+    """The relative standard deviation of one parameter, whatever becomes of the others.
+
+    Parameters
+    ----------
+    parameter : str
+    """
+
+    parameter: str
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The parameter."""
+        return (self.parameter,)
+
+    def deviation(self, covariance: Array) -> Array:
+        """See `Criterion`."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.sqrt(covariance[..., 0, 0]))
+
+
+class WantedPrecision:
+    """Each target's relative standard deviation over the one that is wanted: nearly the largest of these ratios.
+
+    At 1 or below, each parameter is known as well as is wanted; above, the one counts that is farthest from it.
+
+    Parameters
+    ----------
+    wanted : mapping of str to float
+        By the parameter's name its relative standard deviation [1].
+
+    Raises
+    ------
+    InputError
+        If one is not positive.
+
+    Examples
+    --------
+    >>> wanted = WantedPrecision({"friction.coulomb": 0.01, "friction.viscous": 0.1})
+    >>> round(float(wanted.deviation(np.diag([0.02, 0.02]) ** 2)), 2)
+    2.0
+    """
+
+    def __init__(self, wanted: Mapping[str, float]) -> None:
+        wrong = [n for n, size in wanted.items() if not 0 < size < math.inf]
+        require(bool(wanted), "WantedPrecision: name a parameter and its relative standard deviation")
+        require(not wrong, f"WantedPrecision: the standard deviation of {', '.join(wrong)} must be positive")
+        self.wanted = dict(wanted)
+
+    def __repr__(self) -> str:
+        return f"WantedPrecision({self.wanted})"
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The parameters."""
+        return tuple(self.wanted)
+
+    def deviation(self, covariance: Array) -> Array:
+        """See `Criterion`."""
+        with np.errstate(invalid="ignore"):
+            ratios = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)) / np.array(list(self.wanted.values()))
+            return np.asarray(np.sum(ratios**_LARGEST, axis=-1) ** (1 / _LARGEST))
+
+
+STATE_RIDGE = 1e-6  # information about a node's state that is always there, in nominal sizes: only keeps it invertible
+SINGULAR = 1e-13
+"""Share of the largest information about a start state [1] below which it is rounding: more keeps what is none."""
+UNINFORMED = 1e-12  # the same of the parameters [1]: less takes rounding for knowledge
+
+
+def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int = 0) -> Array:
+    """The information of linked segments about parameters, as the estimates of `identify` have it; shape (m, k, k).
+
+    Parameters
+    ----------
+    grams : ndarray, shape (m, count, n + w, n + w)
+        Of m logs and their segments: the data's Gram matrices about start state and parameters, in unit noise.
+    ends : ndarray, shape (m, count, n, n + w)
+        Derivatives of each segment's end state by the same.
+    jumps : ndarray, shape (n,)
+        Standard deviations that the gaps are weighed with. States and jumps are in nominal sizes.
+    eliminated : int
+        So many parameters, the first ones, are each log's own; k are the others.
+    """
+    m, count, n, width = ends.shape
+    gaps, follows = _gap_information(ends[:, :-1], 1 / jumps**2), list[Array]()
+    found = grams[:, 0]
+    for j in range(count - 1):
+        ahead, response = _advance(found, gaps[:, j], n)
+        follows.append(response)
+        found = ahead + grams[:, j + 1]
+    last = n + eliminated
+    response = _respond(found, last)
+    bread = found[:, last:, last:] + np.swapaxes(found[:, :last, last:], 1, 2) @ response
+    k = width - last
+    parameters = np.concatenate([response[:, n:], np.broadcast_to(np.eye(k), (m, k, k))], axis=1)
+    node, meat = response[:, :n], np.zeros((m, k, k))
+    for j in reversed(range(count)):
+        if j < count - 1:
+            node = follows[j][:, :, :n] @ node + follows[j][:, :, n:] @ parameters
+        moves = np.concatenate([node, parameters], axis=1)
+        meat += np.swapaxes(moves, 1, 2) @ grams[:, j] @ moves
+    return _symmetric(bread @ _scaled_inverse(meat, UNINFORMED) @ bread)
+
+
+def _gap_information(ends: Array, weight: Array) -> Array:
+    """What each gap tells about its two nodes' states and the parameters, shape (..., 2 n + w, 2 n + w).
+
+    In nominal sizes: x_next = ends (x, p) + w, with w of variances 1 / `weight`, shape (n,).
+    """
+    n = len(weight)
+    slopes = np.concatenate([ends[..., :n], np.broadcast_to(-np.eye(n), (*ends.shape[:-1], n)), ends[..., n:]], axis=-1)
+    out = (np.swapaxes(slopes, -1, -2) * weight) @ slopes
+    place = np.arange(n)
+    out[..., place, place] += STATE_RIDGE
+    return np.asarray(out)
+
+
+def _advance(information: Array, gap: Array, n: int) -> tuple[Array, Array]:
+    """The information about the next node's state and the parameters from that about this node's, shape (m, k, k).
+
+    And how this node's state follows those, shape (m, n, k); `gap` is of `_gap_information`.
+    """
+    out, mixed = gap[:, n:, n:].copy(), gap[:, :n, n:].copy()
+    out[:, n:, n:] += information[:, n:, n:]
+    mixed[:, :, n:] += information[:, :n, n:]
+    response = np.asarray(-np.linalg.solve(gap[:, :n, :n] + information[:, :n, :n], mixed), dtype=np.float64)
+    return _symmetric(out + np.swapaxes(mixed, 1, 2) @ response), response
+
+
+def _respond(information: Array, count: int) -> Array:
+    """How the first `count` unknowns follow the others, shape (m, count, k - count)."""
+    return -_scaled_inverse(information[:, :count, :count], SINGULAR) @ information[:, :count, count:]
+
+
+def _scaled_inverse(information: Array, smallest: float) -> Array:
+    """The pseudoinverse of symmetric matrices of mixed units, shape (m, k, k)."""
+    size = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 1e-300))
+    scale = size[:, :, None] * size[:, None, :]
+    return np.asarray(np.linalg.pinv(information / scale, rcond=smallest, hermitian=True) / scale)
+
+
+def _symmetric(values: Array) -> Array:
+    return np.asarray((values + np.swapaxes(values, 1, 2)) / 2)

@@ -1,0 +1,944 @@
+"""`fit_from_starts`: the best fit from the model's own starts, with the parameters held that the logs cannot identify.
+
+The first start is tried alone. Where it is left, the parameters to which the prediction errors of a filter lead are
+tried (`predicted_fit`). Where these fail, too, the guessed parameters of each other start (`trial_parameters`, as the
+Stribeck velocity) are held for a few iterations, until the states and the other parameters have settled to them; the
+first that explains the logs is tried at once, the others are then tried by the cost they reached.
+
+A parameter that the data do not determine is held at its given value. A weak prior (a decade about that value) would
+leave it there, too; holding it needs no weight for the prior beside that of the data, and the prior's spread is counted
+in the covariance of the others (`Fit.prior_covariance`).
+
+`rank`: which of several fits of the same logs is the best; `are_alike`: whether two have found one optimum.
+
+`fit_logs`: the best fit of an estimation problem, the short ways of long logs first.
+
+Most long logs need no more than a short search. Where gaps have to close slowly, a filter follows the parameters that
+wide gaps have found, or those of a part of each log, from node to node, and the tight gaps begin with its states.
+
+`cut_excerpts`: the same problem on the liveliest part of each long log, from whose answer the whole one begins.
+
+A search costs as much as its logs are long, and most of its iterations find the way from a rough start; a part of a
+minute's log shows that way as well (`problems/identify/random_plants.py --kind other`).
+
+`fit_from_predictions`: the fit that begins with the parameters by which a filter predicts a part of the logs best.
+
+It is for logs whose first start has failed. Each of the model's guesses is tried with several values of what another
+parameter bounds (static friction, which filtered speeds show too low); the best of them descend side by side
+(`shooting.prediction_errors`), and the search with tight gaps begins with the states that a filter finds by what they
+lead to. Six of nine logs that stick and slip, and that no other start explained in 60 CPU s, are explained so.
+
+`fit_with_closed_gaps`: the optimum of a model that misses its logs, with gaps so tight that they carry no misfit.
+
+A search ends with gaps that a right model closes. A wrong model leaves them open at its optimum, where they take a part
+of the misfit, and the estimates depend on their weight. Gaps that are weighed more, from there on, close: what is left
+is the least squares of the whole logs' simulation, of which the estimates are a property of model and logs alone.
+
+`fit_from_profiles`: the fit to which a profile has shown the way, where the search has ended beside its optimum.
+
+A profile fits all other parameters again at each value of one. Where it finds less cost than the fit, its interval lies
+elsewhere: an estimate outside of its own interval is no optimum.
+
+`hold_order`: what no plant has below another parameter, but a search has left there, is held at that one's value.
+
+`mark_order` is for logs that reject this, and put one parameter below the other beyond chance: the model then lacks
+something, as friction that builds up over a displacement.
+
+Static friction of 0 N is no friction that a drive has. It only says that the logs do not show any beyond Coulomb
+friction, so it is held at Coulomb friction, as what is not identified, and the others are fitted again.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from pneuopt.dynamics.compiled.rollout import check_during_runs
+from pneuopt.dynamics.hooks import Start
+from pneuopt.identification.identifiability import rejects_held_values, rests_on_prior, verdict_from_sensitivities
+from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
+from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem, outputs_in_log
+from pneuopt.identification.profiles import Profile
+from pneuopt.identification.result import IdentificationResult, Mark
+from pneuopt.logs.experiment import Experiment
+from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting.equations import ParameterScaling
+from pneuopt.shooting.filters import GATHERED_DEVIATION, PredictionErrors, filter_nodes
+from pneuopt.shooting.least_squares import (
+    MAX_CHI_SQUARE_RATIO,
+    MAX_GAP_SHARE,
+    BudgetSpentError,
+    Fit,
+    LeastSquares,
+    SearchEnd,
+    solve_least_squares,
+)
+from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
+
+GUESS_STAGES = 3  # stages of a search with guesses held: more force a wrong guess on the log, fewer rank starts wrongly
+# squared residuals a sample after the first stage or before the last, in noise variances, beyond which the first start
+# waits for the others: lower settles all starts of a model that misses the log a little, higher follows hopeless starts
+# to their end
+HOPELESS_MISFIT = 3.0
+# relative width of the bounds that hold a guess; equal bounds would compile other equations than those of the search
+GUESS_BOUND_WIDTH = 1e-9
+# squared residuals a sample, in noise variances, up to which no other start is tried: below 1 every start would be
+# tried, while a wrong basin of soft bristles has left 1.1
+ACCEPTED_CHI_SQUARE_RATIO = 1.05
+# cost of a settled start over that of the first one after as many stages [1] up to which the guess is not what is
+# wrong: lower settles all starts of a wrong model, higher takes another basin for the same
+SAME_MISFIT_RATIO = 1.02
+
+MIN_DOUBTED = 2  # fits after which the problem is doubted: fewer doubt it for one bad start, more take time
+
+Candidate = tuple[EstimationProblem, Fit, str]
+
+
+def fit_from_starts(
+    problem: EstimationProblem,
+    loss: Loss | None = None,
+    *,
+    estimate_noise: bool = False,
+    gives_up: Callable[[EstimationProblem, Fit], bool] = lambda *_: False,
+) -> Candidate:
+    """Fit from the first start that converges at the noise's level; else take the best of all that were tried.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    loss : Loss, optional
+    estimate_noise : bool
+    gives_up : callable
+        Called with the best fit so far, where it is an optimum or the second one: whether another start cannot help.
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With the values held, the weights and the noise levels that the fit ended with.
+    fit : Fit
+        A wrong basin can converge, too, but leaves residuals above the noise; so more starts are tried until two of
+        them agree on the least cost; so is one more where a parameter is not clearly above another that bounds
+        it. Where a search explains the logs but for a parameter that does not settle, that one is held and one more
+        start is tried.
+    label : str
+        The label of its start.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If it comes before the first fit; after that the best fit so far is returned, marked.
+    """
+    fits: list[Candidate] = []
+    interrupted, tightest = False, problem.method.stages[-1].gap
+    is_plain = loss is None and not estimate_noise
+    try:
+        confirms, left_after = lambda: _only_needs_confirmation(fits), lambda: _stages_before_left(problem, fits[0][1])
+        for start in starts_by_cost(problem, confirms, left_after, lambda: _cost_after_guesses(problem, fits)):
+            may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
+            limit = HOPELESS_MISFIT if may_wait else math.inf
+            known = _joinable_costs(fits) if is_plain else ()
+            tried = replace(problem, method=_method_after(problem, fits)) if known else problem
+            held, fit = fit_holding_unidentifiable(tried, start, limit, known)
+            held = replace(held, method=problem.method)
+            if fit.end is SearchEnd.DUPLICATE:
+                break
+            held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
+            if explains_to_noise(held, fit) and not held.held and is_in_order(held, fit):
+                return held, fit, start.label
+            if fit.status.code is not Code.INTERRUPTED and is_at_noise(held, fit):
+                held, fit = fit_a_part(held, fit, start.label)
+            interrupted = fit.status.code is Code.INTERRUPTED
+            fits.append((held, fit, start.label))
+            fits.sort(key=lambda each: rank(each[1], tightest))
+            is_end = interrupted or _are_enough(fits)
+            if is_end or ((is_optimum(fits[0][1]) or len(fits) == MIN_DOUBTED) and gives_up(*fits[0][:2])):
+                break
+            if len(fits) == 1 and is_plain and (predicted := _fit_predicted(problem, fit)):
+                return problem, predicted, f"{start.label}, by prediction errors"
+    except KeyboardInterrupt:
+        if not fits:
+            raise
+        interrupted = True
+    held, fit, label = fits[0]
+    if not interrupted:
+        held, fit = fit_a_part(held, fit, label)
+        interrupted = fit.status.code is Code.INTERRUPTED
+    return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
+
+
+def _fit_predicted(problem: EstimationProblem, first: Fit) -> Fit | None:
+    """The fit by prediction errors where the first start was left; None where that does not explain the logs.
+
+    Raises `KeyboardInterrupt` if it was interrupted.
+    """
+    found = fit_from_predictions(problem, HOPELESS_MISFIT) if first.end is SearchEnd.ABANDONED else None
+    if found is not None and found.status.code is Code.INTERRUPTED:
+        raise KeyboardInterrupt
+    if found is None or not explains_to_noise(problem, found) or not is_in_order(problem, found):
+        return None
+    return found.with_effort_of(first)
+
+
+def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: bool) -> Status:
+    """The status of the best fit of several starts."""
+    status = fit.status
+    if interrupted and (starts > 1 or status.code is not Code.INTERRUPTED):
+        status = Status(Code.INTERRUPTED, (f"the best of {starts} starts so far", "run again for an answer"))
+    elif not status.converged and starts > 1:
+        in_the_best = (f"in the best, {status.verdict}", *status.sentences[1:])
+        status = Status(status.code, (f"none of {starts} starts converged", *in_the_best))
+    if len(problem.experiments) > 1:
+        status = status.with_remedies("compare_logs shows whether the logs are of one drive")
+    return status
+
+
+def starts_by_cost(
+    problem: EstimationProblem,
+    confirms: Callable[[], bool] = lambda: False,
+    left_after: Callable[[], int] = lambda: 0,
+    left_cost: Callable[[], float] = lambda: math.nan,
+) -> Iterator[Start]:
+    """The model's first start; if more are asked for, the others: settled to what each holds, the least cost first.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    confirms : callable
+        Called before each further start: whether the first led to an optimum that only needs confirmation. The next
+        start is then taken as it is, for settling all would cost more; the others are settled where it is not called
+        enough.
+    left_after : callable
+        Called before the others settle: the stages after which the first start was left, 0 if it was not. The others
+        then get no more than those, either.
+    left_cost : callable
+        Called then, too: the cost of the first start after as many stages as the others get, NaN if it got fewer. Where
+        a start costs the same with another guess held, the guess is not what is wrong, and no more of them settle.
+
+    Yields
+    ------
+    Start
+        One that explains the logs to their noise with its guesses held comes as soon as it has settled.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If a start was interrupted while it settled.
+    """
+    candidates = problem.candidates()
+    yield candidates[0]
+    while len(candidates) > 1 and confirms():
+        candidates = candidates[1:]
+        yield candidates[0]
+    guessed = [c for c in candidates if c.trial_parameters]
+    # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
+    left = left_after()
+    stages = min(GUESS_STAGES, left or GUESS_STAGES) if problem.has_gaps else 1
+    settled, known = list[tuple[tuple[float, float], Start]](), left_cost() if left else math.nan
+    others = list(guessed) if len(guessed) > 1 else []
+    while others:
+        cost, start, explains = _settle_start(problem, others.pop(0), stages)
+        if explains:
+            yield start
+            continue
+        settled.append((cost, start))
+        if cost[1] <= SAME_MISFIT_RATIO * known and cost[0] == problem.method.stages[GUESS_STAGES - 1].gap:
+            break
+    yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
+    yield from others
+    yield from [c for c in candidates[1:] if len(guessed) < 2 or not c.trial_parameters]
+    yield from candidates[:1] if left and len(guessed) < 2 else []
+
+
+def _stages_before_left(problem: EstimationProblem, fit: Fit) -> int:
+    """The stages after which a search was left for other starts; 0 if it was not."""
+    gaps = [stage.gap for stage in problem.method.stages]
+    return 1 + gaps.index(fit.stats["gap_deviation"]) if fit.end is SearchEnd.ABANDONED else 0
+
+
+def _cost_after_guesses(problem: EstimationProblem, fits: Sequence[Candidate]) -> float:
+    """The cost of the first start after the stages in which the others settle; NaN where it was left before."""
+    gap = problem.method.stages[min(GUESS_STAGES, len(problem.method.stages)) - 1].gap
+    return next((cost for stage, cost in fits[0][1].stage_costs if stage == gap), math.nan)
+
+
+def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
+    """What a start reaches in some stages with its guesses held, the start from there, and whether that is the noise.
+
+    A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones. With
+    noise of the states a wrong guess explains any log.
+    """
+    transcription = problem.transcription(candidate)
+    guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
+    bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
+    held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
+    method = replace(problem.method, stages=problem.method.stages[:stages], allows_state_noise=False)
+    fit = solve_least_squares(held, method)
+    if fit.status.code is Code.INTERRUPTED:
+        raise KeyboardInterrupt
+    start = problem.start_from(fit, f"{candidate.label}, settled")
+    gap, cost = fit.stats["gap_deviation"], fit.stats["cost"]
+    explains = stages == GUESS_STAGES and 2 * cost <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
+    return (gap, cost), replace(start, parameters={**start.parameters, **guesses}), explains
+
+
+def fit_holding_unidentifiable(
+    problem: EstimationProblem,
+    start: Start,
+    max_misfit: float = math.inf,
+    known_costs: tuple[tuple[float, float], ...] = (),
+) -> tuple[EstimationProblem, Fit]:
+    """Fit from one start; while the data do not determine a parameter, hold that one and fit again.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    start : Start
+    max_misfit, known_costs
+        As of `LeastSquares`, for the first fit.
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With what is held: at the given values, or, if the logs reject those, where the search had left them.
+    fit : Fit
+        The first one, where holding does not converge, or would leave no parameter to estimate.
+    """
+    method = replace(problem.method, max_misfit=max_misfit, known_costs=known_costs)
+    first = solve_least_squares(problem.transcription(start), method)
+    if not first.unidentifiable or first.status.code is Code.INTERRUPTED:
+        return problem, first
+    for is_given in (True, False) if not first.status.converged else (True,):
+        held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
+        is_settled = fit.status.converged and not fit.unidentifiable
+        if fit.status.code is Code.INTERRUPTED or (is_settled and not rejects_held_values(fit, first, len(held.held))):
+            return held, fit
+    return problem, first
+
+
+def _hold_unidentifiable(
+    problem: EstimationProblem, label: str, first: Fit, *, is_given: bool
+) -> tuple[EstimationProblem, Fit]:
+    """Hold one undetermined parameter after the other, at its given value or where the first fit has left it."""
+    held, fit, given = problem, first, problem.unknowns()
+    warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
+    source = given if is_given else first.parameters
+    while fit.unidentifiable and len(held.held) + len(fit.unidentifiable) < len(given.free_names):
+        held = replace(held, held={**held.held, **{n: source.value(n) for n in fit.unidentifiable}})
+        before, fit = fit, solve_least_squares(held.transcription(held.start_from(fit, label)), warm)
+        fit = fit.with_effort_of(before)
+        if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):
+            break
+    return held, fit
+
+
+def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
+    """Where a search did not settle in a parameter, the fit of the others with that one held where it had come to.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    fit : Fit
+        The best of all starts.
+    label : str
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With what is held.
+    fit : Fit
+        The given one, where nothing was unsettled, the rest does not converge either, or only the prior of what is held
+        tells of it; marked, if that was interrupted.
+    """
+    held, part = problem, fit
+    last = problem.method.stages[-REFIT_STAGES:]
+    warm = replace(
+        problem.method, stages=last, allows_state_noise=problem.method.allows_state_noise and fit.jumps is not None
+    )
+    while not part.status.converged:
+        names = part.unidentifiable or part.unsettled
+        if not names or len(held.held) + len(names) >= len(part.parameters.free_names):
+            return problem, fit
+        held = replace(held, held={**held.held, **{n: part.parameters.value(n) for n in names}})
+        before, part = part, solve_least_squares(held.transcription(held.start_from(part, label)), warm)
+        part = part.with_effort_of(before)
+        if part.status.code is Code.INTERRUPTED:
+            return problem, replace(fit, status=part.status)
+        if part.status.code is Code.DIVERGED:
+            return problem, fit
+    return (problem, fit) if _rests_on_held(held, part) else (held, part)
+
+
+def _rests_on_held(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether the logs tell nothing of any other parameter where those held may be ten times as large."""
+    if fit.covariance is None or fit.prior_covariance is None:
+        return False
+    names = fit.parameters.free_names
+    values, free = np.array([fit.parameters.value(n) for n in names]), [n not in problem.held for n in names]
+    covariance = fit.covariance + fit.prior_covariance
+    return bool(rests_on_prior(covariance, fit.prior_covariance, values, problem.held.values())[free].all())
+
+
+def explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether a fit explains the logs to their noise, so that no other start can do better.
+
+    Where a log declares too little noise, the white part of the residuals counts in its place.
+    """
+    return fit.status.converged and is_at_noise(problem, fit)
+
+
+def is_at_noise(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether the residuals of a fit, converged or not, are those of the noise."""
+    return fit.jumps is None and (
+        fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
+        or fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * white_chi_square(problem, fit)
+    )
+
+
+def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
+    """Whether the next start is tried as it is, after fits of which the first is the best.
+
+    So is one start where the best fit ended at an optimum; and each where its gaps stand for noise of the states, for
+    settling with wide gaps says little there.
+    """
+    best = fits[0][1]
+    return is_optimum(best) and (len(fits) == 1 or best.jumps is not None)
+
+
+def _joinable_costs(fits: Sequence[Candidate]) -> tuple[tuple[float, float], ...]:
+    """The costs at the end of the best search's stages, at which another one that joins it only confirms it."""
+    return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].held else ()
+
+
+def _method_after(problem: EstimationProblem, fits: Sequence[Candidate]) -> LeastSquares:
+    """The method of a start that is to confirm the best one: without noise of the states where that did not settle."""
+    settles = problem.method.allows_state_noise and fits[0][1].status.converged
+    return replace(problem.method, allows_state_noise=settles)
+
+
+def _are_enough(fits: Sequence[Candidate]) -> bool:
+    """Whether two starts agree, or the better of them explains the logs to their noise with what it holds."""
+    if len(fits) < 2:
+        return False
+    (held, best, _), (_, second, _) = fits[:2]
+    # with noise of the states every estimate may be biased, and another optimum of it would not change that
+    is_wrong = best.jumps is not None and best.status.converged and is_optimum(second)
+    return is_wrong or are_alike(best, second) or explains_to_noise(held, best)
+
+
+# excess of a parameter over another one that bounds it [1] below which another start is tried: lower takes a basin that
+# has lost it for the answer, higher searches drives twice that have as good as none
+MIN_EXCESS = 0.03
+SAME_COST_RATIO = 1.001  # costs of two fits up to which both are one optimum; lower, and rounding makes two of it
+
+
+def is_optimum(fit: Fit) -> bool:
+    """Whether a search ended at an optimum, be it of a model so wrong that the gaps absorb its misfit."""
+    is_settled = not (fit.unsettled or fit.unidentifiable)
+    is_missed = fit.status.code is Code.NOT_CONVERGED and is_settled and fit.stats["gap_share"] > MAX_GAP_SHARE
+    is_missed &= fit.end is not SearchEnd.ABANDONED
+    return fit.status.converged or is_missed
+
+
+def is_in_order(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether each free parameter that another one bounds is clearly above it, as static friction above Coulomb's.
+
+    Where it is not, a search may have lost it: it has ended so at the noise, with a Stribeck velocity 13 times too
+    high, while the logs showed static friction of nearly twice Coulomb's.
+    """
+    order, found = problem.system.plant.excitation.at_least, fit.parameters
+    bounded = [n for n in found.free_names if n not in problem.held and order.get(n) in found]
+    return all(found.value(n) >= (1 + MIN_EXCESS) * found.value(order[n]) for n in bounded)
+
+
+def rank(fit: Fit, tightest: float) -> tuple[int, float]:
+    """The order of fits: by cost among fits of one kind.
+
+    Noise of the states, or the wide gaps in which an interruption leaves a search, lower the cost of any model; such
+    fits come after those that explain the log without.
+    """
+    cost = fit.stats["cost"]
+    is_cut = fit.end is SearchEnd.ABANDONED or fit.status.code is Code.INTERRUPTED
+    if is_cut and fit.stats["gap_deviation"] > tightest:
+        return 3, cost
+    if fit.jumps is not None:
+        return 1, cost
+    return 0 if 2 * cost <= MAX_CHI_SQUARE_RATIO * fit.count else 2, cost
+
+
+def are_alike(best: Fit, second: Fit) -> bool:
+    """Whether both ended at an optimum, at the same cost."""
+    same = (best.jumps is None) == (second.jumps is None)
+    return (
+        is_optimum(best)
+        and is_optimum(second)
+        and same
+        and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
+    )
+
+
+# iterations with tight gaps that long logs get before a part of them is tried: more cost time, fewer leave easy logs
+SHORT_ITERATIONS = 10
+
+
+def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], Candidate]) -> Candidate:
+    """Fit long logs by the short ways where these lead to the noise, and else by a search from all starts.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    search : callable
+        `fit_from_starts`, which states what is returned.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If it comes before the first fit; after that the best fit so far is returned, marked.
+    """
+    tried = list[Candidate]()
+    try:
+        found = _fit_long_logs(problem, tried) or search(problem)
+    except KeyboardInterrupt:
+        if not tried:
+            raise
+        held, fit, label = tried[0]
+        found = held, replace(fit, status=SearchEnd.INTERRUPTED.status), label
+    if found[1].status.code is not Code.INTERRUPTED:
+        return found
+    held, fit, label = min([found, *tried], key=lambda each: rank(each[1], problem.method.stages[-1].gap))
+    return held, replace(fit, status=found[1].status), label
+
+
+def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candidate | None:
+    """A fit that explains long logs to their noise, or was interrupted; None if they need a longer search.
+
+    What was tried is appended to `tried`. With a parameter held, or one that does not settle, one more start has been
+    tried before; with one that is not clearly above another that bounds it, one that has led to the same.
+    """
+    for found in _tries_of_long_logs(problem):
+        held, fit, label = _settle(*found) if tried else found
+        is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.held or bool(tried))
+        is_sure = is_in_order(held, fit) or any(_is_confirmed(fit, other) for _, other, _ in tried)
+        tried.append((held, fit, label))
+        if (is_answer and is_sure) or fit.status.code is Code.INTERRUPTED:
+            return held, fit, label
+    return None
+
+
+def _is_confirmed(fit: Fit, other: Fit) -> bool:
+    """Whether both ended at one optimum, whichever of them is the better."""
+    return are_alike(*sorted((fit, other), key=lambda each: each.stats["cost"]))
+
+
+def _settle(problem: EstimationProblem, fit: Fit, label: str) -> Candidate:
+    """The fit; where it is at the noise but for a parameter that did not settle, that of the others."""
+    is_unsettled = fit.status.code is Code.NOT_CONVERGED and is_at_noise(problem, fit)
+    return (*(fit_a_part(problem, fit, label) if is_unsettled else (problem, fit)), label)
+
+
+def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
+    """What is tried before a long search of long logs; nothing where they are short.
+
+    First a short search: most logs need no more, and one that is cut near the noise goes on. Then the fit from states
+    that are filtered, and that from the parameters of a part of each log. The states of the whole logs are filtered by
+    these parameters, too: rough states would spoil what the parts have found.
+    """
+    parts = cut_excerpts(problem)
+    if parts is None:
+        return
+    rough, stages = problem.candidates()[0], problem.method.stages
+    few = stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)
+    method = replace(problem.method, stages=few, max_misfit=HOPELESS_MISFIT, allows_state_noise=False)
+    short = solve_least_squares(problem.transcription(rough), method)
+    yield problem, short, rough.label
+    is_near = short.jumps is None and 2 * short.stats["cost"] <= MAX_CHI_SQUARE_RATIO * short.count
+    if is_near and not short.status.converged:
+        last = replace(problem.method, stages=stages[-1:])
+        longer = solve_least_squares(problem.transcription(problem.start_from(short)), last)
+        yield problem, longer.with_effort_of(short), rough.label
+    elif not is_near and (found := _fit_filtered(problem, rough, is_far=short.end is SearchEnd.ABANDONED)):
+        yield found
+    held, fit, label = fit_from_starts(parts)
+    if fit.status.code is Code.INTERRUPTED:
+        yield problem, replace(short, status=fit.status), rough.label
+    if not explains_to_noise(held, fit):
+        return
+    warm = replace(problem, method=replace(problem.method, stages=stages[-1:]))
+    start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters), stages[-1].gap)
+    whole, fit = fit_holding_unidentifiable(warm, start, HOPELESS_MISFIT)
+    yield replace(whole, method=problem.method), fit, f"{label}, of a part"
+
+
+def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> Candidate | None:
+    """The fit with tight gaps from states that are filtered by the parameters of one with wide gaps.
+
+    Nodes that wide gaps have let go apart close slowly; a filter follows the same parameters from node to node. Where
+    the rough states are far off, wide gaps begin with filtered ones, too. None where they leave more than the noise.
+    """
+    stages = problem.method.stages
+    first_and_third = stages[:GUESS_STAGES:2]
+    wide = replace(problem.method, stages=first_and_third, allows_state_noise=False)
+    begin = filter_states(problem, rough) if is_far else rough
+    settled = solve_least_squares(problem.transcription(begin), wide)
+    if settled.status.code is Code.INTERRUPTED:
+        return problem, settled, rough.label
+    if not 2 * settled.stats["cost"] <= MAX_CHI_SQUARE_RATIO * settled.count:
+        return None
+    tight = replace(problem, method=replace(problem.method, stages=stages[-1:], allows_state_noise=False))
+    start = filter_states(tight, replace(rough, parameters=problem.start_from(settled).parameters))
+    held, fit = fit_holding_unidentifiable(tight, start, HOPELESS_MISFIT)
+    return replace(held, method=problem.method), fit.with_effort_of(settled), rough.label
+
+
+# segments of an excerpt: fewer may lack motion that a parameter needs, more cost time
+EXCERPT_SEGMENTS = 1000
+# length of a log, over that of an excerpt, from which on it has one: lower spends more on excerpts than they save,
+# higher searches long logs from a rough start
+MIN_LENGTH_RATIO = 2.5
+MAX_SEGMENTS = 20_000  # of logs whose states are filtered one node after the other: more take longer than they save
+
+
+def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
+    """The problem with an excerpt in place of each long log.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+
+    Returns
+    -------
+    EstimationProblem or None
+        None where there is nothing to gain: no long log, one with holes, windows, or a model without guesses to try.
+    """
+    if math.isfinite(problem.window) or not problem.has_gaps or len(problem.candidates()) < 2:
+        return None
+    if not problem.system.states or any(e.holes for e in problem.experiments) or problem.weights:
+        return None
+    parts = tuple(_cut(problem, e) for e in problem.experiments)
+    whole, kept = (sum(len(e.trajectory) for e in each) for each in (problem.experiments, parts))
+    is_huge = sum(e.trajectory.duration for e in problem.experiments) > MAX_SEGMENTS * problem.method.segment_time
+    return replace(problem, experiments=parts) if whole >= MIN_LENGTH_RATIO * kept and not is_huge else None
+
+
+def filter_states(problem: EstimationProblem, start: Start, gathered: float = GATHERED_DEVIATION) -> Start:
+    """The start with states along the logs that fit its parameters (`shooting.state_filter`).
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    start : Start
+    gathered : float
+        As of `filter_nodes`; the better the parameters are known, the less.
+
+    Returns
+    -------
+    Start
+        As it was, where the CPU budget ends before.
+    """
+    segments = segment(problem.transcription(start))
+    q = np.array([p.value for p in segments.transcription.parameters.values()])
+    try:
+        with check_during_runs(problem.method.budget.check):
+            nodes = filter_nodes(segments, start_nodes(segments), q, gathered)
+            segments, substeps = choose_integration(segments, nodes, q)
+            run = segments.run(nodes, q, substeps, states=True)
+    except BudgetSpentError:
+        return start
+    names = (e.name for e in problem.experiments)
+    return replace(start, states=dict(zip(names, segments.trajectories(run), strict=True)))
+
+
+def liveliest_part(columns: Array, count: int) -> int:
+    """The first row of the part of so many rows with the largest product of the columns' variances.
+
+    A product, for a part in which one output hardly moves shows no friction, however much the others do.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (m, ..., k)
+        NaN where nothing was measured.
+    count : int
+
+    Returns
+    -------
+    int
+    """
+    flat = columns.reshape(len(columns), -1, columns.shape[-1])
+    known = np.isfinite(flat)
+    # about the mean of all rows and over their spread, sums of squares lose no digits that count
+    middle = np.where(known, flat, 0.0).sum(axis=(0, 1)) / np.maximum(known.sum(axis=(0, 1)), 1)
+    centred = np.where(known, flat - middle, 0.0)
+    scaled = centred / np.maximum(np.abs(centred).max(axis=(0, 1)), np.finfo(float).tiny)
+    first = np.arange(0, max(1, len(columns) - count + 1), max(1, count // 10))
+    last = np.minimum(first + count, len(columns))
+    sums = [np.cumsum(np.insert(part.sum(axis=1), 0, 0.0, axis=0), axis=0) for part in (known, scaled, scaled**2)]
+    counts, totals, squares = (each[last] - each[first] for each in sums)
+    counts = np.maximum(counts, 1)
+    variances = np.maximum(squares / counts - (totals / counts) ** 2, np.finfo(float).eps)
+    return int(first[np.argmax(np.log(variances).sum(axis=1))])
+
+
+def _cut(problem: EstimationProblem, experiment: Experiment) -> Experiment:
+    """The liveliest part of a log; the log itself where it is short."""
+    run = experiment.trajectory
+    step = float(np.median(np.diff(run.t)))
+    count = math.ceil(EXCERPT_SEGMENTS * max(problem.method.segment_time, step) / step)
+    if len(run) < MIN_LENGTH_RATIO * count:
+        return experiment
+    columns = [run.fill_gaps(name) for name in outputs_in_log(problem.system, experiment)]
+    begin = liveliest_part(np.column_stack(columns), count)
+    return replace(experiment, trajectory=run.rows(begin, begin + count), source=None)
+
+
+# segments of all logs that the filter follows: fewer may lack motion that a parameter needs, more cost time
+PART_SEGMENTS = 300
+# a parameter over the one that bounds it [1]: finer and wider ones cost time, others miss the valley
+RATIOS = np.geomspace(1.1, 2.4, 8)
+BEST = 4  # sets that descend: fewer end in a side minimum, more cost time
+# deviation that the states gather along a segment, in nominal sizes, the steps at most, and the sets that go on
+LEVELS = ((1e-3, 4, 2), (3e-4, 6, 1), (1e-4, 6, 1), (3e-5, 6, 1))
+# cost a sample at which no set goes on [1]: lower gives up what would lead to the noise (.9), higher follows a wrong
+# model; and the least deviation gathered at which it counts, for with less of it a lost slip costs a right set as much
+MAX_COST, DECIDING = 1.3, 3e-4
+
+
+def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit | None:
+    """The fit with tight gaps from where the prediction errors of a filter lead.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    max_misfit : float
+        As of `LeastSquares`.
+
+    Returns
+    -------
+    Fit or None
+        Whatever its status. None of a model without guesses, where logs have holes, windows or weights, and where no
+        parameters predict the part to its noise.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If it comes, or the CPU budget ends, before the search.
+    """
+    bounded, guesses = _bounded_parameters(problem), [c for c in problem.candidates() if c.trial_parameters]
+    if not bounded or len(guesses) < 2 or not _is_plain(problem):
+        return None
+    segments = segment(problem.transcription(guesses[0]))
+    scaling = ParameterScaling(segments.transcription)
+    with check_during_runs(problem.method.budget.check):
+        errors = PredictionErrors(segments, start_nodes(segments), scaling, _liveliest(segments, problem))
+        z = _best_sets(errors, list(_hypotheses(guesses, bounded)), problem)
+        for gathered, steps, count in LEVELS:
+            if problem.method.progress is not None:
+                problem.method.progress(f"prediction errors, states may gather {gathered:g} of their nominal size")
+            z, costs = errors.descend(z, gathered, steps)
+            if gathered >= DECIDING and not costs.min() < MAX_COST * errors.count:
+                return None
+            z = z[np.argsort(costs)[:count]]
+    values = scaling.values(z[0])
+    named = dict(zip(segments.transcription.parameters, values.tolist(), strict=True))
+    found = {n: named[n] for n in segments.transcription.parameters.free_names}
+    last = problem.method.stages[-1:]
+    tight = replace(problem, method=replace(problem.method, stages=last, allows_state_noise=False))
+    start = replace(guesses[0], parameters={**guesses[0].parameters, **found})
+    start = filter_states(tight, start, last[-1].gap)
+    method = replace(tight.method, max_misfit=max_misfit)
+    return solve_least_squares(tight.transcription(start), method)
+
+
+def _is_plain(problem: EstimationProblem) -> bool:
+    """Whether a filter can follow the logs from segment to segment."""
+    is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
+    return is_whole and bool(problem.system.states) and not problem.weights
+
+
+def _bounded_parameters(problem: EstimationProblem) -> dict[str, str]:
+    """The free parameters that another one bounds, and that one."""
+    free, order = set(problem.parameters.free_names) - set(problem.held), problem.system.plant.excitation.at_least
+    return {n: m for n, m in order.items() if n in free and m in free}
+
+
+def _hypotheses(guesses: Sequence[Start], bounded: dict[str, str]) -> Iterator[tuple[tuple[int, int], Start]]:
+    """The guesses with each ratio, and the place of both."""
+    order = sorted(guesses, key=lambda c: [c.parameters[n] for n in c.trial_parameters])
+    for (i, guess), (j, ratio) in product(enumerate(order), enumerate(RATIOS.tolist())):
+        raised = {n: ratio * guess.parameters[m] for n, m in bounded.items()}
+        yield (i, j), replace(guess, parameters={**guess.parameters, **raised})
+
+
+def _best_sets(
+    errors: PredictionErrors, hypotheses: Sequence[tuple[tuple[int, int], Start]], problem: EstimationProblem
+) -> Array:
+    """The searched parameters of the best hypotheses, of which no two are neighbours. Shape (at most BEST, k)."""
+    z = np.array([ParameterScaling(problem.transcription(start)).start for _, start in hypotheses])
+    chosen = list[int]()
+    for k in np.argsort(errors.evaluate(z, LEVELS[0][0]).costs).tolist():
+        away = [np.abs(np.subtract(hypotheses[k][0], hypotheses[other][0])).max() for other in chosen]
+        if len(chosen) < BEST and min(away, default=2) > 1:
+            chosen.append(k)
+    return z[chosen]
+
+
+def _liveliest(segments: Segments, problem: EstimationProblem) -> Indices:
+    """The liveliest consecutive segments of each log."""
+    count, parts = max(1, PART_SEGMENTS // len(problem.experiments)), list[Indices]()
+    for phase in range(len(problem.experiments)):
+        own = np.flatnonzero(segments.phase == phase)
+        begin = liveliest_part(segments.measured[own], count)
+        parts.append(own[begin : begin + count])
+    return np.concatenate(parts)
+
+
+# squared residuals over the noise's [1], and the gaps' share of them [1], above which a model does not follow whole
+# logs, so that windows are tried: lower cuts logs that it follows but for a sensor's lag (60 and .17), higher iterates
+# for a plant that runs away from its log (.9)
+MAX_CLOSED_MISFIT, MAX_CLOSED_SHARE = 100.0, 0.3
+# gap of each stage over that of the one before [1]: lower leaves an optimum too far off, higher takes more stages
+GAP_FACTOR = 0.3
+MAX_STAGES = 3  # more weigh gaps until nothing else counts but rounding, fewer leave a misfit in them
+
+
+def fit_with_closed_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:
+    """The fit with tighter gaps, where a search has ended at an optimum whose gaps absorb the misfit.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    fit : Fit
+        Of whole logs.
+
+    Returns
+    -------
+    Fit or None
+        A converged one; None where the fit has not failed by its gaps alone, tighter ones lead to no optimum, or to
+        residuals so large that the model does not follow the logs.
+    """
+    is_missed = fit.status.code is Code.NOT_CONVERGED and MAX_GAP_SHARE < fit.stats["gap_share"] < MAX_CLOSED_SHARE
+    found, stage = fit, replace(problem.method.stages[-1], refine=1)  # steps are refined where it has converged
+    for _ in range(MAX_STAGES if is_missed else 0):
+        if not (is_optimum(found) and 2 * found.stats["cost"] <= MAX_CLOSED_MISFIT * found.count):
+            break
+        stage = replace(stage, gap=GAP_FACTOR * stage.gap)
+        method = replace(problem.method, stages=(stage,), allows_state_noise=False)
+        before, found = found, solve_least_squares(problem.transcription(problem.start_from(found)), method)
+        found = found.with_effort_of(before)
+        if found.status.converged:
+            return found
+    return None
+
+
+def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[Profile]) -> Fit | None:
+    """The fit that begins with the best values of the first profile whose interval does not hold the estimate.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    fit : Fit
+    profiles : iterable of Profile
+        Of that fit.
+
+    Returns
+    -------
+    Fit or None
+        None where every estimate lies in its interval. The given one, not converged, where no better one is found; of
+        an interrupted search the better of both, marked.
+    """
+    found = next((p for p in profiles if not p.low <= p.estimate <= p.high), None)
+    if found is None:
+        return None
+    start, best = problem.start_from(fit), found.curve.sort_values("deviance").iloc[0]
+    value = float(best["value"])
+    values = {n: float(best[n]) for n in start.parameters if n != found.name} | {found.name: value}
+    method = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
+    start = replace(start, parameters={**start.parameters, **values})
+    better = solve_least_squares(problem.transcription(start), method).with_effort_of(fit)
+    is_better = better.stats["cost"] < fit.stats["cost"]
+    if better.status.code is Code.INTERRUPTED:
+        return better if is_better else replace(fit, status=better.status)
+    if is_better and better.status.converged:
+        return better
+    verdict = f"{found.name} fits better at {value:.4g} {found.unit}, from where the search finds no better optimum"
+    return replace(fit, status=Status(Code.NOT_CONVERGED, (verdict, "try other start values, or fix a parameter")))
+
+
+# deviations [1] by which one estimate lies below another that bounds it, beyond which the model is wrong: lower blames
+# chance, higher passes friction that no drive has
+MAX_BELOW_DEVIATIONS = 4.0
+
+
+def hold_order(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
+    """Hold parameters that no plant has below another one at that one's value, where the logs do not show them.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    fit : Fit
+    label : str
+        Of the fit's start.
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With what is held: those that ended below the other one at a bound, or were held there, and what has no effect
+        beside them, as the Stribeck velocity between equal frictions, where the search had left it.
+    fit : Fit
+        The given one, where there are none, or where the logs reject the other one's value.
+    """
+    found, bound = fit.parameters, dict(zip(fit.parameters.free_names, fit.at_bound, strict=True))
+    order = problem.system.plant.excitation.at_least
+    below = {n: m for n, m in order.items() if bound.get(n) or n in problem.held}
+    given = problem.unknowns()
+    known = {n: m for n, m in below.items() if m in found and found.value(n) < found.value(m) <= given[n].upper}
+    values = {n: found.value(m) for n, m in known.items()}
+    if not values or not fit.status.converged:
+        return problem, fit
+    start = problem.start_from(fit, label)
+    start = replace(start, parameters={**start.parameters, **values})
+    ordered = replace(problem, held={**problem.held, **_without_effect(problem, start), **values})
+    if len(ordered.held) >= len(found.free_names):
+        return problem, fit
+    held, other = fit_holding_unidentifiable(ordered, start)
+    settled = other.status.converged and not other.unidentifiable and (other.jumps is None or fit.jumps is not None)
+    rejected = not settled or rejects_held_values(other, fit, len(held.held))
+    return (problem, fit) if rejected else (held, other.with_effort_of(fit))
+
+
+def mark_order(problem: EstimationProblem, result: IdentificationResult) -> IdentificationResult:
+    """Mark estimates that the logs put below another one beyond chance, though no plant has them there.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    result : IdentificationResult
+
+    Returns
+    -------
+    IdentificationResult
+        Both are marked "bias possible", and the status names them.
+    """
+    estimates, status = result.estimates.copy(), result.status
+    for low, high in problem.system.plant.excitation.at_least.items():
+        if low in estimates.index and _is_below(result, low, high):
+            estimates.loc[[n for n in (low, high) if n in estimates.index], "mark"] = Mark.BIAS_POSSIBLE
+            words = f"{low} is below {high}, which no drive has: model error, both may be biased"
+            status = status.with_details(words)
+    return replace(result, estimates=estimates, status=status)
+
+
+def _is_below(result: IdentificationResult, low: str, high: str) -> bool:
+    """Whether an estimate is below another parameter, free or fixed, beyond chance."""
+    names = [n for n in (low, high) if n in result.estimates.index]
+    signs = [1.0 if n == high else -1.0 for n in names]
+    values = {low: float(result.estimates["value"][low]), high: result.parameters.value(high)}
+    variance = float(signs @ result.covariance.loc[names, names].to_numpy() @ signs)
+    return variance >= 0 and values[high] - values[low] > MAX_BELOW_DEVIATIONS * math.sqrt(variance)
+
+
+def _without_effect(problem: EstimationProblem, start: Start) -> dict[str, float]:
+    """The parameters that the logs do not identify at a start, with its values."""
+    values = problem.unknowns().with_values(start.parameters)
+    return {n: values.value(n) for n in verdict_from_sensitivities(problem, start).unidentifiable}

@@ -1,0 +1,616 @@
+"""Reader of logs as text: columns apart by comma, semicolon, tab or white space, with decimal point or comma.
+
+Where a log's samples begin: the rows above them are metadata, one that names the columns, and one of their units.
+
+Cells of text as numbers: one row a line, one decimal mark, and the first cell that is no number named.
+
+Time stamps as loggers write them: ISO 8601, 12.03.2026 10:00:00,5, 3/12/2026 10:00:00.5 AM, 10:00:00.5.
+"""
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pneuopt.logs.table import EMPTY_CELL, Table, check_cells
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import LogError, require
+from pneuopt.quantities.units import is_unit
+
+NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?")
+"""A number with a decimal point, or a whole one."""
+MAX_HEAD_ROWS = 1000
+"""Rows above the samples [1]: more take seconds to look through; data loggers write up to a few hundred."""
+MIN_BLOCK_ROWS = 4
+"""Rows above the names that begin with a number [1] and count as samples: fewer refuse metadata, more lose samples."""
+TOA5 = "TOA5"
+"""The first cell of the files of Campbell Scientific's loggers: names, units and processing in rows 2, 3 and 4."""
+
+_COMMENT = re.compile(r"\s*(?:#|%|//|!)+\s*")
+_BRACKETS = re.compile(r"\[\s*(.*?)\s*\]|\(\s*(.*?)\s*\)")
+
+
+class Layout(NamedTuple):
+    """How the rows of a log are to be read.
+
+    Attributes
+    ----------
+    names : list of str
+        Of the columns.
+    units : dict of str to str
+        By name, of those columns for which a row below the names says one.
+    start : int
+        Index of the first row of samples.
+    remarks : tuple of str
+        The rows that are skipped.
+    """
+
+    names: list[str]
+    units: dict[str, str]
+    start: int
+    remarks: tuple[str, ...]
+
+
+def find_layout(rows: Sequence[Sequence[str]], where: str, first_row: int = 1) -> Layout:
+    """Find the names, the units and the first sample.
+
+    The samples begin with the first row of the usual width whose first cell is a number or a time stamp. The nearest
+    row above it without a number names the columns. Between them may stand a row of units, empty rows and comments.
+    Where another row stands there, or none begins with a number, the samples begin below the first row that may be
+    names: no row that may be a sample is skipped.
+
+    Parameters
+    ----------
+    rows : sequence of sequence of str
+        The cells of the file's rows, at least of its first ones.
+    where : str
+        The file, for messages.
+    first_row : int
+        The number that messages give to the first row.
+
+    Raises
+    ------
+    LogError
+        If no row names the columns, or there is no sample.
+    """
+    width = _usual_width(rows)
+    first = next((i for i, row in enumerate(rows) if _is_sample(row, width)), None)
+    head = _find_names(rows, len(rows) if first is None else first, width, first is None)
+    if head is None:
+        raise _missing_names(rows, first or 0, where, first_row)
+    units_row = head + 1 if head + 1 < len(rows) and is_unit_row(rows[head + 1], len(rows[head])) else None
+    below = head + 1 if units_row is None else head + 2
+    between = rows[below:first]
+    start = below if first is None or not all(_is_no_row(row) for row in between) else first
+    require(start < len(rows), f"{where}: a header, but no samples", LogError)
+    _check_blocks(rows[:head], where, first_row)
+    names = _names(rows[head])
+    units = {} if units_row is None else _units(names, rows[units_row])
+    return Layout(names, units, start, _remarks(rows, head, units_row, first_row))
+
+
+def toa5_layout(rows: Sequence[Sequence[str]]) -> Layout:
+    """The layout of a file of Campbell Scientific's loggers."""
+    names = _names(rows[1])
+    return Layout(names, _units(names, rows[2]), 4, ("rows 1, 3 and 4 are read as the head of a TOA5 file",))
+
+
+def has_table(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether there are samples, and above them names of as many columns."""
+    width = _usual_width(rows)
+    first = next((i for i, row in enumerate(rows) if _is_sample(row, width)), None)
+    head = None if first is None else _find_names(rows, first, width, False)
+    return head is not None and abs(len(rows[head]) - width) < 2
+
+
+def is_unit_row(row: Sequence[str], width: int) -> bool:
+    """Whether at least half of the cells, which are as many as the names, are units, in brackets or without.
+
+    Examples
+    --------
+    >>> is_unit_row(["(s)", "Volt", "", "-"], 4), is_unit_row(["time", "valve"], 2)
+    (True, False)
+    """
+    cells = [cell for cell in row if cell]
+    known = sum(plain_unit(cell) is not None for cell in cells)
+    return abs(len(row) - width) < 2 and known > 0 and 2 * known >= len(cells)
+
+
+def plain_unit(cell: str) -> str | None:
+    """The unit that a cell holds: "[mm]" is "mm", "Seconds" is "second"; None where it is none.
+
+    Examples
+    --------
+    >>> plain_unit("[mm]"), plain_unit("Seconds"), plain_unit("valve")
+    ('mm', 'second', None)
+    """
+    match = _BRACKETS.fullmatch(cell)
+    bare = (match[1] or match[2] or "") if match else cell
+    word = bare.casefold().rstrip("s.")
+    return next((text for text in (bare, word) if text and (text == bare or len(word) > 3) and is_unit(text)), None)
+
+
+def _usual_width(rows: Sequence[Sequence[str]]) -> int:
+    widths = Counter(len(row) for row in rows if len(row) > 1)
+    return widths.most_common(1)[0][0] if widths else 1
+
+
+def _is_sample(row: Sequence[str], width: int) -> bool:
+    first = next((cell for cell in row if cell), "")
+    return len(row) == width > 1 and _is_value(first)
+
+
+def _is_value(cell: str) -> bool:
+    return bool(NUMBER.fullmatch(cell.replace(",", "."))) or is_stamp(cell)
+
+
+def _is_blank(row: Sequence[str]) -> bool:
+    return not any(row) or bool(_COMMENT.match(row[0]))
+
+
+def _is_no_row(row: Sequence[str]) -> bool:
+    """An empty line or a comment; a row of empty cells is one of missing samples, and so are numbers after a mark."""
+    if row in ([], [""]):
+        return True
+    return bool(_COMMENT.match(row[0])) and not (_COMMENT.fullmatch(row[0]) and any(map(_is_value, row[1:])))
+
+
+def _find_names(rows: Sequence[Sequence[str]], first: int, width: int, downwards: bool) -> int | None:
+    """The row of the names: the last of the usual width above the samples, and not the one of their units."""
+    may_name = [i for i in range(first) if abs(len(rows[i]) - width) < 2 and _is_header(rows[i])]
+    if not may_name:
+        near = [i for i in range(first) if not _is_blank(rows[i])]
+        return near[-1] if near and _is_header(rows[near[-1]]) else None
+    if downwards:
+        return may_name[0]
+    last = _skip_comments(rows, may_name)
+    above = last - 1
+    named_above = above >= 0 and abs(len(rows[above]) - len(rows[last])) < 2 and not _is_value(rows[above][0])
+    return above if named_above and any(rows[above]) and is_unit_row(rows[last], len(rows[above])) else last
+
+
+def _skip_comments(rows: Sequence[Sequence[str]], may_name: Sequence[int]) -> int:
+    """The last row that may name the columns; a comment does so if it says more units than the uncommented above it."""
+    last = may_name[-1]
+    plain = [i for i in may_name if not _COMMENT.match(rows[i][0])]
+    if not plain or _count_units(rows[last]) > _count_units(rows[plain[-1]]):
+        return last
+    return plain[-1]
+
+
+def _count_units(row: Sequence[str]) -> int:
+    return sum(bool(_BRACKETS.search(cell)) for cell in row)
+
+
+def _is_header(row: Sequence[str]) -> bool:
+    return len(_names(row)) > 1 and any(row) and not any(map(_is_value, row))
+
+
+def _names(row: Sequence[str]) -> list[str]:
+    names = [_COMMENT.sub("", row[0], count=1), *row[1:]] if row else []
+    return names[:-1] if names and not names[-1] else names
+
+
+def _units(names: Sequence[str], row: Sequence[str]) -> dict[str, str]:
+    texts = [_COMMENT.sub("", row[0], count=1), *row[1:]]
+    return {name: plain_unit(text) or text for name, text in zip(names, texts, strict=False) if name and text}
+
+
+def _check_blocks(above: Sequence[Sequence[str]], where: str, first_row: int) -> None:
+    """Refuse to skip what may be another block of samples, of another width."""
+    values = [i for i, row in enumerate(above) if len(row) > 1 and _is_value(row[0])]
+    if len(values) >= MIN_BLOCK_ROWS:
+        first, last = values[0] + first_row, values[-1] + first_row
+        raise LogError(
+            f"{where}: rows {first} to {last} hold numbers, but other columns than the rows below; make two files of it"
+        )
+
+
+def _remarks(rows: Sequence[Sequence[str]], head: int, units: int | None, first_row: int) -> tuple[str, ...]:
+    remarks = []
+    above = [i for i in range(head) if any(rows[i])]
+    if above:
+        first, last = (next(cell for cell in rows[i] if cell)[:30] for i in (above[0], above[-1]))
+        shown = f"{first!r} to {last!r}" if len(above) > 1 else repr(first)
+        span = f"rows {first_row} to {head + first_row - 1} are" if head > 1 else f"row {first_row} is"
+        remarks.append(f"{span} skipped as metadata: {shown}")
+    if units is not None:
+        remarks.append(f"row {units + first_row} is read as the units of the columns")
+    return tuple(remarks)
+
+
+def _missing_names(rows: Sequence[Sequence[str]], first: int, where: str, first_row: int) -> LogError:
+    """Say which row should name the columns, and why it does not."""
+    index = next((i for i in range(first - 1, -1, -1) if not _is_blank(rows[i])), 0)
+    row = rows[index] if rows else []
+    value = next((cell for cell in row if _is_value(cell)), "")
+    place = f"{where}: row {index + first_row}"
+    if not any(row):
+        return LogError(f"{place} is empty; it has to name the columns")
+    if value:
+        return LogError(f"{place} holds the number {value[:40]!r}, not a column's name; name the columns above it")
+    return LogError(f"{where}: one column only; put ',', ';' or a tab between columns")
+
+
+MISSING = ("", "NaN", "nan", "NAN")
+"""Cells of a missing sample: empty, or as MATLAB, Python and Campbell's loggers write it."""
+_UNIT_SEPARATOR = "\x1f"  # ASCII's own
+_WORD = re.compile(r"(?:[#%!/]+\s*)?\S+(?:\s*\[[^\]]*\]|\s*\([^)]*\))?")  # a name keeps its unit in brackets
+
+
+@dataclass(frozen=True)
+class TextBlock:
+    """The samples of a log as text.
+
+    Attributes
+    ----------
+    names : sequence of str
+        Of the columns.
+    lines : sequence of str
+        A row each; " " as the delimiter stands for any white space.
+    first_row : int
+        The number of the first line.
+    stamps : frozenset of str
+        Columns of time stamps.
+    """
+
+    path: Path
+    names: Sequence[str]
+    lines: Sequence[str]
+    delimiter: str
+    first_row: int
+    stamps: frozenset[str] = frozenset()
+
+    def columns(self, names: Sequence[str]) -> dict[str, Array]:
+        """Read the named columns; time stamps as seconds from the first.
+
+        Raises
+        ------
+        LogError
+            If a row has another length than the header, or a cell is not a number.
+        """
+        check_cells(self.path, len(self.lines), len(names))
+        even = _equal_rows(self)
+        found = {name: even.stamp_column(name) for name in names if name in self.stamps}
+        used = [self.names.index(name) for name in names if name not in found]
+        numbers = _numbers(even, used) if used else {}
+        return {name: found[name] if name in found else numbers[self.names.index(name)] for name in names}
+
+    def stamp_column(self, name: str) -> Array:
+        """Seconds from the first stamp."""
+        i = self.names.index(name)
+        cells = [_row_cells(self, k)[i] for k in range(len(self.lines))]
+        return seconds_from_first(cells, self.path, name, self.first_row)
+
+
+def mend_cells(block: TextBlock, used: Sequence[str]) -> tuple[TextBlock, dict[str, list[int]]]:
+    """Leave out rows of another length than the header, and empty the cells of columns that hold no number.
+
+    Parameters
+    ----------
+    used : sequence of str
+        The columns whose cells have to be numbers.
+
+    Returns
+    -------
+    block : TextBlock
+        With a row a line still: one that is left out has empty cells.
+    changes : dict of str to list of int
+        What was done, with the numbers of the rows.
+    """
+    width, changes = len(block.names), dict[str, list[int]]()
+    cells = [split_cells(line, block.delimiter) for line in block.lines]
+    cells = [row[:-1] if len(row) == width + 1 and not row[-1] else row for row in cells]
+    numbers = [i for i, name in enumerate(block.names) if name in used and name not in block.stamps]
+    commas = sum("," in row[i] for row in cells if len(row) == width for i in numbers)
+    points = sum("." in row[i] for row in cells if len(row) == width for i in numbers)
+    for k, row in enumerate(cells):
+        if len(row) != width:
+            changes.setdefault(f"left out, for the row has not {width} cells", []).append(k + block.first_row)
+            cells[k] = [""] * width
+            continue
+        for i in numbers:
+            text = row[i].replace(",", ".") if commas > points else row[i]
+            if row[i] not in MISSING and not NUMBER.fullmatch(text):
+                what = f"cell of {block.names[i]!r} emptied, for it holds no number"
+                changes.setdefault(what, []).append(k + block.first_row)
+                row[i] = ""
+    lines = [_UNIT_SEPARATOR.join(cell.replace(_UNIT_SEPARATOR, " ") for cell in row) for row in cells]
+    return replace(block, lines=lines, delimiter=_UNIT_SEPARATOR), changes
+
+
+def split_cells(line: str, delimiter: str, where: str = "") -> list[str]:
+    """The cells of one line, without quotes and white space around them.
+
+    Examples
+    --------
+    >>> split_cells('0,1; "a;b" ;3" pipe', ";")
+    ['0,1', 'a;b', '3" pipe']
+    """
+    if delimiter == " ":
+        return [match[0] for match in _WORD.finditer(line)] or [""]
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(delimiter)]
+    try:
+        cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=False), [""])
+    except csv.Error:
+        raise LogError(f"{where}: a cell has more than {csv.field_size_limit()} characters; cut it") from None
+    return [cell.strip() for cell in cells]
+
+
+def _equal_rows(block: TextBlock) -> TextBlock:
+    """Rows with as many fields as the header, without the delimiter at their end that some programs write.
+
+    Where a cell is quoted, cells are set apart by a character that no cell holds, and quotes dropped, so that no quote
+    can swallow the next line.
+    """
+    width, mark = len(block.names), block.delimiter
+    even = list(block.lines)
+    if mark == " " or any('"' in line for line in even):
+        rows = [split_cells(line, mark, f"{block.path}: row {i}") for i, line in enumerate(even, block.first_row)]
+        mark = _UNIT_SEPARATOR
+        even = [mark.join(cell.replace(mark, " ") for cell in cells) for cells in rows]
+    for i, line in enumerate(even):
+        n = line.count(mark) + 1
+        if n == width + 1 and line.rstrip(" ").endswith(mark):
+            even[i] = line.rstrip(" ")[:-1]
+        elif n != width:
+            raise _width_error(block, i, n)
+    return replace(block, lines=even, delimiter=mark)
+
+
+def _width_error(block: TextBlock, index: int, n: int) -> LogError:
+    width, row = len(block.names), f"{block.path}: row {index + block.first_row}"
+    if block.lines[index].count('"') % 2:
+        return LogError(f'{row}: a quote (") is opened and not closed; mend the row')
+    doubt = block.delimiter == "," and n > width
+    remedy = "is ',' the decimal mark, too? Then export with ';'" if doubt else "mend or delete the row"
+    return LogError(f"{row} has {n} {'field' if n == 1 else 'fields'}, the header {width}; {remedy}")
+
+
+def _row_cells(block: TextBlock, row: int) -> list[str]:
+    return [cell.strip() for cell in block.lines[row].split(block.delimiter)]
+
+
+def _numbers(block: TextBlock, used: Sequence[int]) -> dict[int, Array]:
+    for decimal in (".", ","):
+        numbers = _parse_with_decimal(block, used, decimal)
+        if numbers is not None:
+            return numbers
+    raise _number_error(block, used)
+
+
+def _parse_with_decimal(block: TextBlock, used: Sequence[int], decimal: str) -> dict[int, Array] | None:
+    import pandas as pd
+
+    try:
+        frame = pd.read_csv(
+            io.StringIO("\n".join(block.lines)),
+            sep=block.delimiter,
+            decimal=decimal,
+            header=None,
+            names=list(range(len(block.names))),
+            usecols=sorted(used),
+            dtype=np.float64,
+            na_values=list(MISSING),
+            keep_default_na=False,
+            quoting=csv.QUOTE_NONE,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+        )
+    except ValueError:
+        return None
+    numbers = {i: frame[i].to_numpy() for i in used}
+    require(len(frame) == len(block.lines), f"{block.path}: rows are lost; export the log as CSV anew", LogError)
+    for i, column in numbers.items():
+        doubtful = np.flatnonzero(~np.isfinite(column))
+        if any(_row_cells(block, row)[i] not in MISSING for row in doubtful.tolist()):
+            return None
+    return numbers
+
+
+def _number_error(block: TextBlock, used: Sequence[int]) -> LogError:
+    """Name the first cell that is not a number."""
+    rows = [_row_cells(block, k) for k in range(len(block.lines))]
+    decimal = (
+        "," if any(NUMBER.fullmatch(row[i].replace(",", ".")) and "," in row[i] for row in rows for i in used) else "."
+    )
+    for k, row in enumerate(rows):
+        for i in used:
+            cell = row[i]
+            mended = cell.replace(",", ".") if decimal == "," and "." not in cell else cell
+            is_number = NUMBER.fullmatch(mended) and np.isfinite(float(mended))
+            if cell not in MISSING and not (is_number and (decimal == "." or "." not in cell)):
+                return LogError(
+                    f"{block.path}: row {k + block.first_row}, column {block.names[i]!r}: {cell[:40]!r} is not a "
+                    f"number (decimal mark {decimal!r}); {EMPTY_CELL}"
+                )
+    return LogError(f"{block.path}: cannot be read as numbers; export it as CSV")
+
+
+_DELIMITERS = (";", "\t", ",", " ")
+
+
+def read_delimited(path: Path, raw: bytes) -> Table:
+    """Read a text file of which a row names the columns: UTF-8, UTF-16 with its mark, or Windows-1252.
+
+    An empty cell or NaN is a missing sample. One decimal mark holds for all columns that are read. Above the names may
+    stand metadata, below them a row of units (`find_layout`). Rows have the numbers that an editor shows.
+    """
+    return read_text(path, decode(path, raw))
+
+
+def decode(path: Path, raw: bytes) -> str:
+    """The text of a file, its lines apart by a line feed.
+
+    Raises
+    ------
+    LogError
+        If it is no text.
+    """
+    if raw[:2] in {b"\xff\xfe", b"\xfe\xff"}:
+        text = raw.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = raw.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = raw.decode("cp1252", errors="replace")
+    require("\0" not in text, f"{path}: not a text file; export the log as CSV in UTF-8", LogError)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_text(path: Path, text: str) -> Table:
+    """Read the text of such a file."""
+    block, layout = find_block(path, text)
+    return block_table(block, layout)
+
+
+def find_block(path: Path, text: str) -> tuple[TextBlock, Layout]:
+    """The samples of such a text as cells, and how its rows are to be read."""
+    lines = text.rstrip("\n ").split("\n")
+    require(any(lines), f"{path}: row 1 is empty; it has to name the columns", LogError)
+    delimiter = _find_delimiter(path, lines[:MAX_HEAD_ROWS])
+    rows = [split_cells(line, delimiter, f"{path}: row {i}") for i, line in enumerate(lines[:MAX_HEAD_ROWS], 1)]
+    layout = toa5_layout(rows) if rows[0][0] == TOA5 and len(rows) > 4 else find_layout(rows, str(path))
+    names, start = layout.names, layout.start
+    first = rows[start] if start < len(rows) else []
+    stamps = frozenset(name for name, cell in zip(names, first, strict=False) if name and is_stamp(cell))
+    return TextBlock(path, names, lines[start:], delimiter, start + 1, stamps), layout
+
+
+def block_table(block: TextBlock, layout: Layout) -> Table:
+    """The table of such samples."""
+    return Table(block.path, block.names, block.first_row, block.columns, layout.units, block.stamps, layout.remarks)
+
+
+def _find_delimiter(path: Path, lines: Sequence[str]) -> str:
+    """The first that gives names and samples below them; else the first that the first line holds."""
+    for delimiter in _DELIMITERS:
+        if has_table([split_cells(line, delimiter, f"{path}: row {i}") for i, line in enumerate(lines, 1)]):
+            return delimiter
+    return next((d for d in _DELIMITERS[:-1] if d in lines[0]), ",")
+
+
+_STAMP = re.compile(
+    r"(?:(?P<date>\d{4}([-/.])\d\d?\2\d\d?|\d\d?([-/.])\d\d?\3(?:\d{4}|\d\d))(?:[T,_]\s*|\s+))?"
+    r"(?P<h>\d\d?):(?P<m>\d\d)(?::(?P<s>\d\d)(?:[.,:](?P<f>\d{1,9}))?)?"
+    r"(?:\s*(?P<half>[AaPp])\.?[Mm]\.?)?(?:\s*(?P<zone>Z|[+-]\d\d(?::?\d\d)?))?"
+)
+_EXAMPLE = "2026-03-12T10:00:00.000"
+_DAY = 86400 * 10**9  # ns
+
+
+def is_stamp(cell: str) -> bool:
+    """Whether a cell is a time of day, with its date or without.
+
+    Examples
+    --------
+    >>> is_stamp("2026-03-12T10:00:00.25Z"), is_stamp("10:00:00,5"), is_stamp("12.5")
+    (True, True, False)
+    """
+    return _STAMP.fullmatch(cell) is not None
+
+
+def seconds_from_first(cells: Sequence[str], path: Path | str, name: str, first_row: int) -> Array:
+    """Read a column of stamps.
+
+    Parameters
+    ----------
+    cells : sequence of str
+        An empty one is a missing stamp. Without dates, a leap back by more than half a day is midnight.
+    path : Path or str
+    name : str
+        Of the column.
+    first_row : int
+        Number of the first row, for messages.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Seconds from the first stamp, exact to 1 ns; NaN where it is missing.
+
+    Raises
+    ------
+    LogError
+        If a cell is no stamp, or its date may be read in two ways.
+
+    Examples
+    --------
+    >>> seconds_from_first(["23:59:59.5", "00:00:00.25"], "run.csv", "time", 2).tolist()
+    [0.0, 0.75]
+    """
+    matches = [_STAMP.fullmatch(cell) for cell in cells]
+    places = [f"{path}: row {first_row + k}, column {name!r}" for k in range(len(cells))]
+    bad = next((k for k, cell in enumerate(cells) if cell and matches[k] is None), None)
+    if bad is not None:
+        raise LogError(f"{places[bad]}: {cells[bad][:40]!r} is not a time stamp; write it as {_EXAMPLE}")
+    month_first = _month_first([m for m in matches if m], f"{path}: column {name!r}")
+    days: dict[str, int] = {}
+    moments: list[int | None] = []
+    for k, match in enumerate(matches):
+        moments.append(_nanoseconds(match, days, month_first, places[k]) if match else None)
+    if not any(days):
+        moments = _unwrap_midnights(moments)
+    start = next((moment for moment in moments if moment is not None), 0)
+    return np.array([np.nan if m is None else (m - start) / 1e9 for m in moments])
+
+
+def _month_first(matches: Sequence[re.Match[str]], place: str) -> bool:
+    """Whether 3/12/2026 is the 12th of March, by what is possible; either will do where the date stays the same."""
+    texts = {m["date"]: bool(m["half"]) for m in matches if re.match(r"\d\d?[-/]", m["date"] or "")}
+    parts = [[int(n) for n in re.split("[-/]", text)] for text in texts]
+    if any(first > 12 for first, _, _ in parts):
+        return False
+    if any(texts.values()) or any(second > 12 for _, second, _ in parts):
+        return True
+    require(len(texts) < 2, f"{place}: {next(iter(texts), '')!r} may be two days; write dates as 2026-03-12", LogError)
+    return False
+
+
+def _nanoseconds(match: re.Match[str], days: dict[str, int], month_first: bool, place: str) -> int:
+    text = match["date"] or ""
+    if text not in days:
+        days[text] = _day_number(text, month_first, place)
+    hour, minute, second = int(match["h"]), int(match["m"]), int(match["s"] or 0)
+    half = (match["half"] or "").lower()
+    fits = hour < (13 if half else 25) and minute < 60 and second < 61
+    require(fits, f"{place}: {match[0]!r} is no time of day; write it as {_EXAMPLE}", LogError)
+    hour = hour % 12 + 12 * (half == "p") if half else hour
+    zone = (match["zone"] or "Z").replace(":", "").replace("Z", "+0000").ljust(5, "0")
+    shift = (int(zone[1:3]) * 60 + int(zone[3:5])) * (-1 if zone[0] == "-" else 1)
+    fraction = int((match["f"] or "0").ljust(9, "0"))
+    return days[text] * _DAY + ((hour * 60 + minute - shift) * 60 + second) * 10**9 + fraction
+
+
+def _day_number(text: str, month_first: bool, place: str) -> int:
+    if not text:
+        return 0
+    parts = [int(part) for part in re.split("[-/.]", text)]
+    if re.match(r"\d{4}", text):
+        year, month, day = parts
+    elif "." in text or not month_first:
+        day, month, year = parts
+    else:
+        month, day, year = parts
+    try:
+        return date(year + 2000 * (year < 100), month, day).toordinal()
+    except ValueError:
+        raise LogError(f"{place}: {text!r} is no date; write it as 2026-03-12") from None
+
+
+def _unwrap_midnights(moments: Sequence[int | None]) -> list[int | None]:
+    unwrapped: list[int | None] = []
+    shift, last = 0, None
+    for moment in moments:
+        if moment is not None:
+            shift += _DAY if last is not None and moment + _DAY // 2 < last else 0
+            last = moment
+        unwrapped.append(None if moment is None else moment + shift)
+    return unwrapped

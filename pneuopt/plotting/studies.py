@@ -1,0 +1,284 @@
+"""Studies: metrics over one axis as lines, over two as maps of equal cells.
+
+Pareto fronts: one requirement over another, a point a certified design.
+
+How the metrics of a study are distributed over its cases: of samples, corners or a table, which have no map.
+
+Which tolerances matter: Sobol's indices, and a design's derivatives beside them, as bars, a panel a figure.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.evaluation.requirements import METRICS, larger_is_better
+from pneuopt.plotting.canvas import (
+    BLUE,
+    GREY,
+    MAX_PLOT_COLUMNS,
+    ORANGE,
+    RED,
+    axes_grid,
+    axis_label,
+    legend_above,
+    note_omissions,
+)
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import check_names, require
+from pneuopt.studies.outcome import INTERRUPTED_CASE
+from pneuopt.studies.sensitivity import LocalSensitivity, Sensitivity
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+    from matplotlib.figure import Figure
+
+
+MAX_NUMBERED_CELLS = 12
+"""Cells along an axis up to which each has room for its number; with more, numbers overlap."""
+LABELS_PER_LONG_AXIS = 6
+"""Labels along an axis of more cells than that: more overlap, fewer are hard to read between."""
+COLOUR_MAP = "viridis_r"
+
+
+def plot_map(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> "Figure":
+    """Metrics of a study over its axes: lines over one, maps over two, a cell a case; what failed is marked.
+
+    Parameters
+    ----------
+    table : DataFrame
+        As of `sweep` over a `grid`: a column an axis and a metric, and "error".
+    axes : mapping of str to str
+        One or two columns, and the unit in which they are: the first runs to the right, the second up.
+    metrics : mapping of str to str
+        Up to three columns, and their units.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        If there are more axes, or a column is not in the table.
+    """
+    require(len(axes) in (1, 2), f"a study is drawn over one or two axes, this has {len(axes)}: {', '.join(axes)}")
+    require(len(metrics) > 0, "no metric to draw")
+    check_names("column", [*axes, *metrics, "error"], [str(c) for c in table])
+    shown = dict(list(metrics.items())[:MAX_PLOT_COLUMNS])
+    width = min(10.0, 1.5 + 4.0 * len(shown))
+    figure, (row,) = axes_grid(1, len(shown), [3.4], width=width)
+    labels = [axis_label(name, unit) for name, unit in axes.items()]
+    draw = _draw_lines if len(axes) == 1 else _draw_map
+    for panel, (metric, unit) in zip(row, shown.items(), strict=True):
+        draw(panel, table, axes, metric)
+        panel.set_title(axis_label(metric, unit), fontsize=10)
+        panel.set_xlabel(labels[0])
+    if len(axes) == 2:
+        row[0].set_ylabel(labels[1])
+    note_omissions(figure, len(shown), len(metrics), "metrics")
+    return figure
+
+
+def _draw_lines(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric: str) -> None:
+    (name,) = axes
+    ordered = table.sort_values(name)
+    x, y = (ordered[column].to_numpy(dtype=float) for column in (name, metric))
+    panel.plot(x, y, "o-", color=BLUE, ms=5)
+    missing = ~np.isfinite(y)
+    for at, error in zip(x[missing], ordered["error"][missing], strict=True):
+        panel.axvline(at, color=RED, lw=1.0, ls=":")
+        panel.text(
+            at,
+            0.5,
+            _failure_word(metric, error),
+            transform=panel.get_xaxis_transform(),
+            color=RED,
+            rotation=90,
+            ha="right",
+            va="center",
+        )
+
+
+def _draw_map(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric: str) -> None:
+    x, y = (np.unique(table[name].to_numpy(dtype=float)) for name in axes)
+    values, errors = np.full((len(y), len(x)), np.nan), np.full((len(y), len(x)), "", dtype=object)
+    place = [np.searchsorted(v, table[name].to_numpy(dtype=float)) for v, name in zip((x, y), axes, strict=True)]
+    values[place[1], place[0]] = table[metric].to_numpy(dtype=float)
+    errors[place[1], place[0]] = table["error"].to_numpy()
+    panel.set_facecolor("0.92")
+    mesh = panel.pcolormesh(np.ma.masked_invalid(values), cmap=COLOUR_MAP)
+    panel.figure.colorbar(mesh, ax=panel, pad=0.02)
+    panel.grid(False)
+    for ticks, at in ((panel.set_xticks, x), (panel.set_yticks, y)):
+        every = 1 if len(at) <= MAX_NUMBERED_CELLS else -(-len(at) // LABELS_PER_LONG_AXIS)
+        ticks(np.arange(0, len(at), every) + 0.5, [f"{v:.3g}" for v in at[::every]])
+    if max(len(x), len(y)) <= MAX_NUMBERED_CELLS:
+        _number_cells(panel, mesh, values, errors, metric)
+
+
+def _number_cells(panel: "Axes", mesh: "QuadMesh", values: Array, errors: NDArray[np.object_], metric: str) -> None:
+    """Each cell's figure, or what became of it, in black or white as the cell is light or dark."""
+    for (j, i), value in np.ndenumerate(values):
+        known = bool(np.isfinite(value))
+        text = f"{value:.3g}" if known else _failure_word(metric, str(errors[j, i]))
+        red, green, blue, _ = mesh.to_rgba(np.array([value]))[0]
+        light = 0.3 * red + 0.59 * green + 0.11 * blue > 0.5
+        colour = RED if not known else "black" if light else "white"
+        panel.text(i + 0.5, j + 0.5, text, ha="center", va="center", fontsize=8, color=colour)
+
+
+def _failure_word(metric: str, error: str) -> str:
+    if error:
+        return "failed" if error != INTERRUPTED_CASE else error
+    return "never" if metric == "SettlingTime" else "none"
+
+
+def plot_front(table: "pd.DataFrame", requirements: Mapping[str, str]) -> "Figure":
+    """The first requirement over the second; limits at which no design was certified are marked.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Of `pareto_front`.
+    requirements : mapping of str to str
+        Its two requirements, the first one first, and their units.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        If these are not two columns of the table.
+    """
+    require(len(requirements) == 2, f"a front has two requirements, got {', '.join(requirements) or 'none'}")
+    check_names("column", [*requirements, "limit", "error"], [str(c) for c in table])
+    (first, up), (second, along) = requirements.items()
+    figure, ((axes,),) = axes_grid(1, 1, (3.4,), width=6.5)
+    axes.plot(table[second].to_numpy(), table[first].to_numpy(), "o-", color=BLUE, ms=5, label="certified designs")
+    failed = table.loc[table["error"] != "", "limit"].dropna()
+    for k, limit in enumerate(failed):
+        axes.axvline(float(limit), color=RED, lw=1.0, ls=":", label=None if k else "no design certified")
+    axes.set(xlabel=axis_label(second, along), ylabel=axis_label(first, up))
+    legend_above(figure, axes)
+    return figure
+
+
+MARKED_SHARE = 0.95
+"""Share of the cases whose bound is marked [1]: a larger one hangs on the last few of a hundred samples."""
+
+
+def plot_distribution(table: "pd.DataFrame", metrics: Mapping[str, str]) -> "Figure":
+    """The share of the cases that keep a bound over the bound, a panel a metric; the bound that 95 % keep is marked.
+
+    A case that failed, or has no figure, keeps no bound: the curve ends below 1.
+
+    Parameters
+    ----------
+    table : DataFrame
+        As of `sweep` or `evaluate_batch`: a row a case, a column a metric, and "error".
+    metrics : mapping of str to str
+        Up to three columns, and their units.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        If there is no metric, or one is not in the table.
+    """
+    require(len(metrics) > 0, "no metric to draw")
+    check_names("column", [*metrics, "error"], [str(c) for c in table])
+    shown = dict(list(metrics.items())[:MAX_PLOT_COLUMNS])
+    figure, (row,) = axes_grid(1, len(shown), [3.2], width=min(10.0, 1.5 + 3.6 * len(shown)))
+    for panel, (metric, unit) in zip(row, shown.items(), strict=True):
+        _draw_shares(panel, table, metric)
+        panel.set_xlabel(axis_label(metric, unit))
+        panel.set_ylim(0.0, 1.02)
+    row[0].set_ylabel(f"share of the {len(table)} cases [1]")
+    note_omissions(figure, len(shown), len(metrics), "metrics")
+    return figure
+
+
+def _draw_shares(panel: "Axes", table: "pd.DataFrame", metric: str) -> None:
+    known = table.loc[(table["error"] == "") & table[metric].notna(), metric].to_numpy(dtype=float)
+    values = np.sort(known[np.isfinite(known)])
+    at_least = metric in METRICS and larger_is_better(metric)
+    values = values[::-1] if at_least else values
+    shares = np.arange(1, len(values) + 1) / len(table)
+    without = len(table) - len(values)
+    panel.set_title(f"{without} without a figure" if without else "", fontsize=10)
+    if not len(values):
+        return
+    panel.step([values[0], *values], [0.0, *shares], where="post", color=BLUE)
+    k = int(np.searchsorted(shares, MARKED_SHARE - 1e-9))
+    if k < len(values):
+        panel.plot([values[k]] * 2, [0.0, shares[k]], color=GREY, linestyle="--")
+        side = "at least" if at_least else "at most"
+        label = f"{100 * MARKED_SHARE:g} % {side} {values[k]:.4g}"
+        panel.annotate(label, (values[k], 0.03), xytext=(-3, 0), textcoords="offset points", ha="right", fontsize=8)
+
+
+INCHES_AN_AXIS = 0.42
+"""Height of an axis' two bars [inch]: less and their names touch, more and ten axes do not fit a page."""
+
+
+def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) -> "Figure":
+    """Total and first index of each axis with their 95 % intervals; the axis that matters most stands on top.
+
+    Parameters
+    ----------
+    found : Sensitivity
+    local : LocalSensitivity, optional
+        Of a design on the same axes: its shares are a third bar, which agrees with an axis' share by itself where the
+        figure is linear over the whole box.
+
+    Returns
+    -------
+    Figure
+        Of the first three figures that were told about; it says if there are more.
+    """
+    figures = list(found.figures.index)
+    shown = figures[:MAX_PLOT_COLUMNS]
+    table = found.table
+    order = table["total"].groupby(level="axis").max().sort_values(ascending=False).index.tolist()
+    width = 2.2 + 2.6 * len(shown)
+    bars = 2 if local is None else 3
+    height, thick = INCHES_AN_AXIS * bars / 2, 0.74 / bars
+    picture, (row,) = axes_grid(1, len(shown), [0.8 + height * len(order)], width=width)
+    places = np.arange(len(order)) - thick * (bars - 1) / 2
+    for panel, figure in zip(row, shown, strict=True):
+        own = table.loc[figure].loc[order]
+        for k, index, colour, label in (
+            (0, "total", BLUE, "with what it does by way of others"),
+            (1, "first", GREY, "by itself"),
+        ):
+            value, low, high = (own[f"{index}{end}"].to_numpy(dtype=float) for end in ("", "_low", "_high"))
+            spread = np.nan_to_num(np.abs([value - low, high - value]))
+            panel.barh(
+                places + k * thick, value, 0.95 * thick, xerr=spread, color=colour, label=label, ecolor="k", capsize=2
+            )
+        if local is not None:
+            shares = _local_shares(local, str(figure), order)
+            panel.barh(places + 2 * thick, shares, 0.95 * thick, color=ORANGE, label="by its slope at the design")
+        panel.set_yticks(np.arange(len(order)), order if panel is row[0] else [""] * len(order))
+        panel.set_xlim(0.0, max(1.0, panel.get_xlim()[1]))  # one scale, so that panels compare, and a constant's is 0
+        panel.set_title(str(figure), fontsize=10)
+        panel.set_xlabel("share of its variance [1]")
+        panel.invert_yaxis()
+    legend_above(picture, row[0])
+    note_omissions(picture, len(shown), len(figures), "figures")
+    return picture
+
+
+def _local_shares(local: LocalSensitivity, figure: str, axes: list[str]) -> Array:
+    """Shares of a figure by axis; none where the design has no such figure, or no such axis."""
+    rows = [local.table["share"].get((figure, axis), np.nan) for axis in axes]
+    return np.asarray(np.nan_to_num(np.array(rows, dtype=float)))

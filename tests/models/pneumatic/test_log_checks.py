@@ -1,0 +1,211 @@
+"""Sensors before a line: their pressures are the chambers' and a drop in proportion to the flow, from the gas law.
+
+Gauge pressures read as absolute, and the reverse, where no pressure is a vacuum or above the supply.
+
+The threshold is 1.5 times smaller residuals. Found with right hardware: 2.2 to 17 times where a zero is wrong, 0.8 at
+most where none is. With wrong hardware: 1.05 at most where none is, 1.5 or more of one pressure where both are wrong.
+"""
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pneuopt as po
+from pneuopt.dynamics.hooks import Log
+from pneuopt.models.catalog import DriveSet, b32, s32, t32
+from pneuopt.models.pneumatic.cylinder import volumes
+from pneuopt.models.pneumatic.log_checks import LEADS, Balance, LinePressureCheck
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.parameters import without_prefix
+from pneuopt.quantities.trajectories import Trajectory
+
+DATA = Path(__file__).parents[3] / "data"
+SETS = {"b32": (b32, 0.25, 5.0), "s32": (s32, 0.35, 2.5), "t32": (t32, 0.3, 2.5)}  # opening, frequency [Hz]
+BOTH = ("pressure_a", "pressure_b")
+
+
+@pytest.fixture(scope="module", params=SETS)
+def swing(request: pytest.FixtureRequest) -> tuple[po.System, po.ParameterSet, Trajectory, dict[str, Array]]:
+    """1.5 s of a valve opened to and fro, with 20 um and 1 kPa of noise, and the flow into each chamber [kg/s]."""
+    make, opening, frequency = SETS[request.param]
+    drive, truth = make()
+    t = np.arange(1500) * 1e-3
+    voltage = opening * truth.value("valve.span") * np.cos(2 * np.pi * frequency * t) * np.cos(2 * np.pi * 0.4 * t)
+    rest = drive.rest(truth, position=truth.value("cylinder.stroke") / 2)
+    run = po.simulate(drive.system(), Trajectory(t, {"valve_voltage": voltage}), truth, initial=rest.states, rtol=1e-7)
+    geometry: Any = without_prefix({n: p.value for n, p in truth.items()}, "cylinder")
+    position: Any = run["position"]
+    size: Any = volumes(position, geometry)
+    gas = truth.value("gas.constant") * truth.value("ambient.temperature")
+    flows = {n: np.gradient(run[n] * v, t) / gas for n, v in zip(BOTH, size, strict=True)}
+    rng = np.random.default_rng(0)
+    noise = {"position": 2e-5, **dict.fromkeys(BOTH, 1e3)}
+    noisy = {n: run[n] + level * rng.standard_normal(t.size) for n, level in noise.items()}
+    return drive.system(), truth.freed("friction.*"), Trajectory(t, {"valve_voltage": voltage, **noisy}), flows
+
+
+@pytest.mark.parametrize("drop", [0.4e5, 0.8e5])
+def test_the_drop_of_a_line_is_seen_and_its_size_found(
+    swing: tuple[po.System, po.ParameterSet, Trajectory, dict[str, Array]], drop: float
+) -> None:
+    system, truth, log, flows = swing
+    most = max(float(np.quantile(np.abs(flow), 0.999)) for flow in flows.values())
+    before = log.with_columns({n: log[n] + drop * flows[n] / most for n in BOTH})
+    (said,) = system.log_warnings({"run": Log(before, truth)})
+    found = re.search(r"lead the chambers by .* ms, as before a line that drops up to (\S+) bar", said)
+    assert found is not None
+    assert float(found.group(1)) == pytest.approx(drop / 1e5, rel=0.5)
+
+
+def test_pressures_of_the_chambers_and_late_ones_are_not_doubted(
+    swing: tuple[po.System, po.ParameterSet, Trajectory, dict[str, Array]],
+) -> None:
+    system, truth, log, _ = swing
+    late = log.with_columns({n: np.interp(log.t - 5e-3, log.t, log[n]) for n in BOTH})
+    for right in (log, late):
+        assert system.log_warnings({"run": Log(right, truth)}) == []
+
+
+@pytest.mark.parametrize("run", ["run_01", "run_02"])
+def test_the_example_rig_is_not_doubted(run: str) -> None:
+    drive, given = po.read_drive(DATA / "pneumatic_rig" / "drive.toml")
+    system, log = drive.system(), po.read_log(DATA / "pneumatic_rig" / f"{run}.csv")
+    assert system.log_warnings({run: Log(log.trajectory, system.parameters | given)}) == []
+
+
+def test_longer_leads_are_not_tried_once_two_are_worse(
+    swing: tuple[po.System, po.ParameterSet, Trajectory, dict[str, Array]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system, truth, log, flows = swing
+    tried, behind = list[float](), LinePressureCheck._behind_line
+
+    def counted(self: LinePressureCheck, log: Log, given: Balance, lead: float) -> Balance:
+        tried.append(lead)
+        return behind(self, log, given, lead)
+
+    monkeypatch.setattr(LinePressureCheck, "_behind_line", counted)
+    most = max(float(np.quantile(np.abs(flow), 0.999)) for flow in flows.values())
+    before = log.with_columns({n: log[n] + 0.8e5 * flows[n] / most for n in BOTH})
+    (said,) = system.log_warnings({"run": Log(before, truth)})
+    lead = next(each for each in LEADS if f"lead the chambers by {1e3 * each:.2g} ms" in said)
+    assert tuple(tried) == LEADS[: LEADS.index(lead) + 3]
+
+
+ATMOSPHERE = 101325.0
+SETS_PRESSURE_ZERO: dict[str, tuple[Callable[[], DriveSet], float, float]] = {  # opening, and its frequency [Hz]
+    "b32": (b32, 0.25, 5.0),
+    "s32": (s32, 0.35, 2.5),
+    "t32": (t32, 0.3, 2.5),
+}
+WRONG: dict[str, dict[str, float]] = {
+    "nothing": {},
+    "supply 5 % too high": {"supply.pressure": 1.05},
+    "supply 5 % too low": {"supply.pressure": 0.95},
+    "dead volumes 20 % too large": {"cylinder.dead_volume_a": 1.2, "cylinder.dead_volume_b": 1.2},
+    "dead volumes 20 % too small": {"cylinder.dead_volume_a": 0.8, "cylinder.dead_volume_b": 0.8},
+    "spool half as quick": {"valve.bandwidth": 0.5},
+    "bore 3 % too large": {"cylinder.bore": 1.03},
+    "exponent too low": {"chamber.exponent": 0.85},
+    "conductance": {"valve.conductance": 0.3},
+}
+
+
+@pytest.fixture(scope="module", params=SETS_PRESSURE_ZERO)
+def swing_of_pressure_zero(request: pytest.FixtureRequest) -> tuple[po.System, po.ParameterSet, Trajectory]:
+    """1.5 s of a valve opened to and fro, with 20 um and 1 kPa of noise; no pressure is below 2.5 bar(a)."""
+    make, opening, frequency = SETS_PRESSURE_ZERO[request.param]
+    drive, truth = make()
+    t = np.arange(1500) * 1e-3
+    voltage = opening * truth.value("valve.span") * np.cos(2 * np.pi * frequency * t) * np.cos(2 * np.pi * 0.4 * t)
+    rest = drive.rest(truth, position=truth.value("cylinder.stroke") / 2)
+    inputs = Trajectory(t, {"valve_voltage": voltage})
+    run = po.simulate(drive.system(), inputs, truth, initial=rest.states, rtol=1e-7)
+    rng = np.random.default_rng(0)
+    noise = {"position": 2e-5, **dict.fromkeys(BOTH, 1e3)}
+    noisy = {n: run[n] + size * rng.standard_normal(t.size) for n, size in noise.items()}
+    assert min(run[n].min() for n in BOTH) > 2.5e5
+    return drive.system(), truth.freed("friction.*"), inputs.with_columns(noisy)
+
+
+def moved(log: Trajectory, shift: float, channels: tuple[str, ...] = BOTH) -> Trajectory:
+    return log.with_columns({n: log[n] + shift for n in channels})
+
+
+def scaled(truth: po.ParameterSet, factors: Mapping[str, float]) -> po.ParameterSet:
+    return truth.with_values({n: factor * truth.value(n) for n, factor in factors.items()})
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_true_zeros_are_not_doubted(
+    swing_of_pressure_zero: tuple[po.System, po.ParameterSet, Trajectory], wrong: str
+) -> None:
+    system, truth, log = swing_of_pressure_zero
+    assert system.log_warnings({"run": Log(log, scaled(truth, WRONG[wrong]))}) == []
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize(("shift", "remedy"), [(-1, "bar(g)"), (1, "an absolute sensor read as bar(g)")])
+def test_wrong_zeros_are_told_even_with_wrong_hardware(
+    swing_of_pressure_zero: tuple[po.System, po.ParameterSet, Trajectory], wrong: str, shift: int, remedy: str
+) -> None:
+    system, truth, log = swing_of_pressure_zero
+    told = system.log_warnings({"run": Log(moved(log, shift * ATMOSPHERE), scaled(truth, WRONG[wrong]))})
+    assert told
+    assert all(remedy in sentence or "supply.pressure" in sentence for sentence in told)
+    if wrong == "nothing":
+        assert [sentence.split(":")[0] for sentence in told] == ["pressure_a of run", "pressure_b of run"]
+        assert all(remedy in sentence for sentence in told)
+
+
+def test_a_supply_in_gauge_is_told_from_sensors_in_gauge(
+    swing_of_pressure_zero: tuple[po.System, po.ParameterSet, Trajectory],
+) -> None:
+    system, truth, log = swing_of_pressure_zero
+    gauge = truth.with_values({"supply.pressure": truth.value("supply.pressure") - ATMOSPHERE})
+    told = system.log_warnings({"run": Log(log, gauge)})
+    assert told
+    assert all("1.013 bar added to supply.pressure: is that too low, or a gauge" in sentence for sentence in told)
+
+
+def test_the_sensor_and_the_log_are_named(
+    swing_of_pressure_zero: tuple[po.System, po.ParameterSet, Trajectory],
+) -> None:
+    system, truth, log = swing_of_pressure_zero
+    gauge = moved(log, -ATMOSPHERE, ("pressure_b",))
+    (sentence,) = system.log_warnings({"good": Log(log, truth), "bad": Log(gauge, truth)})
+    assert sentence.startswith("pressure_b of bad: its chamber's mass balance leaves ")
+    alone = gauge.select(["valve_voltage", "position", "pressure_b"])
+    assert len(system.log_warnings({"alone": Log(alone, truth)})) == 1
+    for channels in (["position"], ["pressure_a", "pressure_b"]):
+        assert system.log_warnings({"silent": Log(gauge.select(["valve_voltage", *channels]), truth)}) == []
+
+
+def test_a_valve_of_unknown_shape_is_no_excuse(
+    swing_of_pressure_zero: tuple[po.System, po.ParameterSet, Trajectory],
+) -> None:
+    system, truth, log = swing_of_pressure_zero
+    unknown = truth.freed("valve.dead_zone", "valve.critical_ratio", "valve.conductance")
+    assert system.log_warnings({"run": Log(log, unknown)}) == []
+    assert len(system.log_warnings({"run": Log(moved(log, -ATMOSPHERE), unknown)})) >= 1
+
+
+@pytest.mark.parametrize("name", ["run_01", "run_02"])
+def test_the_rigs_logs_are_told_from_themselves_in_gauge(name: str) -> None:
+    drive, parameters = po.read_drive(DATA / "pneumatic_rig" / "drive.toml")
+    log = po.read_log(DATA / "pneumatic_rig" / f"{name}.csv").trajectory
+    system = drive.system()
+    assert system.log_warnings({name: Log(log, parameters)}) == []
+    if "pressure_a" in log:
+        assert system.log_warnings({name: Log(moved(log, -ATMOSPHERE), parameters)}) != []
+
+
+def test_a_supply_to_be_identified_is_no_measure(
+    swing_of_pressure_zero: tuple[po.System, po.ParameterSet, Trajectory],
+) -> None:
+    system, truth, log = swing_of_pressure_zero
+    guessed = truth.with_values({"supply.pressure": 5e5}).freed("supply.pressure")
+    assert system.log_warnings({"run": Log(log, guessed)}) == []

@@ -1,0 +1,93 @@
+"""The figure of a study's cases: which share keeps a bound.
+
+The figure of sensitivities: bars as long as the indices, the axis that matters most on top.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.patches import Rectangle
+
+from pneuopt.plotting import plot_distribution, plot_sensitivity
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.studies.sensitivity import LocalSensitivity, sensitivity
+
+TABLE = pd.DataFrame(
+    {
+        "SettlingTime": [0.3, 0.1, np.nan, 0.2, np.nan],
+        "PhaseMargin": [60.0, 40.0, 50.0, 30.0, np.nan],
+        "error": ["", "", "", "", "failed"],
+    }
+)
+
+
+def test_a_curve_is_the_share_of_all_cases_that_keep_the_bound() -> None:
+    panels = plot_distribution(TABLE, {"SettlingTime": "s", "PhaseMargin": "deg"}).axes
+    x, y = map(np.asarray, panels[0].lines[0].get_data())
+    assert x.tolist() == [0.1, 0.1, 0.2, 0.3]
+    assert y.tolist() == pytest.approx([0.0, 0.2, 0.4, 0.6])
+    assert panels[0].get_title() == "2 without a figure"
+    x, y = map(np.asarray, panels[1].lines[0].get_data())
+    assert x.tolist() == [60.0, 60.0, 50.0, 40.0, 30.0]  # at least
+    assert y.tolist() == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8])
+
+
+def test_the_bound_that_most_cases_keep_is_marked() -> None:
+    table = pd.DataFrame({"Overshoot": np.arange(1.0, 101.0), "error": ""})
+    (panel,) = plot_distribution(table, {"Overshoot": "%"}).axes
+    assert panel.texts[0].get_text() == "95 % at most 95"
+
+
+def test_a_column_that_is_not_there_is_refused() -> None:
+    with pytest.raises(InputError, match="Overshot"):
+        plot_distribution(TABLE, {"Overshot": "%"})
+
+
+CUBE = ParameterSet(dict.fromkeys(("little", "much"), Parameter(1.0, "1")))
+
+
+def figures(p: ParameterSet) -> dict[str, float]:
+    value = 0.2 * p.value("little") + p.value("much")
+    return dict.fromkeys(("SettlingTime", "Overshoot", "ISE", "Ripple"), value)
+
+
+def test_bars_are_the_indices_and_what_is_left_out_is_said() -> None:
+    with ThreadPoolExecutor(1) as executor:
+        found = sensitivity(figures, CUBE, dict.fromkeys(CUBE, 0.1), count=32, executor=executor)
+    picture = plot_sensitivity(found)
+    panels = picture.axes
+    assert [panel.get_title() for panel in panels] == ["SettlingTime", "Overshoot", "ISE"]
+    assert [text.get_text() for text in panels[0].get_yticklabels()] == ["much", "little"]
+    widths = [bar.get_width() for bar in panels[0].patches if isinstance(bar, Rectangle)]
+    own = found.table.loc["SettlingTime"]
+    assert widths == pytest.approx([*own["total"][["much", "little"]], *own["first"][["much", "little"]]])
+    assert [text.get_text() for text in picture.texts] == ["3 of 4 figures"]
+
+
+def test_a_third_bar_is_the_share_by_the_slope_at_a_design() -> None:
+    with ThreadPoolExecutor(1) as executor:
+        found = sensitivity(figures, CUBE, dict.fromkeys(CUBE, 0.1), count=32, executor=executor)
+    index = pd.MultiIndex.from_product([["SettlingTime", "Overshoot"], ["little", "much"]], names=["figure", "axis"])
+    shares = pd.DataFrame({"share": [0.1, 0.9, float("nan"), 0.5]}, index=index)
+    panels = plot_sensitivity(found, LocalSensitivity(shares, pd.DataFrame())).axes
+    widths = [[bar.get_width() for bar in panel.patches if isinstance(bar, Rectangle)][4:] for panel in panels]
+    assert widths == [[0.9, 0.1], [0.5, 0.0], [0.0, 0.0]]  # "much" stands on top
+    assert [text.get_text() for text in panels[0].get_yticklabels()] == ["much", "little"]
+
+
+def test_panels_have_one_scale_whose_end_is_the_whole_variance_for_a_constant_too() -> None:
+    with ThreadPoolExecutor(1) as executor:
+        found = sensitivity(
+            lambda p: {"moves": p.value("much"), "stays": 1.0},
+            CUBE,
+            dict.fromkeys(CUBE, 0.1),
+            count=32,
+            executor=executor,
+        )
+    ends = [panel.get_xlim() for panel in plot_sensitivity(found).axes]
+    assert [low for low, _ in ends] == [0.0, 0.0]
+    assert ends[0][1] >= 1.0
+    assert ends[1][1] == 1.0
