@@ -6,7 +6,8 @@ from contextlib import contextmanager
 
 import typer
 
-from pneuopt.cli.run import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, interruption_status
+from pneuopt.cli.run import interruption_status
+from pneuopt.cli.tolerances import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
 from pneuopt.quantities.output import read_once
 

@@ -16,8 +16,8 @@ from itertools import groupby
 import numpy as np
 import typer
 
-from pneuopt.cli.run import EXIT_FAILURE, EXIT_SUCCESS
 from pneuopt.cli.shared import make_console, show_pairs
+from pneuopt.cli.tolerances import EXIT_FAILURE, EXIT_SUCCESS
 from pneuopt.dynamics.compiled.compiler import COMPILER_FLAGS, cache_directory, cached_libraries, find_compiler
 from pneuopt.dynamics.compiled.self_check import SelfCheck, check_machine_code
 from pneuopt.dynamics.system import discretise, parameter_vector

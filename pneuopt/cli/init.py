@@ -13,7 +13,7 @@ from pathlib import Path
 
 import typer
 
-from pneuopt.cli.run import EXIT_SUCCESS
+from pneuopt.cli.tolerances import EXIT_SUCCESS, SAMPLE_TIMES, WIDTH
 from pneuopt.evaluation.moves import excitation_run
 from pneuopt.files.drive import read_drive
 from pneuopt.files.first_files import (
@@ -27,7 +27,7 @@ from pneuopt.files.first_files import (
     sidecar_name,
     unused_channels,
 )
-from pneuopt.files.loop import SAMPLE_TIME
+from pneuopt.files.tolerances import SAMPLE_TIME
 from pneuopt.logs.foreign import read_table
 from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.table import Table, read_bytes
@@ -39,8 +39,6 @@ from pneuopt.quantities.units import read_value, write_value
 
 USUAL_SIZE = "s32"  # of the catalogue: the middle one
 _PNEUMATIC = "pneumatic"  # the kind that has a catalogue, and its valve's centre as a parameter
-_SAMPLE_TIMES = (1e-4, 0.02)  # [s]: a controller's; a log with another step was not written by the controller
-_WIDTH = 80  # characters of a line on the screen
 
 
 @dataclass
@@ -94,7 +92,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     guess = LogGuess((), (), SAMPLE_TIME) if table is None else _guess_log(table, name, ask)
     unused = unused_channels(name)
     columns = {c.channel: "false" if c.channel in unused else c.entry for c in guess.columns}
-    least, most = _SAMPLE_TIMES
+    least, most = SAMPLE_TIMES
     sample_time = guess.sample_time if least <= guess.sample_time <= most else SAMPLE_TIME
     files = first_files(
         name,
@@ -234,7 +232,7 @@ def _advise_command(guess: LogGuess, unused: Container[str]) -> None:
 
 def say(text: str, indent: str = "") -> None:
     """Print a sentence in lines of the screen's width."""
-    typer.echo("\n".join(textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")))
+    typer.echo("\n".join(textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")))
 
 
 @dataclass(frozen=True)

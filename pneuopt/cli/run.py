@@ -28,12 +28,16 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
+from pneuopt.cli.tolerances import (
+    EXIT_OUTPUT_LOST,
+    EXIT_UNFORESEEN,
+    PATIENCE,
+    RETURN,
+    SHOWN_REASON,
+)
+
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
-
-
-SHOWN_REASON = 160
-"""Length of an unforeseen error's words on the screen [character]: more fills it; the file has them all."""
 
 
 def run_guarded(load: Callable[[], Callable[[], object]]) -> NoReturn:
@@ -157,13 +161,6 @@ def _say(sentence: str) -> None:
     sys.stderr.write(f"{sentence}\n")
 
 
-PATIENCE = 1.7
-"""Time that a command may take to end [s]: more looks like a hang; less throws away what it was about to write."""
-
-RETURN = 0.02
-"""Time until a lost interruption comes again [s]: less may meet the same destructor; more delays the end."""
-
-
 class _State:
     """What a process knows of its interruption: the signal, when it came, and whether it has to wait for a file."""
 
@@ -263,17 +260,3 @@ def _watch(heard: socket.socket, _wake: socket.socket) -> None:
 def _numbers() -> set[int]:
     """The signals that end a command here."""
     return {number for number in signal.Signals if signal.getsignal(number) is _interrupt}
-
-
-EXIT_SUCCESS = 0
-EXIT_FAILURE = 1
-"""Not converged, not certified, or a model that misses the logs so far that no interval holds; in a study a case failed
-or never settles."""
-EXIT_BAD_INPUT = 2
-"""Something that the user gave cannot be used. Typer ends with the same number where an option is wrong."""
-EXIT_UNFORESEEN = 70
-"""An error that nobody foresaw, sysexits' EX_SOFTWARE: one line names a file with the details."""
-EXIT_OUTPUT_LOST = 74
-"""What stands on the screen could not be written, sysexits' EX_IOERR; the files that were asked for are."""
-EXIT_INTERRUPTED = 130
-"""Ctrl-C: 128 + the number of SIGINT, as shells have it; SIGTERM gives 143."""

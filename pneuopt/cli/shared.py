@@ -22,7 +22,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column
 from rich.text import Text
 
-from pneuopt.cli.run import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS, interruption_status, without_interruption
+from pneuopt.cli.run import interruption_status, without_interruption
+from pneuopt.cli.tolerances import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS, SECONDS_A_LINE
 from pneuopt.files.drive import StoredFit, read_fit, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -243,8 +244,6 @@ def expand_patterns(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-SECONDS_A_LINE = 5.0
-"""Time between two lines of progress [s] where there is no terminal: less fills a record, more looks like a hang."""
 _TONE_STYLES = {
     Tone.PLAIN: "",
     Tone.HEADING: "bold",

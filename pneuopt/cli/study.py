@@ -21,7 +21,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from pneuopt.cli.run import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
@@ -33,6 +32,15 @@ from pneuopt.cli.shared import (
     read_fit_and_tuning,
     warn,
     warn_of_status,
+)
+from pneuopt.cli.tolerances import (
+    EXIT_FAILURE,
+    EXIT_INTERRUPTED,
+    EXIT_SUCCESS,
+    MAX_CASE_ROWS,
+    MAX_FAILURE_REASONS,
+    MAX_GAIN_COLUMNS,
+    MAX_MAP_AXES,
 )
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate, metric_cell, metric_units
@@ -190,8 +198,6 @@ def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requi
 
 Design: TypeAlias = tuple[ClosedLoop, ParameterSet]
 """The loop of all cases, and its parameters."""
-MAX_MAP_AXES = 2
-"""Axes up to which a study has a map: of more no figure can be read."""
 
 
 def case_page(
@@ -230,12 +236,6 @@ def _page_source(study: Study) -> Source:
     warnings = (*describe_status(read_fit(study.drive)), *describe_status(study.tuning))
     title = f"Study of {study.drive.name} with {study.tuning.name}"
     return Source(title, file_hashes(*files), warnings)
-
-
-MAX_CASE_ROWS, MAX_FAILURE_REASONS = 40, 5
-"""Rows and reasons that a study shows: more scroll the verdict away."""
-MAX_GAIN_COLUMNS = 6
-"""Gains that a front shows: more do not fit a terminal of 80 columns."""
 
 
 def report_cases(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> Report:

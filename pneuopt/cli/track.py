@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.cli.identify import read_experiments, read_free_drive
-from pneuopt.cli.run import EXIT_FAILURE
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
@@ -23,6 +22,7 @@ from pneuopt.cli.shared import (
     warn_of_status,
     write_csv,
 )
+from pneuopt.cli.tolerances import EXIT_FAILURE
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
 from pneuopt.experiments.design import AOptimal, DOptimal, ExperimentDesign

@@ -23,6 +23,15 @@ from numpy.typing import NDArray
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET, Dither, Waveform
 from pneuopt.control.linear_controller import controller_response
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.tolerances import (
+    BALANCE_TOLERANCE,
+    MAX_BALANCE_STEPS,
+    MAX_NEWTON_ITERATIONS,
+    MIN_BALANCE_FRACTION,
+    MIN_NEWTON_STEP,
+    NEWTON_TOLERANCE,
+    RIPPLE_PHASES,
+)
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.quantities.arrays import Array, Indices, Mask
@@ -30,7 +39,6 @@ from pneuopt.quantities.errors import ConvergenceError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 AMPLITUDE_FRACTIONS = np.geomspace(1e-3, 1.0, 13)  # fractions of the amplitude, where the whole is too much at once
-MAX_NEWTON_ITERATIONS, NEWTON_TOLERANCE, MIN_NEWTON_STEP = 50, 1e-9, 1e-3
 
 
 def average_dither(
@@ -459,18 +467,6 @@ class RippleMoments:
         J = ca.horzcat(inward @ ca.jacobian(xdot, x) @ outward, inward @ ca.jacobian(xdot, u[k]))
         output = ca.horzcat(ca.jacobian(y[j], x) @ outward, ca.jacobian(y[j], u[k]), y[j])
         return ca.Function("jacobians", [x, u, q], [ca.densify(v) for v in (inward @ xdot, J, output)])
-
-
-# Phases of a dither period over which is averaged, at least: fewer miss the edge of a dead zone between two of them,
-# more cost time in proportion.
-RIPPLE_PHASES = 32
-# Newton steps, halved ones included, that the balance of the first harmonic may take. With fewer, a swing across
-# Stribeck's minimum is left unbalanced; more are spent on lanes that have no balance at all.
-MAX_BALANCE_STEPS = 40
-# Newton step at which the balance counts as solved, a fraction of the swing; what is left is about its square. A larger
-# one shows in Ms (0.01: 1e-4); a smaller one costs a step and changes nothing.
-BALANCE_TOLERANCE = 1e-4
-MIN_BALANCE_FRACTION = 1e-3  # of a Newton step: a swing that a smaller one does not improve is kept as it is
 
 
 class PlantMatrices(NamedTuple):

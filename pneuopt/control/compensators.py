@@ -14,13 +14,38 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import casadi as ca
 
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, SensedSignal, Signals
+from pneuopt.control.tolerances import (
+    BRAKE,
+    CHANGE_SMOOTHING,
+    COMMAND_SMOOTHING,
+    DERIVATIVE_FILTER_TIME,
+    DIRECTION_SMOOTHING,
+    FALL,
+    GROWTH,
+    LEAST_LIMIT,
+    LEAST_PEAK,
+    LEAST_RISE,
+    LEAST_SMOOTHING,
+    LEAST_TOLERANCE,
+    LEAST_WAY,
+    MIN_FILTER_TIME,
+    MIN_PASSED_TIME,
+    PASSED_TIME,
+    PAUSE,
+    PERIOD_SAMPLES,
+    PRESSURE_NOMINAL,
+    PULSE_SAMPLES,
+    PULSE_SHARE,
+    PULSE_TOLERANCE,
+    PULSE_WIDTH,
+    RISE,
+    STANDSTILL_SHARE,
+)
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, with_prefix, without_prefix
 from pneuopt.quantities.units import difference_unit, unit_ratio
-
-LEAST_SMOOTHING = 1e-9  # [any unit] of a smooth sign: at zero it would jump, and a rest has no derivative
 
 
 @dataclass(frozen=True)
@@ -158,10 +183,6 @@ def compensate(
     return moved, added
 
 
-PULSE_SAMPLES, PERIOD_SAMPLES = 2, 10  # [samples] defaults: shorter or rarer pulses move nothing, longer push through
-CHANGE_SMOOTHING = 0.01  # [command's unit] default: a small one knocks on noise, a large one knocks too weakly
-
-
 @dataclass(frozen=True)
 class Knocker:
     """Pulses of one amplitude and width, a period apart, each in the direction in which the PID's command moves.
@@ -241,7 +262,6 @@ class Knocker:
         return now, p["amplitude"] * now["direction"] * (phase < width)
 
 
-DIRECTION_SMOOTHING = 1e-3  # [measured unit] default: m/s or rad/s; a small one chatters about rest, a large one gives
 # slow motions too little
 
 
@@ -332,11 +352,6 @@ class FrictionFeedforward:
         return {}, p["level"] * ca.tanh(speed / p["smoothing"])
 
 
-COMMAND_SMOOTHING = (
-    0.02  # [command's unit] default: a small one jumps about zero, a large one leaves a part of the zone
-)
-
-
 @dataclass(frozen=True)
 class DeadZoneInverse:
     """``u = v + width tanh(v/smoothing)``: beyond its edge a valve with that dead zone answers v as if it had none.
@@ -387,24 +402,6 @@ class DeadZoneInverse:
     def act(self, seen: ControllerSnapshot, _x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """No states, and what it adds [the command's unit]."""
         return {}, p["width"] * ca.tanh(seen.command / p["smoothing"])
-
-
-PULSE_WIDTH, PAUSE = 0.018, 0.016  # [s] defaults: a valve's spool cannot follow shorter pulses, longer ones go too far
-LEAST_LIMIT, LEAST_TOLERANCE = 1e-9, 1e-12  # [command's unit, error's unit] by which is divided
-PULSE_TOLERANCE = 1e-4  # [error's unit] default: a tenth of a millimetre
-GROWTH, BRAKE = 1.1, 0.6  # [1] defaults: a larger growth arrives sooner, or beyond the reference; see `brake`
-PULSE_SHARE = 0.5  # part of the error that a pulse shall take away: more overshoots, less needs more pulses
-# Exponents of the ratio of the way wanted to that of the last pulse, where the peak rises and where it falls. A force
-# that rises and falls at a given rate moves a body over (P - F)^3, F being the breakaway force: a peak of 1.2 F has a
-# slope of 18 in logarithms, one of 1.6 F of 8. With larger ones the body is thrown to and fro, with smaller ones the
-# peak learns slowly.
-RISE, FALL = 0.05, 0.15
-STANDSTILL_SHARE = 0.2  # of the tolerance: changes of the error below are a standstill; an encoder's count lies below
-# Factor by which the peak rises at least towards one that has gone too far, and beyond it, should it no longer move the
-# body: a larger one throws it, a smaller one takes more pulses.
-LEAST_RISE = 1.02
-LEAST_PEAK = 1e-9  # [command's unit] by which is divided
-LEAST_WAY = 0.06  # of the tolerance: a pulse that has moved less counts as one that has moved this far
 
 
 @dataclass(frozen=True)
@@ -607,9 +604,6 @@ class MotionFeedforward:
 
 
 PRESSURES = ("pressure_a", "pressure_b")
-PASSED_TIME = 0.1  # [s] default: a short one passes nothing of a slow drive's swing, a long one shifts a loaded rest
-MIN_PASSED_TIME = 1e-6  # [s]; below, the loop is too stiff to integrate
-PRESSURE_NOMINAL = 1e5  # [Pa] a usual differential pressure, which scales the state
 
 
 @dataclass(frozen=True)
@@ -687,10 +681,6 @@ def _differential_pressure(seen: ControllerSnapshot) -> Any:
 def _pressure_quantity(on: SensedSignal) -> Quantity:
     """The pressure's signal; a list of keys knows no plant."""
     return on.outputs.get(PRESSURES[0], Quantity(PRESSURES[0], "Pa(a)"))
-
-
-DERIVATIVE_FILTER_TIME = 5e-3  # [s] default: a short one passes an encoder's counts, a long one delays what shall damp
-MIN_FILTER_TIME = 1e-4  # [s]; below, the loop is too stiff to integrate, and a difference over a sample is all counts
 
 
 @dataclass(frozen=True)

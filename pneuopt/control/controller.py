@@ -27,6 +27,13 @@ from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.pid import BAD_SAMPLES, PID, Form, ParallelForm, parallel_gains
 from pneuopt.control.reset_integral import reset_integral
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag, Signals
+from pneuopt.control.tolerances import (
+    LARGEST_SIGNAL,
+    MAX_BISECTIONS,
+    MAX_DOUBLINGS,
+    MIN_FEEDFORWARD_TIME,
+    POSITION_GAIN,
+)
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, stack
 from pneuopt.quantities.arrays import Array
@@ -34,13 +41,9 @@ from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, with_prefix, without_prefix
 from pneuopt.quantities.units import difference_unit, unit_ratio
 
-LARGEST_SIGNAL = 1e30
-"""A signal beyond it, or that compares with nothing, is no number: larger than any reading, a literal everywhere."""
 ERROR = "error"
 """Beside the inputs of a cascade's inner controller: the error of the outer one."""
 _COUNT = f"pid.{BAD_SAMPLES}"
-MAX_BISECTIONS = 120  # halvings of a bracket: fewer than some 60 leave digits of a double, more cost time
-MAX_DOUBLINGS = 60  # of a bracket from 1 [command's unit] on: fewer than some 20 miss large commands
 
 
 @dataclass(frozen=True)
@@ -66,9 +69,6 @@ class PlantSignals:
     outputs: Mapping[str, Quantity]
     axis: Axis | None = None
     load_unit: str = "1"
-
-
-MIN_FEEDFORWARD_TIME = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast leads are refused
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,6 @@ class Feedforward:
         """The sampled law at a sample, `elapsed` [s] after the last good one: the next r_f, and u_ff [output unit]."""
         slow = (p["time"] * x["filter"] + elapsed * r) / (p["time"] + elapsed)
         return {"filter": slow}, p["gain"] * (r - slow)
-
-
-POSITION_GAIN = 10.0  # [1/s] default: a small one creeps in, one near the speed loop's own bandwidth swings
 
 
 @dataclass(frozen=True)

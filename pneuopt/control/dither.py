@@ -9,14 +9,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.control.tolerances import MAX_AVERAGED_PERIODS, MAX_BEAT_AMPLITUDE
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 DITHER_AMPLITUDE, DITHER_OFFSET, DITHER_FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
-
-MAX_AVERAGED_PERIODS = 20  # periods, at most, that make a whole number of samples
-MAX_BEAT_AMPLITUDE = 1e-3  # of the amplitude: what averaging may leave of it
 
 
 class Waveform(Enum):

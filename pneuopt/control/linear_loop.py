@@ -23,6 +23,7 @@ from pneuopt.control.dither import DITHER_OFFSET
 from pneuopt.control.linear_controller import linear_controller, operating_point
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag, Signals
+from pneuopt.control.tolerances import LARGEST_TAYLOR_NORM, TAYLOR_TERMS
 from pneuopt.dynamics.system import Linearisation, names, stack
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet, with_prefix, without_prefix
@@ -154,9 +155,6 @@ class ComposedLoops:
         return ca.Function("law", [stack(y), v, stack(p)], [ca.densify(block) for block in blocks])
 
 
-# Norm of a matrix and terms of the series of its exponential, whose remainder is then .5^17/17!, below rounding: a
-# larger norm needs more terms, a smaller one more squarings, each of which doubles the rounding.
-LARGEST_TAYLOR_NORM, TAYLOR_TERMS = 0.5, 16
 # States that hold the command, as the hold and the delay have their own, and those that nothing moves in normal work.
 _COMMANDS = ("pid.command", "pid.pending", "pid.transfer", "pid.bad_samples")
 

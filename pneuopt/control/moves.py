@@ -13,6 +13,7 @@ from scipy.interpolate import PchipInterpolator
 
 from pneuopt.control.reference import Reference, describe_circumstances, disturbance_columns, reference_samples
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
+from pneuopt.control.tolerances import LABEL_DECIMALS, MAX_LABELLED_STOPS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -362,11 +363,6 @@ def sample_motion(reference: Reference, motion: Motion, step: float, *, between:
     t: Array = np.asarray(k * step, dtype=np.float64)
     columns = dict(zip(("reference", REFERENCE_SPEED, REFERENCE_ACCELERATION), motion(t), strict=True))
     return Trajectory(t, columns | disturbance_columns(reference, k >= first))
-
-
-# Stops of a sequence that its label names; more make a heading that no table has room for.
-MAX_LABELLED_STOPS = 4
-LABEL_DECIMALS = 9  # of a stop in a label: more show what sums of distances leave of a zero, fewer hide micrometres
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,11 @@ from typing import Any
 import casadi as ca
 
 from pneuopt.control.reset_integral import RESET_STATES, reset_parameters, reset_quantities
+from pneuopt.control.tolerances import FAULT_SAMPLES, LEAST_KI, MOST_EMPTYING, UNUSED_FILTER_TIME
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import difference_unit, unit_ratio
-
-UNUSED_FILTER_TIME = 0.01  # [s], the filter of a standard form's derivative that is switched off, Td = 0
 
 
 class Form(Enum):
@@ -255,9 +254,6 @@ def _check_spans(measured: float, command: float) -> None:
 
 
 BAD_SAMPLES = "bad_samples"  # the state that counts them
-FAULT_SAMPLES = 5.0  # default: fewer stop a drive for a disturbed telegram, more leave it longer on an old output
-LEAST_KI = 1e-20  # [any unit] below it there is no integral action: a Ti of 1e30 s, "infinite" where no such literal is
-MOST_EMPTYING = 10.0  # of Tt's default: a Tt that is to switch back-calculation off must not keep a transfer for ever
 
 
 class AntiWindup(Enum):

@@ -4,11 +4,11 @@ from typing import Any
 
 import casadi as ca
 
+from pneuopt.control.tolerances import RESET_RATIO
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import difference_unit
 
-RESET_RATIO = 1.0  # default: less brakes an overshoot less, more would make it swing
 SIDE, EXCURSION = "side", "excursion"
 RESET_STATES = (SIDE, EXCURSION)
 

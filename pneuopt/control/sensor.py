@@ -7,6 +7,7 @@ from typing import Any
 
 import casadi as ca
 
+from pneuopt.control.tolerances import MIN_SENSOR_LAG
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -16,7 +17,6 @@ Signals = dict[str, ca.SX]
 """Symbolic values by name."""
 REFERENCE_SPEED, REFERENCE_ACCELERATION = "reference_speed", "reference_acceleration"
 """The loop's inputs with the rates of the motion that its reference describes; a loop has those that it uses."""
-MIN_SENSOR_LAG = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast sensors are refused
 
 
 @dataclass(frozen=True)

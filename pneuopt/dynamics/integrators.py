@@ -15,9 +15,10 @@ from typing import NamedTuple
 
 import casadi as ca
 
-# |lambda h| of a search's steps, dimensionless. RK4 is unstable above 2.78, and rates change within a search; below, a
-# stiff plant takes more steps than it needs.
-RK4_MAX_H_LAMBDA = 2.0
+from pneuopt.dynamics.tolerances import (
+    MIN_SLOPE,
+    SOLVER_ITERATIONS,
+)
 
 
 def rk4(rate: Callable[[ca.SX, ca.SX], ca.SX], t: ca.SX, h: ca.SX, x: ca.SX) -> ca.SX:
@@ -46,18 +47,6 @@ DIAGONAL = 1 - 1 / math.sqrt(2)
 """The implicit half's diagonal [1], which makes it L-stable."""
 LAST_STAGE_START = -2 * math.sqrt(2) / 3
 """Weight [1] of the first stage in the explicit half's last one."""
-# |lambda h| of the rates that stay explicit, dimensionless: the method is stable for more, but of second order; higher
-# leaves the estimates to the finer steps that follow, lower costs time
-PARTITIONED_MAX_H_LAMBDA = 0.15
-# h times the largest growth rate of the implicit state by its own, dimensionless: above 3.4 (one over `DIAGONAL`) a
-# stage has several solutions, near it its sensitivities are too large; lower costs time
-PARTITIONED_MAX_H_GROWTH = 2.0
-# iterations for a stage's state: fewer show in the outputs where friction turns its sign, more cost
-# time (6 move no output of random_rig.py in problems/shared by a hundredth of the noise, against 45)
-SOLVER_ITERATIONS = 7
-# the least slope of a stage's equation that is reckoned with [1], by which its solution is enclosed: at
-# `PARTITIONED_MAX_H_GROWTH` it is 0.41; lower makes the first enclosure wide, higher may leave out the solution
-MIN_SLOPE = 0.25
 
 Rate = Callable[[ca.SX, ca.SX], ca.SX]
 

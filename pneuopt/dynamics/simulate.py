@@ -19,6 +19,7 @@ from pneuopt.dynamics.runnable import HasSystem, Runnable, as_runnable
 from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration, without_solver_warnings
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector, slopes
+from pneuopt.dynamics.tolerances import MAX_STEPS, SECONDS_A_STEP
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import (
@@ -31,9 +32,6 @@ from pneuopt.quantities.parameters import (
 )
 from pneuopt.quantities.trajectories import Trajectory
 
-# Steps of a tight simulation, and the time that one takes, a pneumatic drive's with a compiler: 3e6 are five minutes.
-# A smaller budget refuses what users mean; with a larger one a mistyped sample time runs for hours without a word.
-MAX_STEPS, SECONDS_A_STEP = 3e6, 1e-4
 REST_COORDINATE = "position"  # the state that `initial` may give alone: the plant then rests there
 
 

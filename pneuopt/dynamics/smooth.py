@@ -20,16 +20,12 @@ from scipy import integrate
 from pneuopt.dynamics.compiled.functions import compile_function, compile_held_rate, compile_rate, compile_rows
 from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.system import Ramp, System, names
+from pneuopt.dynamics.tolerances import LIMIT_CHECK_PERIOD, MAX_INTERNAL_STEPS, ROUNDING_STEP
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-MAX_INTERNAL_STEPS = 200_000  # LSODA steps between two instants; below, stiff plants stop early; above, it hangs long
-# [s] between two checks of the validity limits. Above, a short contact with an end stop is missed; below, simulation is
-# slower.
-LIMIT_CHECK_PERIOD = 1e-3
-ROUNDING_STEP = 8  # units in the last place of the time by which instants are one: LSODA refuses such a step
 ODEINT_SUCCESS = "Integration successful."  # what SciPy says of an integration that reached all instants
 
 

@@ -17,14 +17,12 @@ import numpy as np
 from scipy import integrate, optimize
 
 from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
-from pneuopt.dynamics.smooth import MAX_INTERNAL_STEPS, Recorder, WorkArrays
+from pneuopt.dynamics.smooth import Recorder, WorkArrays
 from pneuopt.dynamics.system import FRICTION_DIRECTION, Ramp, System, names
+from pneuopt.dynamics.tolerances import MAX_EVENTS, MAX_INTERNAL_STEPS, ROOT_PROBES_PER_STEP
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
-
-MAX_EVENTS = 100_000  # events of a run; below, long runs are refused; above, a chattering loop runs for hours
-ROOT_PROBES_PER_STEP = 4  # points of a step at which a root is sought; fewer miss short motions, more cost time
 
 
 class EventKind(Enum):

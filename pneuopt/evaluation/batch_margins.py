@@ -30,6 +30,7 @@ from pneuopt.evaluation.margins import (
     rests_below_zero,
 )
 from pneuopt.evaluation.requirements import METRICS
+from pneuopt.evaluation.tolerances import LOOPS_AT_A_TIME, PEAK_GRID_POINTS, PEAK_REFINEMENTS, SPREAD_FREQUENCIES
 from pneuopt.quantities.arrays import Array
 
 MAX_SENSITIVITY = "MaxSensitivity"
@@ -325,16 +326,6 @@ def _partial_fraction_response(A: Array, B: Array, C: Array, typical: Array) -> 
         return sums
 
     return response
-
-
-# Frequencies spread over the range, beside those about the closed poles. Fewer miss a broad maximum between them;
-# more cost time in proportion.
-SPREAD_FREQUENCIES = 48
-# Finer grids about the two highest peaks, each within two steps of the last, and the frequencies of each. Fewer of
-# either show a sharp resonance too low; more cost time in proportion.
-PEAK_REFINEMENTS = 4
-PEAK_GRID_POINTS = 9
-LOOPS_AT_A_TIME = 128  # more do not fit the processor's cache; fewer spend their time between the operations
 
 
 def sensitivity_peaks(opened: ComplexArray, closed: ComplexArray, low: float, high: float) -> Array:

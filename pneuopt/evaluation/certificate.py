@@ -48,7 +48,6 @@ from pneuopt.dynamics.simulate import continue_simulation
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, relevant_units, report_metrics, tabulate_metrics
 from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
 from pneuopt.evaluation.metric import (
-    TAIL_SHARE,
     Band,
     SettlingBand,
     Tolerance,
@@ -60,6 +59,25 @@ from pneuopt.evaluation.metric import (
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.response import cases, check_travel, readings_a_sample, sample_spacing
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.evaluation.tolerances import (
+    COMMAND_DRIFT_SHARE,
+    CONTACT_SHARE,
+    CONTINUATION_TOLERANCE,
+    COUNT_TOLERANCE,
+    EDGE_SHARE,
+    GROWTH_SHARE,
+    LATEST_SETTLING,
+    MAX_CONTINUATION_INSTANTS,
+    MAX_HORIZONS,
+    MAX_NOTES,
+    MIN_DRIFT_SHARE,
+    MIN_GROWTH,
+    MIN_LATER_OVERSHOOT,
+    MIN_MOTION,
+    RUNAWAY_ERROR,
+    STANDING_SHARE,
+    TAIL_SHARE,
+)
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
@@ -70,30 +88,6 @@ from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-# Horizons to which a response is continued at most: with fewer, hunting that begins with a slow integral goes unseen;
-# more cost time in proportion.
-MAX_HORIZONS = 16
-# Instants that a continuation may simulate. Below, a loop of 10 kHz or with a fast dither stays undecided; above, its
-# certificate takes minutes.
-MAX_CONTINUATION_INSTANTS = 200_000
-# Tolerance of a continuation, relative; its absolute one is a hundredth. A smaller one costs twice the time for digits
-# of which only a share of the settling band counts.
-CONTINUATION_TOLERANCE = 1e-8
-# Peak to peak of the mean over half the record, as a share of the settling band, that counts as standing. A larger one
-# takes slow creep for rest; a smaller one continues responses whose ringing has all but gone.
-STANDING_SHARE = 0.1
-# Change of the command, were it to drift on to the last horizon, as a share of its largest size, that counts as none.
-# A larger one misses an integral that pushes a stuck drive towards its break-away; a smaller one continues responses
-# for the last of their decay.
-COMMAND_DRIFT_SHARE = 0.01
-# Share of a record before a contact with a validity limit that is not judged: the rounded edge of an end stop slows a
-# piston some millimetres before it. With less, a speed that holds until the stop creeps; more hides what it did there.
-CONTACT_SHARE = 0.1
-# Size of the error, in steps, from which a response counts as running away: a lower one takes a large overshoot for
-# it, from a higher one on numbers overflow.
-RUNAWAY_ERROR = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,26 +260,6 @@ def _next_inputs(found: CaseEvaluation, begin: float, course: ContinuedResponse)
     columns = {q.name: np.full(len(t), held.get(q.name, 0.0)) for q in loop.inputs}
     readings = 1 if h is None else readings_a_sample(loop, reference)
     return Trajectory(t, columns), np.linspace(t[0], t[-1], readings * count + 1)
-
-
-# Share of the step below which a response has not moved: below it, a stuck drive whose friction gives way a little
-# counts as a motion; above it, a response counts as none that creeps towards the reference.
-MIN_MOTION = 0.1
-# Overshoot of the continuation beyond the horizon's, as a share of the settling band, from which it takes its place.
-# Below, the ripple's mean at the horizon's end decides; above, a larger overshoot goes unsaid.
-MIN_LATER_OVERSHOOT = 1e-3
-# Ratio of an oscillation's size in the last quarter of the record to that in the quarter before from which it grows.
-# A lower one takes irregular hunting for growth; a higher one misses growth that takes many periods.
-MIN_GROWTH = 1.1
-# Share of the settling band that an oscillation inside it must reach for its growth to count, and a rest for a note
-# that it lies near the edge. Smaller ones report what stays far inside; with larger ones only the edge itself counts.
-GROWTH_SHARE, EDGE_SHARE = 0.5, 0.9
-# Share of the range over half the record that a drift in one direction must cover to be creep: with less, slow hunting
-# is creep too; with all of it, the least ringing on the drift hides it.
-MIN_DRIFT_SHARE = 0.9
-# Horizons within which a response must be in its band for good. With fewer, a design is refused whose user only
-# underrated its settling; with more, one counts as settled that for its user's purposes never does.
-LATEST_SETTLING = 4.0
 
 
 class Defect(Enum):
@@ -495,10 +469,6 @@ def describe_ending(ending: Ending, metrics: Mapping[str, float]) -> Iterator[st
         yield f"at {ending.case} {ripple}"
 
 
-MAX_NOTES = 4
-"""Notes of a certificate that are shown: fewer hide kinds of notes; more repeat one of them for each case."""
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(Result):
     """What `certificate` found; prints its `summary()`.
@@ -628,11 +598,6 @@ def report_notes(notes: Sequence[str]) -> Report:
     more = len(notes) - MAX_NOTES
     rest = f"{more} more notes of this kind on other cases; --json FILE holds all, and so does `Certificate.notes`"
     return Report((*map(Line, notes[:MAX_NOTES]), *([Line(rest)] if more > 0 else [])))
-
-
-# Relative excess of half a count over the band's half width that counts as none: below, rounding refuses a band of just
-# half a count; above, a band that is too narrow passes.
-COUNT_TOLERANCE = 1e-9
 
 
 def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Reference, band: Band) -> str | None:

@@ -24,18 +24,17 @@ from pneuopt.dynamics.hooks import Axis, FinalElement, Rest
 from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.certificate import ContinuedResponse, Ending, continue_response
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases
-from pneuopt.evaluation.metric import (
-    FINAL_PERIODS,
-    TAIL_SHARE,
-    Band,
-    band_share,
-    describe_ripple,
-    entry_for_good,
-    measure_ripple,
-    period_mean,
-)
+from pneuopt.evaluation.metric import Band, band_share, describe_ripple, entry_for_good, measure_ripple, period_mean
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.response import command_range
+from pneuopt.evaluation.tolerances import (
+    FINAL_PERIODS,
+    LAST_CYCLES,
+    MAX_RIPPLE_SHARE,
+    MIN_CURE,
+    MIN_LOOSENING_FORCE,
+    TAIL_SHARE,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet, check_parameters
@@ -44,11 +43,6 @@ from pneuopt.quantities.results import Result
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-# Share of the static friction below which a dither's force on a body at rest is said not to loosen it: the
-# command gives the rest of the force, so a dither may loosen with less than all of it; lower promises too much.
-MIN_LOOSENING_FORCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -278,11 +272,6 @@ def _clamp_body(plant: System, axis: Axis) -> System:
     return replace(plant, ode=ca.Function("ode", [t, x, u, p], [rates, y], ["t", "x", "u", "p"], ["xdot", "y"]))
 
 
-# Cycles of a hunting loop, at its end, over which its error is the largest one: fewer miss the worst of irregular
-# cycles, more reach back into the transient.
-LAST_CYCLES = 3
-
-
 @dataclass(frozen=True, eq=False)
 class DitheredEnding:
     """How a response ends.
@@ -399,14 +388,6 @@ def _largest_speed(found: CaseEvaluation) -> float | None:
         at = run.t[run.t <= run.t[-1] - period / 2]
         speed = period_mean(run.t, speed[None], float(speed[0]), period, at)[0]
     return float(speed[np.abs(speed).argmax()])
-
-
-# Share by which a dither has to reduce the error of a loop that goes on hunting, to count as better: with less, one
-# that shakes a hunting loop a little is useful; with more, no dither is that does not cure it.
-MIN_CURE = 0.5
-# Ripple from peak to peak, a share of the step, from which a dither is harmful whatever else it does: above, the motion
-# goes to and fro instead of along the step; far below, a dither that cures hunting as large is refused.
-MAX_RIPPLE_SHARE = 0.5
 
 
 class Usefulness(Enum):

@@ -9,14 +9,14 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, as_references
-from pneuopt.dynamics.simulate import MAX_STEPS, simulate
-from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.tolerances import MAX_STEPS
+from pneuopt.evaluation.limit_cycle import find_limit_cycle
 from pneuopt.evaluation.margins import margin_rows, worst_margins
 from pneuopt.evaluation.metric import Band, Requirement
-from pneuopt.evaluation.metrics import MAX_REFINEMENTS, Envelope, meter_metrics, refine_instants
+from pneuopt.evaluation.metrics import Envelope, meter_metrics, refine_instants
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, percent_factor, user_limit
 from pneuopt.evaluation.response import (
-    POINTS_PER_READING,
     TuningCase,
     cases,
     check_steps,
@@ -28,6 +28,15 @@ from pneuopt.evaluation.response import (
 )
 from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.evaluation.tolerances import (
+    MAX_COMPARED_COLUMNS,
+    MAX_REFERENCE_COLUMNS,
+    MAX_REFINEMENTS,
+    MIN_RELATIVE_AMPLITUDE,
+    MIN_SHOWN_PERCENT,
+    POINTS_PER_READING,
+    TRANSIENT_SHARE,
+)
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet, check_argument, check_parameters
 from pneuopt.quantities.report import TIED, Report, Table, format_number, number_columns, text_columns
@@ -40,10 +49,6 @@ LIMIT_CYCLE_METRICS = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare
 DITHER_METRICS = ("Ripple", "SettlingTimeRaw")
 """Metrics that say something of a loop with dither only."""
 TIMES_OR_NEVER = ("SettlingTime", "SettlingTimeRaw")
-MAX_REFERENCE_COLUMNS, MAX_COMPARED_COLUMNS = 3, 2
-"""References beside each other, alone and with other figures: more do not fit 80 columns; their worst is shown."""
-MIN_SHOWN_PERCENT = 1e-3
-"""Least figure in percent that is shown as it is: below, digits of rounding errors hide the others."""
 
 
 def evaluate(

@@ -12,32 +12,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.evaluation.metric import period_mean, remove_ripple
+from pneuopt.evaluation.tolerances import (
+    CROSSING_HYSTERESIS,
+    MAX_PERIOD_SPREAD,
+    MIN_AUTOCORRELATION,
+    MIN_CYCLES,
+    MIN_RELATIVE_AMPLITUDE,
+    PHASES_PER_CYCLE,
+    STANDSTILL_FRACTION,
+    TRANSIENT_SHARE,
+    WINDOWS_PER_PERIOD,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
-# Share of a record that is left out for the transient, unless a start is given: a smaller one takes the transient's
-# ringing for a cycle, a larger one leaves too few cycles of slow hunting.
-TRANSIENT_SHARE = 0.4
-MIN_CYCLES = 3  # fewer cycles do not show whether they repeat; more miss slow hunting in a short record
-# Least autocorrelation one period later, relative to the variance: it allows noise as strong as the cycle; a smaller
-# one finds cycles in noise alone.
-MIN_AUTOCORRELATION = 0.5
-# Largest standard deviation of the periods, relative to their mean: filtered noise has more, a smaller one rejects
-# irregular hunting.
-MAX_PERIOD_SPREAD = 0.35
-# Moving averages per period that remove noise before zero crossings are sought: fewer flatten the cycle, more leave
-# noise and its crossings.
-WINDOWS_PER_PERIOD = 8
-# Swing on both sides that a zero crossing needs, in standard deviations: with less, noise crosses too; with more, a
-# cycle of varying amplitude loses crossings.
-CROSSING_HYSTERESIS = 0.3
 # Growth of the amplitude per period, as a logarithm. A ringing decays where its growth is below the first by two
 # standard errors, or below the second whatever its error.
 MIN_SUSTAINED_GROWTH = log(0.98)
 MAX_DECAY_GROWTH = log(0.8)
-MIN_RELATIVE_AMPLITUDE = 0.01  # share of the record's range below which an amplitude counts as none
-STANDSTILL_FRACTION = 0.02  # share of the largest speed below which a speed counts as standstill
-PHASES_PER_CYCLE = 64  # points of the mean cycle: fewer cut its peaks, more cost time
 
 
 @dataclass(frozen=True)

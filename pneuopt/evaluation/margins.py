@@ -45,6 +45,14 @@ from pneuopt.control.reference import Reference, disturbance_input
 from pneuopt.dynamics.system import Linearisation, names
 from pneuopt.evaluation.metric import Source, period_mean, remove_ripple
 from pneuopt.evaluation.requirements import METRICS
+from pneuopt.evaluation.tolerances import (
+    FLAT,
+    MOST_POLE_ROUNDING,
+    NOISE_ANGLE,
+    POLE_ROUNDING,
+    RESTING_SPEED,
+    SPEED_TOLERANCE,
+)
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -57,13 +65,6 @@ if TYPE_CHECKING:
 AT_REST, AT_THE_START, SLIDING, AT_THE_END = "at rest", "at the start", "sliding", "at the end"
 FRICTION_SLOPE, NOISE_GAIN = "FrictionSlope", "NoiseGain"
 MARGIN_METRICS = tuple(metric.name for metric in METRICS.values() if metric.source is Source.LINEAR_LOOP)
-# Speed below which a body counts as resting, a share of its state's nominal value; a rest's own rounding lies below.
-RESTING_SPEED = 1e-9
-
-
-# Share of the largest speed by which a speed may miss it and count as the largest: below, rounding chooses between the
-# instants of a steady motion; above, the body still accelerates.
-SPEED_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,11 +248,6 @@ def _worst(metric: str, values: list[float]) -> float:
 
 
 ComplexArray = NDArray[np.complex128]
-# Share of a matrix's size by which rounding moves its well conditioned poles. With a smaller one the drift of a piston
-# under speed control makes it unstable; with a larger one slow instabilities beside fast filters pass.
-POLE_ROUNDING = 1e-13
-# Share of the fastest pole beyond which no rounding moves even a double pole at zero, the root of a double's precision.
-MOST_POLE_ROUNDING = 1e-7
 
 
 def are_stable(closed: Array, poles: ComplexArray | None = None) -> NDArray[np.bool_]:
@@ -282,14 +278,6 @@ def _has_stable_poles(A: Array) -> bool:
     with np.errstate(divide="ignore"):
         condition = 1 / np.abs((left.conj() * right).sum(axis=0))
     return bool((poles.real <= POLE_ROUNDING * np.linalg.norm(balanced) * condition).all())
-
-
-# Angle over a horizon of the slowest noise that counts [rad]. With a smaller one the noise gain is that of a drift, far
-# slower than the response; with a larger one a resonance of slow loops is missed.
-NOISE_ANGLE = 0.3
-# Relative change of a response between the two lowest frequencies of a grid, below which it is that at rest. With a
-# larger one an integral's response counts as one; with a smaller one a gain margin at rest is missed on a coarse grid.
-FLAT = 1e-3
 
 
 @dataclass(frozen=True)

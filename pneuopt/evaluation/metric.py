@@ -39,6 +39,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.reference import Reference
+from pneuopt.evaluation.tolerances import (
+    EDGE_ROUNDING,
+    FINAL_PERIODS,
+    MIN_STAY_RATIO,
+    MIN_WAVE_PHASES,
+    RIPPLE_ALLOWANCE,
+    SAMPLE_SHARE,
+    TAIL_SHARE,
+)
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import check_argument
@@ -46,9 +55,6 @@ from pneuopt.quantities.units import write_value
 
 ValuesAndSlopes = tuple[Array, Array]
 RowReader = Callable[["StepRecord"], ValuesAndSlopes]
-# Share of a controller's sample time after which an instant counts as one sample later: nearer 1, rounding of the
-# instants decides; well below 1, the command's change within a sample would count.
-SAMPLE_SHARE = 0.999
 
 
 def without_slopes(values: Array) -> ValuesAndSlopes:
@@ -386,14 +392,6 @@ class AtLeast(Requirement):
     min: float | None = None
 
 
-# Whole dither periods at the end of a record over which its final value is averaged: fewer average less noise, more
-# reach back into the transient.
-FINAL_PERIODS = 5
-# Share of a record that counts as its end, where ripple is read and a settling comes too late to count: a smaller one
-# sees less than a cycle of slow hunting, a larger one reaches back into the transient.
-TAIL_SHARE = 0.05
-
-
 def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
     """Centred mean over one period of signals that are linear between samples and `initial` before the first.
 
@@ -502,14 +500,6 @@ def _integral(t: Array, y: Array, whole: Array, initial: float, at: Array) -> Ar
     ahead = at - t[k]
     inside: Array = whole[:, k] + ahead * (y[:, k] + 0.5 * ahead * (y[:, k + 1] - y[:, k]) / (t[k + 1] - t[k]))
     return np.where(at < t[0], initial * (at - t[0]), inside)
-
-
-# Largest distance by which the signal is moved towards its mean, in amplitudes of the ripple at the end. Below 1 some
-# of a steady ripple stays; at 1 all that it grows by does, where the stroke is passed or the valve is wide open; far
-# above it a small ripple lets the mean smooth the transient.
-RIPPLE_ALLOWANCE = 2.0
-# Least instants in a period at which the wave is read: fewer cut its peaks, more cost time.
-MIN_WAVE_PHASES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -684,15 +674,6 @@ def first_crossing_times(t: Array, z: Array, level: float) -> Array:
 def pick_samples(rows: Array, k: NDArray[np.intp]) -> Array:
     """One sample of each row."""
     return np.asarray(rows[np.arange(len(rows)), k], dtype=float)
-
-
-# Share of a band's half width by which a signal on its edge may lie outside by rounding, and still be in it. At 0 the
-# units decide whether a signal that ends on the edge has settled; far above, designs that leave the band have.
-EDGE_ROUNDING = 1e-9
-# Ratio of the time in the band at the record's end to any stay in it before, from which a response that came in late
-# counts as settled. With a lower one slow hunting settles whenever it is inside; with a higher one a stroke that ends
-# early makes creep of every response that once touched the band's edge.
-MIN_STAY_RATIO = 2.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,14 +33,18 @@ from pneuopt.evaluation.metric import (
     without_slopes,
 )
 from pneuopt.evaluation.requirements import METRICS, StepEnvelope
+from pneuopt.evaluation.tolerances import (
+    INTEGRAL_TOLERANCE,
+    LINE_TOLERANCE,
+    MAX_INSTANTS,
+    MIN_SETTLED_PERIODS,
+    PARTS_AT_A_TIME,
+    SPREAD,
+)
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-
-# Dither periods that a response must stay in its band to count as settled where its ripple does not: with fewer, one
-# that just passes through the band counts too; more ask for longer records.
-MIN_SETTLED_PERIODS = 2
 
 ROW_METRICS = tuple(name for name, metric in METRICS.items() if metric.slope is not None)
 
@@ -486,25 +490,6 @@ def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajecto
     record = meter_record(response.t, {n: row.T for n, row in zip(shown, rows, strict=True)}, start)
     readable = (m for m in METRICS.values() if m.channels and set(m.channels) <= set(shown))
     return {metric.name: float(metric.largest(record)[0]) for metric in readable}
-
-
-# Largest distance of a signal between two readings from the straight line that joins them, a share of the step: with a
-# larger one settling times and overshoots are off; a smaller one adds readings that change no digit shown.
-LINE_TOLERANCE = 1e-4
-# Relative error of the integrals over the error that readings may cause: with a larger one a search compares reading
-# errors; a smaller one adds readings that change no digit shown.
-INTEGRAL_TOLERANCE = 1e-3
-# Parts into which a distance between readings is divided at a time: fewer take more simulations; more add readings
-# where they are not needed.
-PARTS_AT_A_TIME = 8
-# Times that points are added where a response changes fast: each brings them eight times as close. Fewer leave the peak
-# of a fast response in a long horizon unread; more cost a simulation each.
-MAX_REFINEMENTS = 4
-# Factor on the time after a step within which responses of different gains are taken to change equally fast: a smaller
-# one misses those that are faster than the first; a larger one adds readings where nothing happens.
-SPREAD = 3.0
-# Readings of a response, at most: fewer leave a fast response in a long horizon unresolved; more take seconds to read.
-MAX_INSTANTS = 60_000
 
 
 def refine_instants(

@@ -30,26 +30,43 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.margins import margins
 from pneuopt.evaluation.response import TuningCase, check_travel, command_range
+from pneuopt.evaluation.tolerances import (
+    ALLOWED_SHARE,
+    CALM,
+    CALM_WAY,
+    DWELL_DIGITS,
+    FAST_SHARE,
+    FIRST_GAIN,
+    FIRST_PUSH,
+    GAIN_STEP,
+    GUESSED_SENSITIVITY,
+    LEAST_DWELL,
+    LEAST_FAST_SPEED,
+    LEAST_MARGIN,
+    LEAST_SPAN,
+    LONGEST_PUSH,
+    LONGEST_STEP,
+    MARGIN_SHARE,
+    MEDIUM,
+    MOST_FACTOR,
+    MOST_OVERSHOOT,
+    MOST_TRIES,
+    MOVE_BISECTIONS,
+    PLACE_DIGITS,
+    PUSH_FACTOR,
+    PUSH_SAMPLES,
+    PUSH_TOLERANCE,
+    REST_BEFORE,
+    SETTLED_SHARE,
+    SHORT_WAY,
+    SLOW,
+    SLOW_WAY,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
-
-# Share of a move over which full command is tried first, and the factor on it where that is too short to come half
-# way: larger ones run far beyond the move's end, where a cylinder's model ends; smaller ones try again more often.
-FIRST_PUSH, PUSH_FACTOR = 0.1, 1.4
-# Instants at which full command is read: fewer blur its times and its peak; more cost time in proportion.
-PUSH_SAMPLES = 300
-LONGEST_PUSH = 60.0  # [s], of what hardly moves: a shorter one refuses creeping drives, a longer one takes long
-PUSH_TOLERANCE = 1e-7  # of the simulation: its figures are shown with three digits
-# Bisections of a speed or a share of the limits. Fewer make the figures coarse; each more costs an equilibrium.
-MOVE_BISECTIONS = 20
-# Largest factor on a move's speeds that is tried for the shortest move: a larger one would end beyond any drive.
-MOST_FACTOR = 64.0
-# Share of what full command can that a message and the shortest move allow: nearer 1 the samples of a run refuse what
-# was advised; lower it gives speed away.
-ALLOWED_SHARE = 0.98
 
 
 def check_move(loop: ClosedLoop, move: Move | MoveSequence, parameters: ParameterSet) -> None:
@@ -257,37 +274,6 @@ def _axis(loop: ClosedLoop) -> Axis:
     axis = loop.plant.axis
     assert axis is not None
     return axis
-
-
-# Share of the stroke kept free at either end, and the least length of it [m]: less leaves a wrong guess of the gain no
-# room to overshoot, more leaves no way to become fast on.
-MARGIN_SHARE, LEAST_MARGIN = 0.1, 0.01
-# Shortest way between the margins [m]: on a shorter one the fast moves end before the following error has settled.
-LEAST_SPAN = 0.03
-# Share of the fastest move that the drive's file allows: more, and a drive half as strong as its file says cannot
-# follow; less leaves conductance and viscous friction to a part of the valve's travel.
-FAST_SHARE = 0.5
-# Least speed of the fastest moves [m/s], several Stribeck speeds of usual seals: with less, viscous friction is taken
-# for Coulomb's.
-LEAST_FAST_SPEED = 0.05
-# Speeds of the medium, calm and slow moves over that of the fast ones [1].
-MEDIUM, CALM, SLOW = 0.4, 0.15, 0.03
-# Lengths of the calm, the slow and the short moves over the span [1].
-CALM_WAY, SLOW_WAY, SHORT_WAY = 0.4, 0.08, 0.01
-# Largest sensitivity of the plain controller on the plant as guessed [1], sliding: a gain half as large again, which a
-# wrong conductance makes of it, is then still stable.
-GUESSED_SENSITIVITY = 2.0
-# Share of the command per span from which the gain is sought downwards, and the factor between two tries [1].
-FIRST_GAIN, GAIN_STEP, MOST_TRIES = 100.0, 0.85, 80
-REST_BEFORE = 0.5  # [s] before the first move: pressures at rest are read from it
-# A dwell lasts until the error of a following at the move's speed would be this share of the span [1], and so long at
-# least [s]: after shorter ones the axis still moves, longer ones show nothing more.
-SETTLED_SHARE, LEAST_DWELL = 0.005, 0.3
-LONGEST_STEP = 2e-5  # [s] of the simulation as guessed: longer ones are unstable where friction turns over .1 mm/s
-# Part of the way from the run's ends to the stops that the simulated overshoot may take: more leaves none to a drive
-# that is not as guessed.
-MOST_OVERSHOOT = 0.5
-PLACE_DIGITS, DWELL_DIGITS = 5, 2  # of places [m] and dwells [s] after the point: so a file shows them whole
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,7 @@ from pneuopt.evaluation.scenarios import (
     samples,
     tolerances,
 )
+from pneuopt.evaluation.tolerances import FIT_SHARE, GAIN_TOLERANCE, PLANT_COUNT
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
@@ -147,9 +148,6 @@ def draw_in_ranges(
     return [{n: values[k] for n, values in columns.items()} for k in range(count)]
 
 
-# Plants on which a design is tried. If it holds on all of 100, at least 97 % of such plants hold with 95 % confidence
-# (0.05^(1/100)); fewer say less, more cost time in proportion.
-PLANT_COUNT = 100
 # By what share of its value a parameter differs from plant to plant where no fit has estimated it. Parameters on one
 # line vary together. Larger shares find fault with every design, smaller ones with none.
 TOLERANCES: Mapping[tuple[str, ...], float] = {
@@ -165,10 +163,7 @@ TOLERANCES: Mapping[tuple[str, ...], float] = {
     ("plant.damping",): 0.1,  # friction's share in it
     ("plant.dead_time",): 0.05,
 }
-# Share by which a controller's gain differs from the printed one: rounding to three digits, integer scaling in a PLC.
-GAIN_TOLERANCE = 0.01
 GAIN_PREFIXES = ("pid.", "feedforward.")
-FIT_SHARE = 0.95  # of the plants [1] that lie between the low and the high end of a fit's estimate
 
 
 @dataclass(frozen=True, eq=False)

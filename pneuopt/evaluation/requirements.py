@@ -48,13 +48,13 @@ from pneuopt.evaluation.metric import (
     without_slopes,
 )
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
+from pneuopt.evaluation.tolerances import ANR_DENSITY, LEAST_ROOT, LITRES_PER_CUBIC_METRE
 from pneuopt.quantities.errors import require
 
 PUSH = "load.force"
 """The disturbance against which a loop is stiff."""
 FOLLOWING_METRICS = frozenset({"FollowingError", "FollowingErrorRMS"})
 """What needs the reference at every instant."""
-LEAST_ROOT = 1e-300  # keeps the derivative of a root finite where nothing is off: 0/0 otherwise
 
 
 def overshoot_distance_rows(record: StepRecord) -> ValuesAndSlopes:
@@ -199,8 +199,6 @@ class EnergyUse(AtMost):
     metric = Metric("EnergyUse", "J", Source.METER, slope=energy_rows, channels=(POWER_CHANNEL,))
 
 
-ANR_DENSITY = 1.185  # density of air in the standard state of ISO 8778 (ANR: 100 kPa, 20 degC, 65 % humidity) [kg/m^3]
-LITRES_PER_CUBIC_METRE = 1e3
 AIR_CHANNEL = "air"  # the meter's channel with the mass flow drawn from the supply [kg/s]
 
 

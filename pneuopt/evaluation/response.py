@@ -18,25 +18,25 @@ from scipy.integrate import cumulative_trapezoid
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, Step
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
-from pneuopt.dynamics.simulate import MAX_STEPS, SECONDS_A_STEP
+from pneuopt.dynamics.tolerances import MAX_STEPS, SECONDS_A_STEP
 from pneuopt.evaluation.metric import Band, band_share
 from pneuopt.evaluation.metrics import BandCentre, Envelope, step_metrics
 from pneuopt.evaluation.requirements import PUSH
 from pneuopt.evaluation.scenarios import Factor, Scenarios, apply_scenario
+from pneuopt.evaluation.tolerances import (
+    MAX_READINGS_A_SAMPLE,
+    MIN_READINGS_A_SAMPLE,
+    POINTS_PER_READING,
+    READINGS_A_HORIZON,
+    RESPONSE_SAMPLES,
+    SAMPLES_A_DITHER_PERIOD,
+    TRAVEL_SAMPLES,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
-
-# Samples of a response of a loop without sample time: fewer blur a settling time, more cost time in proportion.
-RESPONSE_SAMPLES = 1000
-# Readings of a sampled loop over a horizon, and the least and most of them a sample: with fewer, the signal leaves the
-# settling band between two readings unseen; more cost time in proportion.
-READINGS_A_HORIZON, MIN_READINGS_A_SAMPLE, MAX_READINGS_A_SAMPLE = 1000, 2, 16
-# Samples a period of a continuous dither: with six, the averaged response of a drive with friction seems to settle in
-# 47 ms where it takes 63 ms; more cost time in proportion.
-SAMPLES_A_DITHER_PERIOD = 20
 
 
 def measure(
@@ -227,11 +227,6 @@ def _check_scenario(
         )
 
 
-# Points of the simulated record for each reading of a search: with one, the record would miss what happens between the
-# search's readings just as the search does; more cost time in proportion.
-POINTS_PER_READING = 4
-
-
 def check_steps(
     loop: ClosedLoop,
     references: Sequence[Reference],
@@ -308,10 +303,6 @@ def _duration(seconds: float) -> str:
     if not math.isfinite(seconds) or seconds > 72 * 3600:
         return f"{seconds / 86400:.2g} days"
     return f"{seconds / 3600:.2g} hours" if seconds > 7200 else f"{seconds / 60:.2g} minutes"
-
-
-# Instants over a horizon at which a reference is read: fewer miss a turn by more of its way, more take longer.
-TRAVEL_SAMPLES = 2001
 
 
 def check_travel(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> None:

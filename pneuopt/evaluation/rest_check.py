@@ -20,6 +20,16 @@ from pneuopt.dynamics.stick_slip import Event, EventKind
 from pneuopt.evaluation.response import TuningCase, cases, loop_inputs, sample_spacing
 from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.evaluation.tolerances import (
+    MAX_READINGS,
+    MIN_KEPT_ERROR,
+    MIN_PUSH,
+    MIN_STANDSTILLS,
+    READINGS_A_SECOND,
+    STILL_SHARE,
+    TOLERANCE,
+    USUAL_DURATION,
+)
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, check_argument
@@ -30,26 +40,6 @@ from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd
-
-# Standstills whose errors are compared: of fewer nobody can say whether hunting decays; more take longer than a minute
-# of slow hunting.
-MIN_STANDSTILLS = 3
-# Ratio of the error at a standstill to that at the one before from which hunting does not decay. A lower one takes the
-# last slips of a loop that comes to rest for hunting; a higher one misses hunting of varying size.
-MIN_KEPT_ERROR = 0.9
-# Change of the command over the second half of the run, as a share of its largest size, that counts as none. A larger
-# one takes an integral that still pushes a stuck body for rest; a smaller one rounding.
-MIN_PUSH = 1e-6
-# Motion over the second half, as a share of the step, below which a body that never sticks has come to rest: without a
-# break-away force its motion dies away. A larger one hides creep, a smaller one waits for what nobody sees.
-STILL_SHARE = 1e-4
-# Instants at which a continuous loop is read, each second, and at most: fewer miss the extremes of a fast hunting, more
-# cost memory; a body that hunts slowly stands at its extremes.
-READINGS_A_SECOND, MAX_READINGS = 200, 50_000
-# Tolerance of the integration, relative: a larger one moves a break-away's instant, a smaller one costs time.
-TOLERANCE = 1e-8
-USUAL_DURATION = 60.0
-"""How long a loop is watched [s], unless it is said: hunting of a servo axis has periods of seconds."""
 
 
 @dataclass(frozen=True)

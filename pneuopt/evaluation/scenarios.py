@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from pneuopt.evaluation.tolerances import EDGE, MAX_CORNERS, MAX_DRAWS_PER_SAMPLE, MIN_PROBABILITY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -151,12 +152,6 @@ _POINTS: Mapping[Sampling, Callable[[int, Sequence[str], Seed], Array]] = {
     Sampling.LATIN_HYPERCUBE: _latin_points,
     Sampling.SOBOL: _sobol_points,
 }
-
-
-MIN_PROBABILITY = 1e-6
-"""Probability [1] that a distribution must leave within a parameter's bounds: below it, its tail has no digits left;
-a larger one refuses what is only cut off."""
-_EDGE = 2.0**-53  # share nearest to 0 and 1 [1]: at these themselves a quantile is infinite
 
 
 class Distribution(Protocol):
@@ -321,7 +316,7 @@ def quantiles(distribution: Distribution, name: str, parameter: Parameter, share
     inside = 1.0 - below - above
     message = f"{name}: {distribution} leaves its bounds, {p.lower:g} to {p.upper:g} {p.unit}; move one of them"
     require(inside > MIN_PROBABILITY, message)
-    probability = np.clip(below + np.asarray(shares) * inside, _EDGE, 1 - _EDGE)
+    probability = np.clip(below + np.asarray(shares) * inside, EDGE, 1 - EDGE)
     return np.asarray(np.clip(frozen.ppf(probability), lower, p.upper))
 
 
@@ -353,10 +348,6 @@ Spread = float | tuple[float, float]
 Spreads = Mapping[str, Spread] | Mapping[AxisNames, Spread]
 SampleSpreads = Spreads | Mapping[str, Spread | Distribution] | Mapping[AxisNames, Spread | Distribution]
 ScenarioValues = dict[str, dict[str, float]]
-MAX_CORNERS = 4096  # plants, 12 axes: each one is simulated for every candidate, and another axis doubles their number
-# Draws until a sample lies within the bounds: fewer refuse a covariance that reaches beyond them, more only delay the
-# error where hardly any draw fits.
-MAX_DRAWS_PER_SAMPLE = 1000
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from math import inf
 from types import MappingProxyType
 from typing import Any
 
-from pneuopt.evaluation.metric import TAIL_SHARE, Band, Tolerance
+from pneuopt.evaluation.metric import Band, Tolerance
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     EnvelopeBounds,
@@ -23,12 +23,9 @@ from pneuopt.evaluation.requirements import (
     with_upper_limit,
 )
 from pneuopt.evaluation.rest_check import NoHunting
+from pneuopt.evaluation.tolerances import STABILITY_SENSITIVITY, TAIL_SHARE
 from pneuopt.quantities.errors import require
 
-# Largest sensitivity of a loop that a search takes for stable where none was asked for. With a smaller one good designs
-# on fast loops are lost that nobody had forbidden; with a larger one designs are found that a tenth more or less gain,
-# or another operating point, makes unstable.
-STABILITY_SENSITIVITY = 10.0
 Kind = type | tuple[type, ...]
 NO_WEIGHTS: Mapping[Requirement, float] = MappingProxyType({})
 

@@ -23,9 +23,18 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from pneuopt.identification.identifiability import UNIDENTIFIABLE_DEVIATION
+from pneuopt.experiments.tolerances import (
+    LARGEST,
+    REACHED_ROOM,
+    SHOWN_BLOCKS,
+    SINGULAR,
+    STATE_RIDGE,
+    UNINFORMED,
+    USEFUL_RATIO,
+)
 from pneuopt.identification.result import IdentificationResult, join_names
 from pneuopt.identification.statistics import confidence_interval
+from pneuopt.identification.tolerances import UNIDENTIFIABLE_DEVIATION
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import write_text
@@ -37,13 +46,6 @@ from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-REACHED_ROOM = (
-    0.02  # share of a limit's width [1] within which it counts as active: less misses what a sample just missed
-)
-SHOWN_BLOCKS = 8  # of a run [1], in its summary: more fill a screen, and a controller plays the file
-USEFUL_RATIO = 1.5  # times that a target's interval shrinks [1], below which the run is hardly worth its time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -269,10 +271,6 @@ def _join(low: float, high: float) -> str:
     return f"{low:.{digits}g}{TIED}to {high:.{digits}g}"
 
 
-_LARGEST = 6
-"""Power of the sum that stands for the largest [1]: with a higher one a search sees the worst alone, and is slow."""
-
-
 class Criterion(Protocol):
     """What a planned experiment is to make small."""
 
@@ -401,13 +399,7 @@ class WantedPrecision:
         """See `Criterion`."""
         with np.errstate(invalid="ignore"):
             ratios = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)) / np.array(list(self.wanted.values()))
-            return np.asarray(np.sum(ratios**_LARGEST, axis=-1) ** (1 / _LARGEST))
-
-
-STATE_RIDGE = 1e-6  # information about a node's state that is always there, in nominal sizes: only keeps it invertible
-SINGULAR = 1e-13
-"""Share of the largest information about a start state [1] below which it is rounding: more keeps what is none."""
-UNINFORMED = 1e-12  # the same of the parameters [1]: less takes rounding for knowledge
+            return np.asarray(np.sum(ratios**LARGEST, axis=-1) ** (1 / LARGEST))
 
 
 def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int = 0) -> Array:

@@ -20,7 +20,8 @@ from pneuopt.dynamics.system import names
 from pneuopt.evaluation.scenarios import draws as draw_plants
 from pneuopt.evaluation.scenarios import further, generator
 from pneuopt.experiments.design import Criterion, DOptimal, ExperimentDesign
-from pneuopt.experiments.search import MIN_BLOCK_SAMPLES, DesignSearch, Judge, Limits, PlannedRun, value_size
+from pneuopt.experiments.search import DesignSearch, Judge, Limits, PlannedRun, value_size
+from pneuopt.experiments.tolerances import MAX_SAMPLES, MAX_WRONG, MIN_BLOCK_SAMPLES
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, check_names, require
@@ -30,10 +31,6 @@ from pneuopt.shooting.least_squares import CpuBudget
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-MAX_SAMPLES = 1_000_000  # of a run: more take minutes a candidate
-MAX_WRONG = 0.5  # relative standard deviation [1] of a draw: wider ones are other plants than the one in hand
 
 
 def next_experiment(

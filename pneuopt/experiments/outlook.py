@@ -12,6 +12,7 @@ from pneuopt.control.reference import Reference
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.requirements import larger_is_better, metric_name, requirement_values
 from pneuopt.evaluation.specification import Objective, Specification, specify
+from pneuopt.experiments.tolerances import SLACK
 from pneuopt.identification.tracking import Tracking
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -20,10 +21,6 @@ from pneuopt.quantities.results import Shown
 
 if TYPE_CHECKING:
     from datetime import datetime
-
-
-SLACK = 1e-3
-"""Share of a limit that counts as kept: a design that was tuned lies on its limits."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -24,9 +24,36 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.experiments.design import Criterion, ExperimentDesign, linked_information, tabulate_design
+from pneuopt.experiments.tolerances import (
+    ALL_BLOCKS,
+    ALL_BLOCKS_SPREAD,
+    AMPLITUDES,
+    BATCH_SAMPLES,
+    BEGIN_SHARE,
+    BLOCKS,
+    CHIRP_RATIO,
+    COPIED_BLOCK,
+    CYCLES_A_SAMPLE,
+    FREQUENCIES,
+    FRESH_BLOCK,
+    LEAST_AMPLITUDE,
+    LEVEL_SHARE,
+    MIN_BLOCK_SAMPLES,
+    MIN_GAIN,
+    MIN_SUBSTEPS,
+    MOST_REPEATS,
+    ONE_BLOCK,
+    PART_SHARE,
+    QUIET_CYCLES,
+    QUIET_ROUNDS,
+    ROUNDS_A_SPREAD,
+    SPREADS,
+    VAGUE,
+    VARIATIONS,
+)
 from pneuopt.identification.logged_loop import REFERENCE_CHANNELS
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import InputError, ModelError, require
@@ -37,20 +64,6 @@ from pneuopt.quantities.units import write_value
 from pneuopt.shooting.least_squares import CpuBudget, LeastSquares
 from pneuopt.shooting.segments import Segments, gap_scales, segment, stable_substeps, start_nodes
 from pneuopt.shooting.transcription import Phase, Transcription
-
-LEVEL_SHARE = 0.15
-"""Share of a block [1] in which the excitation moves smoothly to its level: less knocks the axis, more wastes time."""
-CHIRP_RATIO = 4.0  # of a chirp's last to its first frequency: less is a sine, more hurries past each
-AMPLITUDES = 10  # amplitudes of the library: fewer miss the edge of sticking, which the refinement finds again
-FREQUENCIES = 8  # frequencies of the library: as for the amplitudes
-LEAST_AMPLITUDE = 3e-4
-"""Share of the range [1] of the smallest wave: smaller ones drown in noise, and presliding motion needs this one."""
-ONE_BLOCK, ALL_BLOCKS, FRESH_BLOCK, COPIED_BLOCK = 0.6, 0.75, 0.9, 0.95
-"""Shares [1], each up to the next, of the kinds of change of a run; the rest moves blocks. The first kind refines, the
-others lead out of where it ends."""
-ALL_BLOCKS_SPREAD = 0.15
-"""By how much less blocks move that move together [1]: as far as one alone, hardly any change is for the better."""
-CYCLES_A_SAMPLE = 0.08  # of the highest frequency [1]: a faster wave has corners that the controller cannot play
 
 
 class Wave(Enum):
@@ -201,8 +214,6 @@ def vary_run(
     return changed
 
 
-BATCH_SAMPLES = 400_000  # samples simulated at once: more take memory (100 bytes a sample and signal), fewer lanes
-MIN_SUBSTEPS = 8  # integration steps a sample: fewer miss how a bristle lets go
 Limits = Mapping[str, tuple[float, float]]
 
 
@@ -404,22 +415,6 @@ class PlannedRun:
 
 
 _SEVERAL_INPUTS = "a planned run excites one input, the plant has {}; plan it with a friction model that needs one"
-
-
-BLOCKS = 8  # of the shortest run: more are refined longer, fewer make poorer mixtures
-MOST_REPEATS = 4  # times that the shortest run fits into the duration: more make runs without slow motions
-BEGIN_SHARE = 0.08  # of the time [1] for each of the lengths a search begins with: less tells them apart wrongly
-PART_SHARE = 0.6  # of the time left [1] for a part of the run: more leaves none to mend what its repetition spoils
-MIN_BLOCK_SAMPLES = 50  # of a block: shorter ones hold no slow motion
-VARIATIONS = 12  # of a block at once, in SIMD lanes: more are better and take longer
-SPREADS = (0.5, 0.2, 0.08)
-"""Of a change [1], in turn: the largest leave an optimum that is not the best, the smallest find its bottom."""
-ROUNDS_A_SPREAD = 3  # changes of each of them, over the number of blocks: fewer do not find what they can
-QUIET_CYCLES = 2  # cycles over all spreads without a gain of `MIN_GAIN`, after which a search has ended
-QUIET_ROUNDS = 2  # exchanges of each block of the start: a third one changes none
-MIN_GAIN = 0.01  # of the criterion [1] over a cycle: less is not worth the time
-VAGUE = 10.0
-"""Relative standard deviation [1] of what nothing tells, which keeps covariances finite: less passes for knowledge."""
 
 
 @dataclass(frozen=True, eq=False)

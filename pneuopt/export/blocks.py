@@ -21,6 +21,7 @@ from pneuopt.control.sensor import REFERENCE_SPEED, Encoder, SensorLag
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.export.makers import BLOCK_FORMS, Block, BlockDesign, BlockForm, Setting, number, standard_times, wire
 from pneuopt.export.program import check_sampled
+from pneuopt.export.tolerances import RANGE_MARGIN, SHEET_WIDTH
 from pneuopt.export.writer import check_name, comment_text
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -28,7 +29,6 @@ from pneuopt.quantities.units import difference_unit, write_value
 
 COMPARED_METRICS = {"SettlingTime": "s", "Overshoot": "%", "SteadyStateError": "%"}
 """What the two are compared by, and its unit."""
-SHEET_WIDTH = 116  # [character] of the sheet's sentences
 BLIND_LIMITS = "its limits, and its integral with them, do not see the sum with what is added behind it"
 MECHANICAL_UNITS = {"N": "newtons", "N*m": "newton metres"}
 """Units of a command that no output module has: the amplifier's scale lies between."""
@@ -276,9 +276,6 @@ def _advice(own: ClosedLoop, values: ParameterSet) -> list[str]:
     kind = f'  anti_windup = "{own.pid.anti_windup.value}"'
     weights = [f"  {n} = {values.value(f'pid.{n}'):g}" for n in ("b", "c")]
     return [*([kind] if own.pid.limits else []), *weights, *(['  Tf = "0 s"'] if values.value("pid.Tf") == 0 else [])]
-
-
-RANGE_MARGIN = 1.0  # travels of the references that the process value's range goes beyond them, at either end
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from pathlib import Path
 import casadi as ca
 
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
+from pneuopt.export.tolerances import ZIP_DATE
 from pneuopt.export.writer import check_name
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 
-ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # of the files in an FMU: the same model makes the same bytes
 _MADE_AT, _TOKEN = re.compile(r' generationDateAndTime="[^"]*"'), re.compile(r'instantiationToken="([^"]*)"')
 _DESCRIPTION = "modelDescription.xml"
 

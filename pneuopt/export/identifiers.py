@@ -9,8 +9,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Mapping
 
-MAX_IDENTIFIER = 40
-"""Length of a name [character]: Rockwell's controllers cut longer ones (1756-PM012, "Tag names"), C99 takes 63."""
+from pneuopt.export.tolerances import MAX_IDENTIFIER
 
 
 def _words(text: str) -> frozenset[str]:

@@ -20,10 +20,20 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.dynamics.system import FRICTION_DIRECTION
 from pneuopt.export.identifiers import RESERVED_FILES, Identifiers, reserved_as
 from pneuopt.export.program import CENTRE, ControllerProgram, Variable, controller_program
+from pneuopt.export.tolerances import (
+    DROPOUT,
+    GAP,
+    LARGEST_LITERAL,
+    LONGEST_GAP,
+    RISE,
+    RUN_SAMPLES,
+    RUN_TOLERANCE,
+    SELECT,
+    SMALLEST_LITERAL,
+)
 from pneuopt.export.writer import (
     ARITHMETIC,
     COMPARED,
-    SELECT,
     Binding,
     Header,
     Names,
@@ -41,13 +51,6 @@ from pneuopt.export.writer import (
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-
-RUN_SAMPLES = 200
-"""Of a test's run: fewer than some 50 pass no limit and no pulse, many more make a long file."""
-RUN_TOLERANCE = 1e-12
-"""Of the largest output: what sums in another order may differ by, after a run of `RUN_SAMPLES`."""
-_DROPOUT, _GAP, _LONGEST_GAP = 60, 100, 30  # samples: while the measured signal rises, and after
-_RISE = 25.0  # samples in which the measured signal follows: fewer hide the integral, more hide the approach
 
 
 @dataclass(frozen=True)
@@ -74,10 +77,10 @@ def make_reference_run(program: ControllerProgram) -> ReferenceRun:
     k = np.arange(RUN_SAMPLES)
     size = _step_size(program)
     reference = np.where((k >= 5) & (k < 150), size, -0.3 * size)
-    measured = size * (1 - np.exp(-np.maximum(k - 5, 0) / _RISE)) + 0.02 * size * np.sin(0.9 * k)
+    measured = size * (1 - np.exp(-np.maximum(k - 5, 0) / RISE)) + 0.02 * size * np.sin(0.9 * k)
     others = [size * np.sin(0.1 * (n + 1) * k) for n in range(len(program.inputs) - 2)]
     count = {v.name: v.value for v in program.parameters}["fault_samples"]
-    measured[_DROPOUT] = measured[_GAP : _GAP + int(min(count, _LONGEST_GAP)) + 1] = np.nan
+    measured[DROPOUT] = measured[GAP : GAP + int(min(count, LONGEST_GAP)) + 1] = np.nan
     inputs = np.column_stack([reference, measured, *others])
     return ReferenceRun(inputs, run_program(program, inputs)[:, 0])
 
@@ -248,10 +251,6 @@ def _number(value: float) -> str:
 
 _WHOLE = "LINT_TO_LREAL(LREAL_TO_LINT({0}))"
 _TANH = "(1.0 - 2.0 / (EXP(2.0 * MAX(-20.0, MIN(20.0, {0}))) + 1.0))"  # beyond 20 it is 1 in 16 digits
-LARGEST_LITERAL = 1e38
-"""In place of infinity: some compilers refuse an LREAL's literal that is no REAL (matiec, issue 12), from 3.4E38 on."""
-SMALLEST_LITERAL = 1e-37
-"""In place of what is nearer to zero: below 1.2E-38 those compilers refuse it, and zero would divide by zero."""
 
 
 class _StructuredTextSyntax(Syntax):

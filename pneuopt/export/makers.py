@@ -11,13 +11,13 @@ from enum import Enum
 from typing import NamedTuple
 
 from pneuopt.control.pid import ParallelForm
+from pneuopt.export.tolerances import MINUTE, OPEN_END, OPEN_LIMIT, PLAIN_WEIGHT, TIME_GRAIN, USUAL_UPDATE
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.units import difference_unit, write_value
 
 BEHIND_OFFSET = "Behind the block: offset"
 BEHIND_FACTOR = "Behind the block: factor"
 """Settings of what the user's own program does with a block's output: ``wire = offset + factor output``."""
-PLAIN_WEIGHT = 0.5  # [1] of the set-point weights 0 and 1 a block takes the nearer one
 
 
 @dataclass(frozen=True)
@@ -312,8 +312,6 @@ SIEMENS_FORM = BlockForm(
 """PID_Compact as of V2: 0 % of its output is made the centre, as it gives 0 % whenever it does not control."""
 
 
-MINUTE = 60.0  # [s], the unit of times of PIDE
-USUAL_UPDATE = 0.01  # [s], where the update times of PID begin that are usual
 LOGIX_PID = "Rockwell PID"
 
 
@@ -460,7 +458,6 @@ ROCKWELL_FORM = BlockForm(
 """PID, and PIDE where it can run the design: in percent of the spans of PV and CV."""
 
 
-OPEN_END = 1e38  # an end of the output that is never reached, where the other end is a limit
 UTIL_PID = "CODESYS Util.PID_FIXCYCLE"
 
 
@@ -531,9 +528,6 @@ CODESYS_FORM = BlockForm(
 """PID_FIXCYCLE of the library Util, and PD where there is no integral; their Y_OFFSET is the centre."""
 
 
-TIME_GRAIN = 1e-3
-"""What IEC 61131-3's TIME counts in on most controllers [s]: times of a block are rounded to it."""
-OPEN_LIMIT = 1e38  # what the block is delivered with: no limit
 FB_CTRL_PID = "Beckhoff FB_CTRL_PID"
 
 

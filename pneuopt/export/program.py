@@ -12,6 +12,7 @@ from pneuopt.control.pid import BAD_SAMPLES
 from pneuopt.control.sensor import Encoder, Signals
 from pneuopt.dynamics.system import Symbols, symbols
 from pneuopt.export.identifiers import Identifiers
+from pneuopt.export.tolerances import UNNAMED_CONSTANTS
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
 
@@ -49,7 +50,6 @@ STATE_MEANINGS: Mapping[str, str] = {
 }
 FAULT = "fault"
 _NOT_READ = ("measured_read", "output_read")
-_UNNAMED_CONSTANTS = (0.5, 1.0, 2.0)  # sample times [s] that are found in many formulas, where their name would mislead
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class ControllerProgram:
     @property
     def constants(self) -> Mapping[float, str]:
         """Constants that have a name."""
-        return {} if self.sample_time in _UNNAMED_CONSTANTS else {self.sample_time: "SAMPLE_TIME"}
+        return {} if self.sample_time in UNNAMED_CONSTANTS else {self.sample_time: "SAMPLE_TIME"}
 
 
 def controller_program(controller: Controller, parameters: ParameterSet, centre: float = 0.0) -> ControllerProgram:

@@ -16,21 +16,18 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from pneuopt.control.controller import LARGEST_SIGNAL, Controller
+from pneuopt.control.controller import Controller
 from pneuopt.control.pid import integrates, to_series, to_standard
+from pneuopt.control.tolerances import LARGEST_SIGNAL
 from pneuopt.dynamics.compiled.c_writer import DIVISIONS, Instruction, read_instructions
 from pneuopt.export.identifiers import Identifiers
 from pneuopt.export.program import C_NAMES, ControllerProgram
+from pneuopt.export.tolerances import MAX_BLOCK_NAME, MAX_COMMENT, MAX_INLINE, SELECT
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import provenance
 from pneuopt.quantities.units import difference_unit, unit_ratio, write_value
 
-MAX_INLINE = 70
-"""Length of an expression that stands within another [character]: a longer one gets a name of its own; below some 40
-each operation has a line, above some 100 lines are too long to read."""
-
-SELECT = -1  # the operation "where a condition holds, this, else that", which CasADi has in four parts
 COMPARISONS = frozenset({ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE})
 LOGIC = frozenset({ca.OP_NOT, ca.OP_AND, ca.OP_OR})
 STEPS = COMPARISONS | {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_SIGN}  # operations that jump: a rounding before them may show
@@ -445,11 +442,7 @@ def write_program_text(
     )
 
 
-MAX_BLOCK_NAME = 40
-"""Length of a block's name [character]: some controllers cut longer ones."""
 _COMMENT_MARKS = re.compile(r"\*/|/\*|\(\*|\*\)|//|\"\"\"|'''|\?\?|\\|<!|--|\$")
-MAX_COMMENT = 200
-"""Length of a text that comes from a file [character]: longer ones fill the header with another's words."""
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from pneuopt.files.loop import (
     read_spreads,
     signal_units,
 )
+from pneuopt.files.tolerances import CHECKSUM_DIGITS, MAX_CHANGES
 from pneuopt.files.toml import read_toml, toml_table
 from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning_table
 from pneuopt.quantities.errors import UnitError
@@ -47,10 +48,6 @@ Parts = dict[str, Entries]
 
 CHECKSUM = "checksum"
 """The section of a tuned.toml that binds its certificate to what it is about."""
-DIGITS = 12
-"""Significant digits of a number in the checksum: fewer miss an edit, more depend on the last bit of a conversion."""
-MAX_CHANGES = 8
-"""Changes that are told one by one, at most: more bury the first; a fit of other logs changes every estimate."""
 
 
 @dataclass(frozen=True)
@@ -284,7 +281,7 @@ class _Writer:
         """Both values, " (2 V -> 3 V)"; nothing of digests."""
         if _is_digest(was) or _is_digest(now):
             return ""
-        for digits in (6, DIGITS):
+        for digits in (6, CHECKSUM_DIGITS):
             texts = [self._write(name, text, digits) for text in (was, now)]
             if texts[0] != texts[1]:
                 break
@@ -373,7 +370,7 @@ def _number(value: float, unit: str = "") -> str:
 
     It is hexadecimal, so that whoever replaces a gain's digits in the whole file does not replace the certified ones.
     """
-    rounded = float(f"{value:.{DIGITS}g}") + 0.0  # -0.0 becomes 0
+    rounded = float(f"{value:.{CHECKSUM_DIGITS}g}") + 0.0  # -0.0 becomes 0
     return f"{rounded.hex()} {'' if unit == '1' else unit}".strip()
 
 

@@ -17,6 +17,7 @@ import tomlkit
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import System
+from pneuopt.files.tolerances import COVARIANCE_ROUNDING
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.identification.checkup import AMBIENT_PRESSURE, DRIVE_FILE, Assumption
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -176,9 +177,6 @@ def _word(value: bool | str) -> str:
 FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
-COVARIANCE_ROUNDING = 1e-8
-"""Asymmetry of a covariance, over the deviations of its row and column [1]: a file that was rounded by hand; more
-is another matrix."""
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
 _DRIVE_SECTION = {"drive": {"kind": KIND_KEY}}
 

@@ -14,10 +14,11 @@ from pneuopt.dynamics.system import System
 from pneuopt.evaluation.moves import ExcitationRun
 from pneuopt.files.drive import FIT_SECTIONS, default_parameters, drive_keys
 from pneuopt.files.keys import Template, json_schema
-from pneuopt.files.loop import SAMPLE_TIME, signal_units, tuning_keys
+from pneuopt.files.loop import signal_units, tuning_keys
 from pneuopt.files.outputs import output_schema
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
+from pneuopt.files.tolerances import COMMENT_WIDTH, DIGITS, SAMPLE_TIME, SAMPLES_A_DITHER_PERIOD, SWEEP
 from pneuopt.files.tuning import TUNED_SECTIONS
 from pneuopt.logs.columns import CHANNELS, SIDECAR_KEYS, plant_channels
 from pneuopt.models.catalog import CATALOGUE_SOURCE
@@ -29,9 +30,6 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.units import write_value
 
 BAND, OVERSHOOT, SENSITIVITY = "2 %", "5 %", 1.6  # what a first tuning asks for: usual, and within reach of most drives
-SWEEP = (0.8, 1.0, 1.2)  # of a first study's parameter, times its value: near enough that one design may hold
-_DIGITS = 6
-_SAMPLES_A_DITHER_PERIOD = 5  # of a slow controller, for which the usual dither would be too fast
 _EXAMPLE_SPREAD = 'distribution = "normal", spread = "5 %"'
 _OTHER_FILES = ("drive", "tuning", "study", "rig")
 
@@ -155,14 +153,14 @@ def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, 
     given = loop.parameters.with_values({f"pid.{n}": value for n, (value, _, _) in first.gains.items()})
     given = given.with_bounds({f"pid.{n}": (low, high) for n, (_, low, high) in first.gains.items()})
     ends = (0.0, 2 * first.limit) if counts_from_zero else (-first.limit, first.limit)
-    sample_time = write_value(loop.pid.sample_time or 0.0, "s", _DIGITS)
+    sample_time = write_value(loop.pid.sample_time or 0.0, "s", DIGITS)
     stated = {"pid.form": '"parallel"', "pid.sample_time": _quote(sample_time)}
     stated |= {f"pid.{n}": _value_text(given[f"pid.{n}"], free=True, bounds=True) for n in first.gains}
     stated["pid.limits"] = "[" + ", ".join(_quote(write_value(end, command)) for end in ends) + "]"
     if first.dither is not None:
         frequency, most = first.dither
-        frequency = min(frequency, 1.0 / (_SAMPLES_A_DITHER_PERIOD * (loop.pid.sample_time or SAMPLE_TIME)))
-        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz", _DIGITS))}
+        frequency = min(frequency, 1.0 / (SAMPLES_A_DITHER_PERIOD * (loop.pid.sample_time or SAMPLE_TIME)))
+        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz", DIGITS))}
         least = {"amplitude": 0.0, "offset": -most}
         free = {n: Parameter(0.0, command, lower, most) for n, lower in least.items()}
         stated |= {f"dither.{n}": _value_text(p, free=True, bounds=True) for n, p in free.items()}
@@ -276,7 +274,7 @@ def _value_text(p: Parameter, *, free: bool = False, bounds: bool = False) -> st
 
 
 def _number_text(value: float, unit: str) -> str:
-    text = write_value(value, unit, _DIGITS)
+    text = write_value(value, unit, DIGITS)
     return text if unit == "1" else _quote(text)
 
 
@@ -285,7 +283,6 @@ def _quote(text: str) -> str:
 
 
 PLAYED_FILE, RUN_FILE = "moves.csv", "run.toml"  # not one name: run.toml would be taken for the sidecar of run.csv
-_COMMENT_WIDTH = 108  # characters of a line of comment
 
 
 def run_files(run: ExcitationRun, drive: str = "drive.toml") -> dict[str, str]:
@@ -324,7 +321,7 @@ def _head(run: ExcitationRun, drive: str) -> list[str]:
         f"Then: pneuopt identify {drive} LOG -o fit.toml",
         f"Simulated on the drive as guessed: pneuopt simulate {drive} {RUN_FILE} -o predicted.csv",
     )
-    return [f"# {line}" for part in text for line in textwrap.wrap(part, _COMMENT_WIDTH, subsequent_indent="  ")]
+    return [f"# {line}" for part in text for line in textwrap.wrap(part, COMMENT_WIDTH, subsequent_indent="  ")]
 
 
 def _loop(run: ExcitationRun) -> Iterator[str]:

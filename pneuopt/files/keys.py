@@ -12,6 +12,7 @@ from pneuopt.files.drive import drive_keys
 from pneuopt.files.loop import tuning_keys
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
+from pneuopt.files.tolerances import COMMENT_COLUMN, MAX_WIDTH, SHARED_BY
 from pneuopt.logs.columns import SIDECAR_KEYS
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import UnitError
@@ -26,7 +27,6 @@ FILE_MEANINGS: Mapping[str, str] = {
     "log.toml": "the sidecar of log.csv: it has the log's name",
 }
 _SIGNAL_WORDS = {"command": "command", "measured": "measured", "difference": "measured", "position": "position"}
-_SHARED_BY = 3  # requirements that have the same key: one row stands for all
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def _merge_shared(sections: Mapping[str, Key]) -> Iterable[tuple[str, Key]]:
     done = set()
     for name, key in walked:
         shape = _shape(name, key) if name.count(".") == 2 else None
-        if shape is None or counts[shape] < _SHARED_BY:
+        if shape is None or counts[shape] < SHARED_BY:
             yield name, key
         elif shape not in done:
             done.add(shape)
@@ -254,7 +254,6 @@ _FORMS: Mapping[Takes, Callable[[Key], dict[str, Any]]] = {
 }
 
 
-COMMENT_COLUMN, MAX_WIDTH = 44, 110  # characters: a comment begins there, or above its key where the line is too long
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 
 

@@ -18,18 +18,20 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.gain_schedule import SCHEDULED_GAINS, GainSchedule
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.moves import Move, MoveProfile
-from pneuopt.control.pid import FAULT_SAMPLES, PID, AntiWindup, Form
+from pneuopt.control.pid import PID, AntiWindup, Form
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
+from pneuopt.control.tolerances import FAULT_SAMPLES
 from pneuopt.dynamics.hooks import Axis
-from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
+from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.metric import Band, Requirement, Tolerance
 from pneuopt.evaluation.requirements import REQUIREMENT_KINDS, SettlingTime, StepEnvelope
 from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.scenarios import DISTRIBUTIONS, TOGETHER, Distribution, Sampling, Spread
 from pneuopt.files.drive import ambient_pressure
+from pneuopt.files.tolerances import MAX_CASES, MAX_OPTION, SAMPLE_TIME
 from pneuopt.files.toml import construct_at, read_parameter
 from pneuopt.quantities.errors import InputError, UnitError, check_names, require
 from pneuopt.quantities.keys import (
@@ -48,12 +50,6 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import count_gauge_from, difference_unit, read_value, write_value
 from pneuopt.tuning.method import Method
 from pneuopt.tuning.tune import METHODS
-
-MAX_CASES = 20_000
-"""Plants or cells that a file may ask for [1]: more take days and gigabytes; fewer refuse a map of 100 by 100."""
-MAX_OPTION = 1_000_000
-"""A whole number among a method's options [1]: a thousand times more fill the memory; fewer refuse a long search."""
-
 
 REQUIREMENTS_BY_KEY: Mapping[str, type[Requirement]] = {
     re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in REQUIREMENT_KINDS
@@ -555,8 +551,6 @@ TUNING_KEYS: Mapping[str, Key] = {
 """All sections; the parameters of the loop's parts come beside the keys of their sections."""
 
 
-SAMPLE_TIME = 1e-3
-"""Of a first controller, and of usual values that count in samples [s]: a common one; longer ones slow a loop down."""
 _CONDITIONS = {"Tt": "with limits, for back-calculation", "reset_band": "with reset_ratio"}
 _SECTION_CONDITIONS = {
     "position_loop": "where a position is controlled",

@@ -14,7 +14,6 @@ from pneuopt.evaluation.scenarios import SampleSpreads, corners
 from pneuopt.files.drive import ambient_pressure, read_fit
 from pneuopt.files.loop import (
     CORNERS_KEY,
-    MAX_CASES,
     SAMPLE_KEYS,
     SAMPLED_KEY,
     SAMPLES_KEY,
@@ -22,6 +21,7 @@ from pneuopt.files.loop import (
     read_sample_spreads,
     read_spreads,
 )
+from pneuopt.files.tolerances import DEFAULT_POINTS, MAX_CASES
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, check_sections, flag, read_table, table
@@ -200,7 +200,6 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], CaseSource], Cases]] = {
 
 
 _AXIS_EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
-_DEFAULT_POINTS = 9  # designs of a front: each is a tuning, so more take long; fewer hide the bend
 _RANGE_KEYS: Mapping[str, Key] = {
     "from": Key("first value", unit="{own}", required=True, example='"2 kg"'),
     "to": Key("last value", unit="{own}", required=True, example='"8 kg"'),
@@ -253,7 +252,7 @@ STUDY_KEYS: Mapping[str, Key] = {
                 of=Key("a requirement", Takes.TEXT),
                 counts=(2, 2),
             ),
-            "points": Key("designs of the front", Takes.COUNT, usual=_DEFAULT_POINTS, least=2, most=MAX_CASES),
+            "points": Key("designs of the front", Takes.COUNT, usual=DEFAULT_POINTS, least=2, most=MAX_CASES),
             "lower": Key("where the second ends; by default the least that can be", unit="{own}", example='"100 N"'),
             "upper": Key("where it begins; by default the tuning's limit", unit="{own}", example='"250 N"'),
         },

@@ -11,19 +11,18 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.moves import MotionPath, Move, MoveSequence
 from pneuopt.control.reference import Reference, Step
 from pneuopt.dynamics.runnable import command_centre
-from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
+from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.metric import Requirement
-from pneuopt.evaluation.plants import PLANT_COUNT
 from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, further, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
+from pneuopt.evaluation.tolerances import PLANT_COUNT
 from pneuopt.files.loop import (
     ACCEPT_KEY,
     BUDGET_KEYS,
     LIMIT_KEYS,
-    MAX_CASES,
     MOVE_KEYS,
     PATH_KEYS,
     REFERENCE_KEYS,
@@ -40,6 +39,7 @@ from pneuopt.files.loop import (
     read_spreads,
     signal_units,
 )
+from pneuopt.files.tolerances import MAX_CASES
 from pneuopt.files.toml import construct_at, read_toml
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.errors import InputError, check_names, require

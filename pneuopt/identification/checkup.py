@@ -38,6 +38,7 @@ from pneuopt.identification.problem import (
     outputs_in_log,
 )
 from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, Verdict
+from pneuopt.identification.tolerances import MAX_PERCENT, MIN_PERCENT
 from pneuopt.logs.doctor import LogFinding, Severity, evidence, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise
@@ -162,11 +163,6 @@ MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "ex
 """Names of findings that no check of the log doctor makes: by the model's equations, of what was mended in a log, of
 parameters of which none is free, and of two columns that are exchanged."""
 OTHER_CHECKS = (MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK)
-MIN_PERCENT = 0.1
-"""Standard deviation over the value [%] below which the model's errors count, and not the noise: a lower one promises
-what no rig keeps, a higher one hides what quiet sensors give."""
-MAX_PERCENT = 100.0
-"""Standard deviation over the value [%] beyond which its digits say nothing."""
 _NUMBER_AND_UNIT = re.compile(r"(?<=\d) (?=(?:[a-zA-Z]?(?:m|s|N|V|g|Hz|Pa|bar|rad|J|K|W)|%)(?![a-z]))")
 _TONES = {Severity.FAULT: Tone.BAD, Severity.DOUBT: Tone.DOUBTFUL, Severity.NOTE: Tone.PLAIN}
 

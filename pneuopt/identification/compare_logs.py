@@ -13,6 +13,7 @@ from pneuopt.identification.identify import identify
 from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.problem import as_estimation_model, as_experiments, check_logs
 from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.tolerances import DISAGREEMENT_DEVIATIONS, MIN_RELATIVE_DIFFERENCE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -22,13 +23,6 @@ from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
     import pandas as pd
-
-# standard deviations between a log's own estimate and the others' from which they disagree: lower blames chance, higher
-# misses another load
-DISAGREEMENT_DEVIATIONS = 4.0
-# relative difference [1] that a disagreement must exceed, too: lower takes the bias of a model for another drive, whose
-# intervals do not hold it; higher misses a small change of the drive
-MIN_RELATIVE_DIFFERENCE = 0.02
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -26,6 +26,7 @@ from pneuopt.identification.problem import (
     check_logs,
     find_centre,
 )
+from pneuopt.identification.tolerances import CHANGE, MIN_FORCE_SHARE, MIN_STOP_FORCE, STOP_DEPTH
 from pneuopt.logs.doctor import PISTON, LogFinding, StatedAxis, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
@@ -128,18 +129,6 @@ def accept_remedy(finding: LogFinding) -> str:
 def _find(system: Fittable, experiments: Iterable[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:
     for experiment in experiments:
         yield from examine(experiment, stated_axis(system.plant, experiment, parameters))
-
-
-CHANGE = 1e-3
-"""Change of a parameter [of its value, or of its unit] by which forces are seen to depend on it: smaller drowns in
-rounding, larger leaves the range in which hardware is possible."""
-STOP_DEPTH = 1e-3
-"""Depth beyond a limit of the position [m] at which a model's end stop pushes back: less is rounded, more breaks it."""
-MIN_FORCE_SHARE = 1e-3
-"""Force of a signal over the largest one's [1] from which it counts: lower asks for a position where stops are rounded,
-higher forgets soft springs."""
-MIN_STOP_FORCE = 10.0
-"""Force [N] by which a model's end stop pushes back at that depth at least: lower takes a spring for a stop."""
 
 
 def stated_axis(plant: System, experiment: Experiment, parameters: ParameterSet) -> StatedAxis:

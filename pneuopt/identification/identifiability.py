@@ -27,42 +27,33 @@ from pneuopt.identification.result import (
     summarise_motion,
     with_values_in_words,
 )
+from pneuopt.identification.tolerances import (
+    HARMLESS_DEVIATION,
+    INFORMATION_ROUNDING,
+    MAX_EXPECTED_DEVIATION,
+    MAX_INFLATION,
+    MAX_INVERSE_SINGULAR,
+    MAX_PRIOR_DEVIATION,
+    MAX_PRIOR_VARIANCE_SHARE,
+    MAX_REDUCTION_SEGMENTS,
+    MAX_RELATIVE_DEVIATION,
+    MIN_COMBINATION_SHARE,
+    REJECTION_CONFIDENCE,
+    UNIDENTIFIABLE_DEVIATION,
+)
 from pneuopt.identification.widths import excerpts
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.shooting.least_squares import Fit, LeastSquares
-from pneuopt.shooting.segments import MAX_SEARCH_SUBSTEPS, Segments, choose_integration, segment, start_nodes
+from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
+from pneuopt.shooting.tolerances import MAX_SEARCH_SUBSTEPS
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Standard deviations relative to the value (or per e-fold of a logarithm):
-HARMLESS_DEVIATION = 0.01  # a combination known better does no harm; larger hides some, smaller names needless groups
-MAX_LINEAR_DEVIATION = 0.15  # of a log parameter: beyond it the likelihood is no parabola, and the interval is profiled
-MAX_RELATIVE_DEVIATION = 0.3  # beyond it a number is only rough; larger lets it pass unmarked, smaller marks good ones
-MAX_EXPECTED_DEVIATION = 1.0  # before a fit, beyond it a parameter is unidentifiable: a fit need not be tried
-UNIDENTIFIABLE_DEVIATION = 10 / 3  # after a fit: beyond it a factor of ten about the value is as good as the logs
 MAX_RELATIVE_INTERVAL = 4 * MAX_RELATIVE_DEVIATION  # width of a profile's interval over the value: rough beyond it
 
-# Combinations of parameters:
-MAX_INFLATION = 30.0  # times that a standard deviation shrinks if the others were known: beyond it parameters act alike
-MIN_COMBINATION_SHARE = 0.3  # of a weak combination's largest part: smaller names parameters that hardly take part
-INFORMATION_ROUNDING = 1e-9  # root of information, relative to the largest: smaller takes rounding for information
-MAX_INVERSE_SINGULAR = 1e9  # inverse singular values, at most: larger are rounding
-
-# Parameters that were held, with a weak prior about their values:
-# share of an estimate's variance [1] that the priors may make up: with more, the estimate rests on them and not on the
-# logs; a lower limit marks estimates that the logs do identify
-MAX_PRIOR_VARIANCE_SHARE = 0.1
-# standard deviation over the value [1] up to which such an estimate is identified all the same: a factor of ten in what
-# is held moves it by no more; higher hands out numbers that are the prior's, lower withholds friction known to 1 %
-MAX_PRIOR_DEVIATION = 0.1
-# confidence level [1] of the likelihood-ratio test that rejects held values: higher keeps wrong values, lower rejects
-# right ones by chance
-REJECTION_CONFIDENCE = 0.95
-
-MAX_REDUCTION_SEGMENTS = 2000  # segments whose sensitivities are reduced together: more at once take memory, fewer time
 
 UNIDENTIFIED = "the logs do not identify"
 VAGUER_THAN_PRIOR = "its standard deviation is as wide as a factor of ten"

@@ -65,7 +65,8 @@ from pneuopt.quantities.parameters import (
 )
 from pneuopt.quantities.status import Code, Progress, ProgressReporter, Status, provenance
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, CpuBudget, Fit, LeastSquares, solve_least_squares
+from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, solve_least_squares
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 if TYPE_CHECKING:
     import pandas as pd

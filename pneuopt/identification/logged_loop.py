@@ -19,6 +19,7 @@ from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Enco
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import DiscreteSystem, Motion, Symbols, System, define, names
+from pneuopt.identification.tolerances import DIFFERENTIATION_WINDOW, SAMPLE_TIME_TOLERANCE
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
@@ -28,11 +29,6 @@ MOTION = ("speed", "position")  # signals of which one follows from the other wh
 REFERENCE_CHANNELS = {"speed": "speed_reference", "position": "position_reference"}
 UNSEEN_STATES = ("pid.command", "pid.previous_error", "pid.transfer", "pid.bad_samples")
 CONTROLLER_ACTS = "controller_acts"  # 1 at the log's samples at which the controller computes, 0 in between
-# difference of a log's time from the controller's, in sample times [1]: smaller refuses rounded times, larger takes
-# samples of another moment
-SAMPLE_TIME_TOLERANCE = 1e-3
-# samples over which a position is differentiated where the fed-back speed is not logged: fewer are noisy, more lag
-DIFFERENTIATION_WINDOW = 21
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,22 +11,23 @@ from typing import Protocol
 
 import numpy as np
 
-from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem, outputs_in_log
+from pneuopt.identification.problem import EstimationProblem, outputs_in_log
+from pneuopt.identification.tolerances import (
+    ESTIMATE_CHANGE_TOLERANCE,
+    MAX_REFITS,
+    MIN_WEIGHT,
+    NOISE_CHANGE_TOLERANCE,
+    OUTLIER_THRESHOLD,
+    REFIT_STAGES,
+)
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import noise_level
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, Fit, LeastSquares, solve_least_squares
-
-MAX_REFITS = 12  # refits with new weights, at most: fewer leave the weights unsettled, more cost time
-# standard deviations that an estimate may still move from refit to refit: smaller takes more refits, larger stops early
-ESTIMATE_CHANGE_TOLERANCE = 0.05
-NOISE_CHANGE_TOLERANCE = 0.02  # relative change of a noise level [1] from refit to refit, likewise
-MIN_WEIGHT = 1e-8  # least weight of a sample [1]: zero would divide its noise by zero, a larger one lets outliers count
-# residual over its channel's scale [1] of an outlier: one in 16 000 samples of normal noise; lower counts noise
-OUTLIER_THRESHOLD = 4.0
+from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 
 class Loss(Protocol):

@@ -35,34 +35,35 @@ from pneuopt.dynamics.system import names
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log, window_runs
 from pneuopt.identification.result import Mark, join_names
 from pneuopt.identification.statistics import agreement
-from pneuopt.identification.widths import SIGNIFICANT_FALL
+from pneuopt.identification.tolerances import (
+    ASSUMED_SHARE,
+    GATE_LEVEL,
+    HARMLESS_SHIFT,
+    LEAST_TIME_DOF,
+    LEFT_OUT_REGULARISATION,
+    LEVEL,
+    MAX_MISFIT,
+    MAX_NRMSE,
+    MIN_LOG_DOF,
+    MIN_SIGNAL_SPREAD,
+    MIN_TIME_DOF,
+    MODEL_ERROR_LEVEL,
+    MOTION_BLOCKS,
+    MOTION_CLASSES,
+    MOTION_LEVEL,
+    SIGNIFICANT_FALL,
+    SIMULATIONS,
+    SLOW_RATIO,
+    TIME_BLOCKS,
+)
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.filters import FitScores, fit_scores
-from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, Fit, Optimum, solve_least_squares
+from pneuopt.shooting.least_squares import Fit, Optimum, solve_least_squares
 from pneuopt.shooting.segments import Segments, segment
-
-# blocks of time at the finest level, halved twice: more miss slow residuals, fewer leave hardly a degree of freedom
-TIME_BLOCKS = 24
-# probability [1] that chance makes the clusters disagree so much, below which intervals are widened: higher widens
-# those of exact models, lower leaves a slow misfit unseen
-GATE_LEVEL = 0.05
-# degrees of freedom [1] that a level needs to count: with fewer its intervals are wide whatever the residuals are
-MIN_TIME_DOF, MIN_LOG_DOF = 3.0, 1.3
-# degrees of freedom [1] with which the best level counts where none has enough: fewer make an interval of nothing,
-# more trust a parameter that one moment of the log determines
-LEAST_TIME_DOF = 2.0
-# share of the whole information [1] that is added to what is left without a cluster: smaller lets a cluster that alone
-# determines a parameter have a change without limit, larger hides its weight
-LEFT_OUT_REGULARISATION = 1e-3
-# information that every cluster counts as having, in its average share [1]: less lets scores count that hardly tell
-# anything, more hides a disagreement of short clusters
-ASSUMED_SHARE = 0.1
-SIMULATIONS = 40  # of white residuals: fewer misjudge what chance does, more cost time
-SLOW_RATIO = 2.0  # variance by the coarsest blocks over that by the finest [1] that shows a misfit as slow as the log
-LEVEL = 0.95  # of the intervals by which the levels are compared [1]
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,26 +307,6 @@ def _is_slow(coarse: Spread, fine: Spread) -> bool:
 def _distinct(levels: Sequence[Clusters]) -> list[Clusters]:
     """The levels without those of as many clusters as one before: halving ends at one cluster a log."""
     return [c for i, c in enumerate(levels) if c.count not in [known.count for known in levels[:i]]]
-
-
-# classes of a simulated signal, equally full: more see finer effects with less certainty
-MOTION_CLASSES = 6
-# blocks of time over which the means of the residuals by class scatter: fewer have little power, more are correlated
-MOTION_BLOCKS = 32
-# probability [1], over all signals and outputs, below which residuals depend on a signal: higher blames chance, lower
-# misses stick-slip that the model smooths
-MOTION_LEVEL = 0.001
-# residuals in noise standard deviations [1] from which most of their power is an error of the model: a lower one blames
-# the model for noise that a log states too low, a higher one trusts intervals of wrong models
-MODEL_ERROR_LEVEL = 2.0
-# residuals in standard deviations of the stated noise [1] beyond which there is no interval: the parameters of a model
-# that misses so much are not those of the drive, and how far they are off is not in the residuals. Sensors at the wrong
-# place have left 26 to 49, friction that depends on load or position 2 to 8
-MAX_MISFIT = 20.0
-# the same over the channel's own variation [1], where the noise is estimated: that of a fine encoder is far below what
-# any model explains
-MAX_NRMSE = 0.2
-MIN_SIGNAL_SPREAD = 1e-6  # spread of a signal over its size [1]: a smaller one is rounding, and has no classes
 
 
 @dataclass(frozen=True, eq=False)
@@ -611,11 +592,6 @@ def _clusters(scores: FitScores, groups: Indices, *, simulate: bool = False) -> 
     np.add.at(sums, groups, scores.scores)
     by_chance = scores.simulate_white(SIMULATIONS, groups) if simulate else None
     return Clusters(sums, scores.information(groups), scores.optimum.equations.segments.phase[first], by_chance)
-
-
-# change of an estimate by a rejected width, in its deviations [1], up to which it is no bias: a 95 % interval that is
-# shifted by half a deviation still holds the truth 92 times in 100; lower marks what does no harm
-HARMLESS_SHIFT = 0.5
 
 
 class RejectedWidth(NamedTuple):

@@ -25,7 +25,17 @@ from pneuopt.dynamics.hooks import FinalElement, Log, Start
 from pneuopt.dynamics.runnable import Fittable, HasSystem, as_runnable, centre_name
 from pneuopt.dynamics.system import DiscreteSystem, add_slopes, append_slopes, names
 from pneuopt.identification.logged_loop import LoggedLoop
-from pneuopt.identification.result import MOVING_SPEED_SHARE, IdentificationResult
+from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.tolerances import (
+    MAX_BRIDGE,
+    MAX_NOISE_FACTOR,
+    MAX_REST_DISTANCE,
+    MIN_EXCURSION,
+    MIN_RUN,
+    MOVING_SPEED_SHARE,
+    RANGE_TOLERANCE,
+    STATIC_SEGMENTS,
+)
 from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise, noise_level
@@ -42,9 +52,6 @@ from pneuopt.quantities.parameters import (
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import Fit, LeastSquares
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
-
-STATIC_SEGMENTS = 100  # segments of a static map's log: fewer make uneven blocks of time, more cost time
-REFIT_STAGES = 3  # last stages of a method that a refit runs, near its answer: more cost time, fewer may not converge
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,9 +214,6 @@ def apply_conditions(parameters: ParameterSet, experiment: Experiment) -> Parame
         raise InputError(f"{experiment.name}: condition {error}") from None
 
 
-# Factor [1] between a stated noise level and the one that the log shows: a smaller one doubts good estimates of short
-# logs and of noise that is not white, a larger one lets intervals through that are too narrow.
-MAX_NOISE_FACTOR = 3.0
 FOREIGN_CHANNELS = "channels"  # the name by which channels that no plant reads are accepted, and left out
 # What a fit cannot do without, by the names of the checks, and why no user can accept it.
 NEEDED = {
@@ -369,12 +373,6 @@ def outputs_in_log(system: Fittable, experiment: Experiment) -> tuple[str, ...]:
     return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)
 
 
-# Missing samples in a row that are bridged: with more an input that swings is wrong between its ends; with fewer a log
-# that loses a block now and then falls apart, and each part has a start state to be found.
-MAX_BRIDGE = 10
-MIN_RUN = 10  # samples with an output between two holes: fewer hardly find the start state of a part, more lose data
-
-
 def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Intersample]:
     """How each of the system's inputs runs between two samples of a log: as the log says, or as is usual."""
     said = experiment.intersample
@@ -490,13 +488,6 @@ def _bridge(log: Trajectory, behaviour: dict[str, Intersample], lost: Mask) -> d
 def _longest_run(mask: Mask) -> int:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return int(np.max(edges[1::2] - edges[::2]))
-
-
-# distance of the resting command from the middle of its range, over half the range [1]: higher takes a valve that holds
-# a load for one with another centre, lower misses a wide dead zone
-MAX_REST_DISTANCE = 0.2
-RANGE_TOLERANCE = 0.02  # by which noise may leave the range, over half the range [1]; higher takes other ranges for it
-MIN_EXCURSION = 0.02  # to both sides of the middle, over half the range [1]; lower takes one-way logs for two-way ones
 
 
 def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> ParameterSet:

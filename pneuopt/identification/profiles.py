@@ -18,6 +18,14 @@ from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model, check_logs
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.statistics import confidence_interval
+from pneuopt.identification.tolerances import (
+    DELTA_METHOD_STEP,
+    END_TOLERANCE,
+    MAX_LOG_PROBE,
+    MAX_LOG_STEP,
+    MAX_REFITS_A_SIDE,
+    REFIT_ITERATIONS,
+)
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
@@ -29,15 +37,6 @@ from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-MAX_REFITS_A_SIDE = 14  # refits on one side of the estimate: more cost time, fewer leave an end open that is not
-# how closely an end is surrounded, relative to its distance from the estimate, or the deviance's root at a refit, to
-# the level's: smaller takes more refits, larger interpolates the end from farther off
-END_TOLERANCE = 0.02
-MAX_LOG_STEP = 1.5  # e-folds of a log parameter between two refits: larger steps lose the optimum of the others
-MAX_LOG_PROBE = 0.3  # e-folds over which the curvature at the estimate is measured: farther away it differs
-REFIT_ITERATIONS = 40  # iterations of a refit, at most: fewer leave its cost too high, and the interval too narrow
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -324,8 +323,6 @@ def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePo
 
 
 ParameterValues = Mapping[str, float]
-# standard deviations over which a slope is taken: larger steps see curvature, smaller ones rounding
-DELTA_METHOD_STEP = 1e-3
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 
 from pneuopt.dynamics.hooks import Excitation, Lack, LoggedMotion
+from pneuopt.identification.tolerances import INFINITE_INFLATION, MAX_FIT_ROWS, MOVING_SPEED_SHARE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
@@ -28,13 +29,6 @@ from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-# inflation of a standard deviation [1] from which "nothing separates them" is shown: lower hides useful figures, higher
-# shows rounding
-INFINITE_INFLATION = 1e5
-MAX_FIT_ROWS = 12
-"""Rows of a table of logs: of more, the median and the worst are easier to read."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -444,9 +438,6 @@ class Mark(StrEnum):
 
 
 _VALUE_IN_WORDS = re.compile(r"<(?:([\d.]+) )?(\w+)>")
-# share of the largest speed [1] below which a sample counts as standing still: lower takes noise for motion, higher
-# leaves slow motion out
-MOVING_SPEED_SHARE = 0.05
 
 
 def summarise_motion(

@@ -17,13 +17,12 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.identifiability import (
-    MAX_LINEAR_DEVIATION,
     add_profiles,
     add_unidentifiable,
     verdict_from_covariance,
     verdict_from_sensitivities,
 )
-from pneuopt.identification.misfit import MODEL_ERROR_LEVEL, fixed_widths
+from pneuopt.identification.misfit import fixed_widths
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.profiles import Profile, trace_profile
 from pneuopt.identification.result import (
@@ -34,25 +33,34 @@ from pneuopt.identification.result import (
     Verdict,
     join_names,
 )
+from pneuopt.identification.tolerances import (
+    ALIKE_SQUARES,
+    GAP_SUBSTEPS,
+    LAST_TRIAL_ITERATIONS,
+    MAX_FREED_TRIALS,
+    MAX_LINEAR_DEVIATION,
+    MAX_TESTS,
+    MIN_CHANGE,
+    MIN_EXPLAINED_SHARE,
+    MIN_PROMISED_SHARE,
+    MIN_RELATIVE_CHANGE,
+    MIN_REPORTED_GAP,
+    MODEL_ERROR_LEVEL,
+    PROFILE_DRAG_DEVIATIONS,
+    RESIDUAL_BLOCK_SAMPLES,
+    TRIAL_ITERATIONS,
+    WHOLE_SHARE,
+)
 from pneuopt.identification.widths import advise_widths
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
 from pneuopt.shooting.equations import segment_gaps
-from pneuopt.shooting.least_squares import MAX_CHI_SQUARE_RATIO, Fit, SearchEnd, solve_least_squares, start_search
+from pneuopt.shooting.least_squares import Fit, SearchEnd, solve_least_squares, start_search
 from pneuopt.shooting.segments import segment, start_nodes
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-# standard deviations that another parameter moves along a profile, beyond which it is profiled, too: lower costs time,
-# higher leaves wrong linear intervals
-PROFILE_DRAG_DEVIATIONS = 3.0
-RESIDUAL_BLOCK_SAMPLES = 50  # samples of a block of residuals: fewer show single outliers, more blur the time span
-GAP_SUBSTEPS = (
-    20  # integration steps a sample for the gaps that are shown: fewer add integration errors, more cost time
-)
-MIN_REPORTED_GAP = 1e-4  # of a state's nominal size: smaller gaps are integration errors, larger ones point to a fault
 
 
 def review_fit(
@@ -291,26 +299,6 @@ def _worst_gap(problem: EstimationProblem, start: Start) -> str:
     )
 
 
-# share of the misfit [1] that a freed value must explain by the linearised equations to be tried: lower tries what does
-# not help, higher passes over what is far off
-MIN_PROMISED_SHARE = 0.5
-# the same by a fit, to be named: lower blames a value for an error of the model, higher misses it beside another one
-MIN_EXPLAINED_SHARE = 0.8
-# iterations of a stage of a trial, and of its last one again where the equations by then promise enough: a value that
-# explains the logs takes 17 in all, more are lost on what does not
-TRIAL_ITERATIONS, LAST_TRIAL_ITERATIONS = 4, 10
-MAX_FREED_TRIALS = 2  # values that are tried: more take time, fewer miss one whose promise is not the largest
-MAX_TESTS = 2  # fits of one problem that are tested: more take time, fewer miss what the first one is too far off for
-# change of a value in its deviations [1] below which it is not wrong: lower blames chance
-MIN_CHANGE = 4.0
-# the same over the given value [1]: lower names what a scale or a data sheet leaves open, and what a friction law that
-# is a little wrong asks for (1.3 % of the mass, where a Coulomb law meets a Stribeck curve)
-MIN_RELATIVE_CHANGE = 0.03
-# share of the misfit [1] from which a value explains all of it: others are then tried only if they promise as much
-WHOLE_SHARE = 0.98
-# squared residuals above the best trial's, in variances of its residuals, up to which logs do not tell two values
-# apart: lower names one of two by chance, higher names what fits worse
-ALIKE_SQUARES = 20.0
 # what a user knows better than any value of a rig: of values that logs do not tell apart, it is named last
 NATURE = ("ambient.", "gas.")
 

@@ -59,40 +59,42 @@ from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.identifiability import rejects_held_values, rests_on_prior, verdict_from_sensitivities
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
-from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem, outputs_in_log
+from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.profiles import Profile
 from pneuopt.identification.result import IdentificationResult, Mark
+from pneuopt.identification.tolerances import (
+    ACCEPTED_CHI_SQUARE_RATIO,
+    BEST,
+    DECIDING,
+    EXCERPT_SEGMENTS,
+    GAP_FACTOR,
+    GUESS_BOUND_WIDTH,
+    GUESS_STAGES,
+    HOPELESS_MISFIT,
+    LEVELS,
+    MAX_BELOW_DEVIATIONS,
+    MAX_CLOSED_MISFIT,
+    MAX_CLOSED_SHARE,
+    MAX_COST,
+    MAX_SEGMENTS,
+    MAX_STAGES,
+    MIN_DOUBTED,
+    MIN_EXCESS,
+    MIN_LENGTH_RATIO,
+    PART_SEGMENTS,
+    REFIT_STAGES,
+    SAME_COST_RATIO,
+    SAME_MISFIT_RATIO,
+    SHORT_ITERATIONS,
+)
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.equations import ParameterScaling
-from pneuopt.shooting.filters import GATHERED_DEVIATION, PredictionErrors, filter_nodes
-from pneuopt.shooting.least_squares import (
-    MAX_CHI_SQUARE_RATIO,
-    MAX_GAP_SHARE,
-    BudgetSpentError,
-    Fit,
-    LeastSquares,
-    SearchEnd,
-    solve_least_squares,
-)
+from pneuopt.shooting.filters import PredictionErrors, filter_nodes
+from pneuopt.shooting.least_squares import BudgetSpentError, Fit, LeastSquares, SearchEnd, solve_least_squares
 from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
-
-GUESS_STAGES = 3  # stages of a search with guesses held: more force a wrong guess on the log, fewer rank starts wrongly
-# squared residuals a sample after the first stage or before the last, in noise variances, beyond which the first start
-# waits for the others: lower settles all starts of a model that misses the log a little, higher follows hopeless starts
-# to their end
-HOPELESS_MISFIT = 3.0
-# relative width of the bounds that hold a guess; equal bounds would compile other equations than those of the search
-GUESS_BOUND_WIDTH = 1e-9
-# squared residuals a sample, in noise variances, up to which no other start is tried: below 1 every start would be
-# tried, while a wrong basin of soft bristles has left 1.1
-ACCEPTED_CHI_SQUARE_RATIO = 1.05
-# cost of a settled start over that of the first one after as many stages [1] up to which the guess is not what is
-# wrong: lower settles all starts of a wrong model, higher takes another basin for the same
-SAME_MISFIT_RATIO = 1.02
-
-MIN_DOUBTED = 2  # fits after which the problem is doubted: fewer doubt it for one bad start, more take time
+from pneuopt.shooting.tolerances import GATHERED_DEVIATION, MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
 
 Candidate = tuple[EstimationProblem, Fit, str]
 
@@ -428,12 +430,6 @@ def _are_enough(fits: Sequence[Candidate]) -> bool:
     return is_wrong or are_alike(best, second) or explains_to_noise(held, best)
 
 
-# excess of a parameter over another one that bounds it [1] below which another start is tried: lower takes a basin that
-# has lost it for the answer, higher searches drives twice that have as good as none
-MIN_EXCESS = 0.03
-SAME_COST_RATIO = 1.001  # costs of two fits up to which both are one optimum; lower, and rounding makes two of it
-
-
 def is_optimum(fit: Fit) -> bool:
     """Whether a search ended at an optimum, be it of a model so wrong that the gaps absorb its misfit."""
     is_settled = not (fit.unsettled or fit.unidentifiable)
@@ -477,10 +473,6 @@ def are_alike(best: Fit, second: Fit) -> bool:
         and same
         and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
     )
-
-
-# iterations with tight gaps that long logs get before a part of them is tried: more cost time, fewer leave easy logs
-SHORT_ITERATIONS = 10
 
 
 def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], Candidate]) -> Candidate:
@@ -592,14 +584,6 @@ def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> 
     return replace(held, method=problem.method), fit.with_effort_of(settled), rough.label
 
 
-# segments of an excerpt: fewer may lack motion that a parameter needs, more cost time
-EXCERPT_SEGMENTS = 1000
-# length of a log, over that of an excerpt, from which on it has one: lower spends more on excerpts than they save,
-# higher searches long logs from a rough start
-MIN_LENGTH_RATIO = 2.5
-MAX_SEGMENTS = 20_000  # of logs whose states are filtered one node after the other: more take longer than they save
-
-
 def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
     """The problem with an excerpt in place of each long log.
 
@@ -692,16 +676,8 @@ def _cut(problem: EstimationProblem, experiment: Experiment) -> Experiment:
     return replace(experiment, trajectory=run.rows(begin, begin + count), source=None)
 
 
-# segments of all logs that the filter follows: fewer may lack motion that a parameter needs, more cost time
-PART_SEGMENTS = 300
 # a parameter over the one that bounds it [1]: finer and wider ones cost time, others miss the valley
 RATIOS = np.geomspace(1.1, 2.4, 8)
-BEST = 4  # sets that descend: fewer end in a side minimum, more cost time
-# deviation that the states gather along a segment, in nominal sizes, the steps at most, and the sets that go on
-LEVELS = ((1e-3, 4, 2), (3e-4, 6, 1), (1e-4, 6, 1), (3e-5, 6, 1))
-# cost a sample at which no set goes on [1]: lower gives up what would lead to the noise (.9), higher follows a wrong
-# model; and the least deviation gathered at which it counts, for with less of it a lost slip costs a right set as much
-MAX_COST, DECIDING = 1.3, 3e-4
 
 
 def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit | None:
@@ -793,15 +769,6 @@ def _liveliest(segments: Segments, problem: EstimationProblem) -> Indices:
     return np.concatenate(parts)
 
 
-# squared residuals over the noise's [1], and the gaps' share of them [1], above which a model does not follow whole
-# logs, so that windows are tried: lower cuts logs that it follows but for a sensor's lag (60 and .17), higher iterates
-# for a plant that runs away from its log (.9)
-MAX_CLOSED_MISFIT, MAX_CLOSED_SHARE = 100.0, 0.3
-# gap of each stage over that of the one before [1]: lower leaves an optimum too far off, higher takes more stages
-GAP_FACTOR = 0.3
-MAX_STAGES = 3  # more weigh gaps until nothing else counts but rounding, fewer leave a misfit in them
-
-
 def fit_with_closed_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:
     """The fit with tighter gaps, where a search has ended at an optimum whose gaps absorb the misfit.
 
@@ -863,11 +830,6 @@ def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[P
         return better
     verdict = f"{found.name} fits better at {value:.4g} {found.unit}, from where the search finds no better optimum"
     return replace(fit, status=Status(Code.NOT_CONVERGED, (verdict, "try other start values, or fix a parameter")))
-
-
-# deviations [1] by which one estimate lies below another that bounds it, beyond which the model is wrong: lower blames
-# chance, higher passes friction that no drive has
-MAX_BELOW_DEVIATIONS = 4.0
 
 
 def hold_order(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:

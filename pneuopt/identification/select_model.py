@@ -38,6 +38,15 @@ from pneuopt.identification.identify import check_options, identify, validate
 from pneuopt.identification.problem import EstimationProblem, as_experiments
 from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult, remedy
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
+from pneuopt.identification.tolerances import (
+    HOPELESS_RATIO,
+    JUMPING_WINDOW_SAMPLES,
+    LEADER_RATIO,
+    MAX_HELD_OUT_RATIO,
+    MAX_TRIALS,
+    NESTED_TEST_LEVEL,
+    TIE,
+)
 from pneuopt.identification.widths import COMMON_WIDTH
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, UnknownNameError, require
@@ -54,7 +63,6 @@ if TYPE_CHECKING:
 # gaps and iterations of a trial: with tighter gaps, or more iterations, it takes as long as a search; with looser ones
 # a wrong model looks as good as a right one
 TRIAL_STAGES = (Stage(3e-3, 12), Stage(1e-3, 8), Stage(1e-4, 12))
-MAX_TRIALS = 3  # starts of a model that are tried: fewer may miss the right basin, more take as long as a search
 
 
 @dataclass(frozen=True)
@@ -160,17 +168,6 @@ def _try_start(problem: EstimationProblem, start: Start, allowed: Sequence[float
             return replace(trial, squares=math.inf, ratio=least / enough)
         start = problem.start_from(fit)
     return trial
-
-
-# samples of a window where candidates jump from segment to segment and none has chosen one: fewer hardly tell models
-# apart, with more all gather so much misfit that no search settles
-JUMPING_WINDOW_SAMPLES = 20
-# squares of a trial over the least of all [1], up to which the simplest candidate leads: lower lets idle terms lead,
-# higher a model that does not follow the logs
-LEADER_RATIO = 1.1
-# squares that a short search promises over the leader's [1] above which a candidate is hopeless: lower gives up models
-# that a whole search may save, higher searches for minutes what comes out last
-HOPELESS_RATIO = 4.0
 
 
 @dataclass(frozen=True)
@@ -405,17 +402,6 @@ def _with_widths(candidate: Candidate, widths: Mapping[str, float]) -> Candidate
     every = {name for width in known for name in (width.name, *width.follows)} & own.keys() & widths.keys()
     edits = {n: replace(own[n], value=widths[n], source=COMMON_WIDTH) for n in every}
     return replace(candidate, parameters=own | ParameterSet(edits))
-
-
-# probability [1] below which a likelihood-ratio test rejects the simpler model: higher keeps terms that are chance,
-# lower drops weak true ones
-NESTED_TEST_LEVEL = 0.01
-# difference of the BIC [1] below which held-out runs, or simplicity, decide: a ratio of the likelihoods of 20 (Kass and
-# Raftery 1995); higher lets few samples decide, lower takes chance for evidence
-TIE = 6.0
-# held-out NRMSE over a simpler model's [1] above which the richer one is not recommended: higher recommends models that
-# predict worse, lower lets noise decide
-MAX_HELD_OUT_RATIO = 1.02
 
 
 @dataclass(frozen=True, eq=False, repr=False)

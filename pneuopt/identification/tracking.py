@@ -26,6 +26,7 @@ from scipy.stats import t as student
 
 from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.tolerances import HISTORIES, MIN_LOGS, POWERS, WEEK
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import as_tuple
@@ -34,12 +35,6 @@ from pneuopt.quantities.results import Shown
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-MIN_LOGS = 4
-"""Logs from which a drift is tested [1]: three leave one degree of freedom, with which nothing is significant."""
-HISTORIES = 40_000
-"""Drawn histories: fewer make the level of a look uncertain by more than a tenth, more take seconds."""
 
 
 @dataclass(frozen=True)
@@ -169,11 +164,6 @@ def _p_values(times: tuple[float, ...], drift: float, count: int) -> Array:
     slope = xy[:, late] / xx[late]
     left = np.maximum(yy[:, late] - slope * xy[:, late], 0) / (n[late] - 2)
     return np.asarray(2 * student.sf(np.abs(slope) / np.sqrt(left / xx[late]), n[late] - 2))
-
-
-WEEK = 604800.0  # [s]
-POWERS = (0.8, 0.9)
-"""Probabilities [1] with which the drift is seen after the logs that the power calculation names."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

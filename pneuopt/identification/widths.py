@@ -16,15 +16,26 @@ from math import inf, sqrt
 import numpy as np
 
 from pneuopt.dynamics.hooks import Width
-from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.identification.problem import EstimationProblem, known_runs
 from pneuopt.identification.result import ChosenWidth
+from pneuopt.identification.tolerances import (
+    CONFIRMING_STAGES,
+    EXCERPTS,
+    FORESEEN_RATIO,
+    MAX_HIDING_SHARE,
+    MAX_TRIAL_SAMPLES,
+    MAX_WIDENED_MISFIT,
+    MIN_RELATIVE_FALL,
+    SIGNIFICANT_FALL,
+)
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.equations import weigh_gaps
 from pneuopt.shooting.least_squares import BudgetSpentError, Fit, LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.segments import MAX_SEARCH_SUBSTEPS, choose_integration, segment, stable_substeps, start_nodes
+from pneuopt.shooting.segments import choose_integration, segment, stable_substeps, start_nodes
+from pneuopt.shooting.tolerances import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.transcription import Transcription
 
 CHOSEN_WIDTH = "chosen by identify from the logs"
@@ -36,25 +47,6 @@ COMMON_WIDTH = "common to all candidates"
 # gaps and iterations of a trial: with tighter gaps, or more iterations, it takes as long as a search; with looser gaps,
 # or fewer, a wrong width looks as good as a right one
 TRIAL_STAGE = Stage(3e-3, 6)
-# stages of the method that confirm another width: with fewer a search that has not settled counts as a wrong width,
-# with more it takes as long as a search
-CONFIRMING_STAGES = 4
-MAX_TRIAL_SAMPLES = 8000  # of all logs: more take time and tell no more, fewer may leave out where a log sticks
-EXCERPTS = 4  # stretches in which a longer log is tried: fewer may miss where it sticks, more are short
-# foreseen cost over that with the given width [1], below which no search with tight gaps confirms a narrower one:
-# higher trusts equations far from their optimum, lower takes minutes where a sample takes a hundred integration steps
-FORESEEN_RATIO = 0.5
-# fall of the squared residuals that counts, in variances (chi-square with one degree of freedom exceeds it once in a
-# thousand); lower follows chance, higher keeps wrong widths
-SIGNIFICANT_FALL = 10.8
-# fall of the cost that counts [1]; lower takes integration errors for a better width, higher keeps wrong widths
-MIN_RELATIVE_FALL = 2e-3
-# width over what it hides [1], above which it is narrowed even where the cost does not fall: above .25 a rounded edge
-# shifts the dead zone that it is fitted with
-MAX_HIDING_SHARE = 0.25
-# squared residuals over the noise's [1] up to which a wider one counts: above it the model lacks something that a wide
-# one would hide, as viscous friction that is held at zero; below 2 the tails of the noise alone refuse it
-MAX_WIDENED_MISFIT = 4.0
 
 
 @dataclass(frozen=True, eq=False)

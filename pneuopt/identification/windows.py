@@ -19,25 +19,21 @@ from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_m
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.result import ChosenWindow
 from pneuopt.identification.search import fit_holding_unidentifiable
+from pneuopt.identification.tolerances import (
+    FIRST_ITERATIONS,
+    MIN_KNOWN_SHARE,
+    MIN_WINDOW_SAMPLES,
+    MIN_WINDOWS,
+    NEXT_ITERATIONS,
+    WINDOW_FACTOR,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import MAX_GAP_SHARE, Fit, close_gaps
+from pneuopt.shooting.least_squares import Fit, close_gaps
 from pneuopt.shooting.segments import choose_integration, segment, start_nodes
-
-# measured samples of the shortest window that is tried: with fewer its start states take most of what it tells, with
-# more a plant that runs away quickly is not followed
-MIN_WINDOW_SAMPLES = 20
-MIN_WINDOWS = 12  # windows of all logs: with fewer the scatter between parts is a guess, more leave out long ones
-# share of the parameters that windows must determine to better than their own size [1]: short windows with starts of
-# their own follow any smooth log, also one of another plant, and a lower share takes that for an answer; with a higher
-# one an offset that is zero forbids windows
-MIN_KNOWN_SHARE = 0.5
-# iterations in the first windows, which begin where a search of whole logs has failed, and in the next ones, which
-# begin with the answer of those twice as long: fewer leave what would converge, more are lost where one window creeps
-FIRST_ITERATIONS, NEXT_ITERATIONS = 60, 30
-WINDOW_FACTOR = 2.0  # from one length to the next [1]: lower takes more fits, higher may pass over the best
+from pneuopt.shooting.tolerances import MAX_GAP_SHARE
 
 Windowed = tuple[EstimationProblem, Fit, ChosenWindow]
 

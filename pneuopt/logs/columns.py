@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from pneuopt.logs.table import EMPTY_CELL, Table
+from pneuopt.logs.tolerances import MAX_MAGNITUDE, MAX_NAME_PARTS, MAX_ROWS_SHOWN, MIN_SAMPLES
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, table
@@ -41,15 +42,6 @@ COLUMN_KEYS: Mapping[str, Key] = {
 }
 """The table of a channel: which column it is, and how that is converted."""
 
-MIN_SAMPLES = 10
-"""The fewest samples of a log: with fewer its noise level is a guess; a larger bound refuses logs that are enough."""
-MAX_MAGNITUDE = 1e30
-"""Magnitude of a sample in the file's unit [1]: more is the 9.91e37 by which instruments say overload; a smaller bound
-refuses counts."""
-MAX_ROWS_SHOWN = 20
-"""Rows that a message lists [1]: more fill the screen, fewer leave repeated stamps to be found one a run."""
-MAX_NAME_PARTS = 8
-"""Words of a column's name that are compared with channels [1]: each costs a search; no channel has more than three."""
 
 _SYNONYMS = {"t": "time", "velocity": "speed", "displacement": "position", "voltage": "valve_voltage"}
 _BRACKETED_UNIT = re.compile(r"(.+?)\s*\[\s*(.*?)\s*\]|(.+?)\s+\((.+)\)")

@@ -39,16 +39,63 @@ from numpy.typing import NDArray
 
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import find_resolution, noise_level
+from pneuopt.logs.tolerances import (
+    CLIPPED_SHARE,
+    FAST_PERCENTILE,
+    LAG_STEPS,
+    LARGE_SHARE,
+    LARGEST_NOISE,
+    LEAST_SPEED,
+    LEAST_WAY,
+    LOWER_QUARTILE,
+    MAX_ATMOSPHERE_ERROR,
+    MAX_COMMAND_LAG,
+    MAX_HATS,
+    MAX_MASS_FACTOR,
+    MAX_NET_TRAVEL_SHARE,
+    MAX_NOISE_SHARE,
+    MAX_PHASE_STEP,
+    MAX_PISTON_SPEED,
+    MAX_PRESSURE,
+    MAX_SENSOR_LAG,
+    MAX_SLOPE_NOISE_SHARE,
+    MAX_STEPS_BETWEEN,
+    MAX_UNEXPLAINED,
+    MAX_WHITE_LAG,
+    MEAN_BLOCKS,
+    MIN_CONTRADICTION,
+    MIN_HATS,
+    MIN_JUMP_ACCELERATION,
+    MIN_JUMP_NOISE,
+    MIN_JUMP_SPEED_RATIO,
+    MIN_OFFSET_SHARE,
+    MIN_PRESSURE_RATIO,
+    MIN_RESIDUAL_FACTOR,
+    MIN_SPEED_CORRELATION,
+    MIN_SPLINE,
+    MIN_STOP_FORCE_RATIO,
+    MIN_STOP_SAMPLES,
+    MIN_STOP_TIME,
+    MIN_VIEW_SAMPLES,
+    MIN_WORK_SHARE,
+    MOST_MOTION,
+    NEIGHBOURS,
+    NOISE_WIDTHS,
+    RECIPROCATING_TRAVEL_RATIO,
+    ROD_AREA_RATIOS,
+    SHORTEST_DWELL,
+    SPEED_SLOPE_RATIOS,
+    STATED_STOP_SHARE,
+    STILL_STEPS,
+    STOP_SHARE,
+    STOP_WIDTH,
+    USUAL_SPEED_QUANTILE,
+    VIEW_STROKES,
+    WRONG_SIGN_CORRELATIONS,
+)
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, write_value
-
-LARGE_SHARE = 0.1
-"""Share of a signal's largest value [1] beyond which its sign counts: lower counts noise, higher misses reversals."""
-VIEW_STROKES = 1.0
-"""Strokes to either side of an instant that a figure shows: with fewer a wrong sign looks like a lag, more blur it."""
-MIN_VIEW_SAMPLES = 25
-"""Samples to either side of an instant that its figure shows: fewer look like noise."""
 
 
 class StatedAxis(NamedTuple):
@@ -221,35 +268,6 @@ def view_about(t: Array, at: int, motion: Array | None = None) -> tuple[float, f
         half = VIEW_STROKES * duration / (1 + int(np.count_nonzero(np.diff(side))))
     half = max(half, MIN_VIEW_SAMPLES * float(np.median(np.diff(t))))
     return max(float(t[0]), float(t[at]) - half), min(float(t[-1]), float(t[at]) + half)
-
-
-MIN_RESIDUAL_FACTOR = 2.0
-"""Residual with the stated value over that with the log's own [1]: lower blames values for what no model has, higher
-leaves wrong ones to the fit, which ends in a misfit."""
-MAX_UNEXPLAINED = 0.15
-"""Residual of the balance over the spread of the force [1] up to which it says something: higher lets a balance speak
-that holds for nothing, lower skips noisy forces."""
-MIN_CONTRADICTION = 0.1
-"""Residual with the stated value over the spread of the force [1] that is worth a word: lower blames a light mass whose
-force the sensors' lags hide, and a right one that sticks and slips, as its friction falls while it speeds up (6 % of
-the force); higher passes wrong ones in slow motion."""
-MAX_MASS_FACTOR = 1.5
-"""Factor [1] by which a stated mass may be off: lower blames what lags of sensors do, higher passes a lost carriage."""
-MIN_OFFSET_SHARE = 0.2
-"""Offset over friction [1] that is worth a word: lower speaks of every sensor, higher passes what moves estimates."""
-MAX_ATMOSPHERE_ERROR = 0.2
-"""Share [1] by which an offset may miss one atmosphere on the difference of a piston's areas: lower forgets gauge
-pressures on a log with noise, higher blames their unit for another force."""
-MAX_NOISE_SHARE = 2e-3
-"""Share of the accelerations' variance [1] that noise may have: higher makes masses small, lower blurs fast motion."""
-MIN_HATS = 30
-"""Windows each way [1] that a balance needs: fewer fit any mass."""
-MAX_PHASE_STEP = 0.25
-"""Phase of the motion from sample to sample [rad]: higher leaves lags of a part of a sample, which look like a mass."""
-LAG_STEPS = 20
-"""Lags each way that are tried: fewer leave a lag of milliseconds, which looks like a mass under viscous friction."""
-MAX_HATS = 2000
-"""Windows that are used of a log [1]: more cost time and say the same."""
 
 
 class Balance(NamedTuple):
@@ -475,20 +493,6 @@ def _forces(experiment: Experiment, axis: StatedAxis, found: Balance) -> Evidenc
     return evidence(part, Panel(axis.force_unit, curves), speed, at=at, motion=rows.speed)
 
 
-MOST_MOTION = 0.5
-"""Share of a log in motion [1] below which it is one of moves and dwells: higher notes every log that pauses."""
-LEAST_SPEED, LEAST_WAY = 0.01, 0.002
-"""Speed and way over the log's largest [1] of a move: lower counts flicker, higher loses slow, short ones."""
-NOISE_WIDTHS, LOWER_QUARTILE = 4.0, 0.3186
-"""Standard deviations of noise beyond which a speed is motion [1], fewer find moves in noise; and how many of them the
-lower quartile of noise alone is."""
-FAST_PERCENTILE, LARGEST_NOISE = 98, 0.1
-"""Percentile of the speeds that is fast motion, and share of it [1] that noise may have: a higher percentile takes two
-jumps of a sensor for moves, a larger share motion of all speeds for noise."""
-SHORTEST_DWELL = 0.05
-"""Rest [s] during which a move goes on: a shorter one counts a move that sticks on its way as two."""
-
-
 def check_dwells(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Note a log that stands still most of the time: which share is motion, and what is identified from it."""
     t, motion = experiment.trajectory.t, motion_speed(experiment, axis)
@@ -522,21 +526,6 @@ def _find_moves(t: Array, size: Array) -> list[tuple[int, int]]:
     travelled = size * np.gradient(t)  # in the time of each sample
     ways = [float(travelled[first:last].sum()) for first, last in spans]
     return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > LEAST_WAY * max(ways)]
-
-
-MIN_STOP_FORCE_RATIO = 2.5
-"""Push at rest at an end over what holds or moves the body elsewhere [1]: lower takes static friction for a stop,
-higher misses stops under a weak push."""
-MIN_STOP_TIME = 0.05
-"""Time [s] of pushing against a stop: shorter takes a reversal for one, longer misses a bounce."""
-MIN_STOP_SAMPLES = 10
-"""Samples of the same: fewer take noise for a stop, more miss stops in logs of 100 Hz."""
-STOP_WIDTH = 6.0
-"""Noise [1] within which positions at a stop lie: lower cuts a stop in pieces, higher takes slow reversals for one."""
-STOP_SHARE = 2e-3
-"""Share of the way [1] by which a stop gives in: lower misses soft stops, higher takes slow reversals for them."""
-STATED_STOP_SHARE = 0.05
-"""Share of the way [1] by which a stated stop may be off: lower blames a sensor's zero, higher a wrong stroke."""
 
 
 def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -595,20 +584,6 @@ def _longest_run(mask: Mask) -> tuple[int, int]:
         return 0, 0
     longest = int(np.argmax(edges[1::2] - edges[::2]))
     return int(edges[2 * longest]), int(edges[2 * longest + 1]) - 1
-
-
-MIN_JUMP_NOISE = 30.0
-"""Jump over the noise [1]: lower takes outliers and steps of an encoder for jumps, higher misses small ones."""
-MIN_JUMP_SPEED_RATIO = 5.0
-"""Speed of a jump over that of the motion around it, and of most of the log [1]: lower takes short strokes in coarse
-logs for jumps, higher misses jumps of fast motion."""
-MIN_JUMP_ACCELERATION = 500.0
-"""Acceleration [m/s^2] that a jump needs at least, to start and to stop within a sample: short-stroke cylinders reach
-less, higher misses jumps in logs of 100 Hz."""
-NEIGHBOURS = 3
-"""Samples beside a jump that show the motion around it: with fewer an outlier is one, more miss short ones."""
-USUAL_SPEED_QUANTILE = 0.98
-"""Share of a log's samples [1] that move no faster than its usual speed: higher counts the jumps among them."""
 
 
 Indices = NDArray[np.intp]
@@ -671,15 +646,6 @@ def _evidence(experiment: Experiment, axis: StatedAxis, known: Indices, jumps: I
     needed = Panel("m/s", {f"slope of the {axis.position}": speed})
     shown = evidence(experiment, axis.position, needed, where=where, label="jump")
     return replace(shown, view=(max(float(t[0]), begin - margin), min(float(t[-1]), end + margin)))
-
-
-MEAN_BLOCKS = 20
-"""Blocks of a log whose means separate motion from noise: with more their means are noisy, with fewer hide motion."""
-MAX_SENSOR_LAG = 0.02
-"""Time [s] by which one sensor may come later than another: shorter takes a filter's lag in fast motion for a wrong
-sign, longer misses wrong signs of motion at a few hertz."""
-MAX_SLOPE_NOISE_SHARE = 0.1
-"""Share of a slope's variance [1] that noise may have: higher drowns the work in it, lower blurs fast motion."""
 
 
 def motion_speed(experiment: Experiment, axis: StatedAxis) -> Array | None:
@@ -765,15 +731,6 @@ def lagged_ratio(a: Array, b: Array, lag: int) -> float:
     return float(a @ b) / float(a @ a)
 
 
-MIN_PRESSURE_RATIO = 0.3
-"""Lowest pressure over the atmosphere [1] that counts as absolute: no chamber is exhausted further. A lower bound
-lets gauge readings pass, a higher one refuses sensors with an offset."""
-MAX_PRESSURE = 1e7
-"""Pressure [Pa] that no pneumatic drive has, 100 bar; lower blames blow moulding, higher misses units."""
-CLIPPED_SHARE = 0.02
-"""Share of samples at the largest value [1] that looks clipped: lower blames rest, higher misses short clipping."""
-
-
 def check_pressures(experiment: Experiment, _: StatedAxis) -> Iterator[LogFinding]:
     """Find wrong zero points: gauge pressures taken for absolute ones, or the reverse."""
     log = experiment.trajectory
@@ -830,25 +787,6 @@ def check_sampling(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFind
         if name in (axis.position, axis.speed) and 2 < levels < min(50, y.size // 4):
             message = f"{name!r} has only {levels} levels, the resolution is coarse for the motion"
             yield LogFinding(name, message, False, evidence=evidence(experiment, name, at=len(log) // 2))
-
-
-MAX_NET_TRAVEL_SHARE = 0.3
-"""Net travel over path [1] up to which a log counts as one that returns: higher blames lifts, lower skips most logs."""
-MIN_WORK_SHARE = -0.2
-"""Work over the integral of the absolute power [1] below which the sign is wrong: nearer to zero, noise is blamed."""
-ROD_AREA_RATIOS = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0)
-"""Areas of the rod's side over the other's [1]: one of these is near for real cylinders; more hide wrong signs."""
-SPEED_SLOPE_RATIOS = (0.5, 2.0)
-"""Speed over the position's slope [1] that passes: wider lets wrong units pass, inches for centimetres say; narrower
-refuses filtered speeds of fast motion."""
-MIN_SPEED_CORRELATION = 0.7
-"""Correlation [1] of speed and slope from which they are compared: lower compares noise, higher misses short motion."""
-MAX_COMMAND_LAG = 0.1
-"""Time [s] within which a drive's speed follows its valve: longer finds chance correlations, shorter misses drives."""
-WRONG_SIGN_CORRELATIONS = (-0.6, 0.3)
-"""The sign is wrong if the least correlation of command and speed is below the first, the largest below the second."""
-RECIPROCATING_TRAVEL_RATIO = 1.9
-"""Travel over range [1]: at 2 a piston has come back, so it is commanded; a lower bound blames overshoot."""
 
 
 def check_position_speed(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -988,14 +926,6 @@ def _command_correlations(t: Array, command: Array, motion: Array) -> tuple[floa
     return min(found), max(found)
 
 
-MAX_WHITE_LAG = 20
-"""Lags [samples] that white noise leaves uncorrelated: with one, motion at a quarter of the rate looks white."""
-STILL_STEPS = 2.0
-"""Range at rest in steps of the resolution [1]: more takes small motion for rest, fewer flicker for motion."""
-MAX_PISTON_SPEED = 50.0
-"""Speed [m/s] that no piston or linear servo has; lower blames fast ones, higher misses slow ones in mm."""
-
-
 def check_has_motion(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find channels without motion."""
     for name in (axis.position, axis.speed):
@@ -1051,12 +981,6 @@ def _autocorrelation(y: Array) -> Array:
     if power == 0:
         return np.zeros(1)
     return np.array([float(e[k:] @ e[:-k]) / power for k in range(1, min(MAX_WHITE_LAG, y.size - 1) + 1)])
-
-
-MIN_SPLINE = 4
-"""Samples of a channel through which a cubic spline runs."""
-MAX_STEPS_BETWEEN = 5.0
-"""Time between two samples of a channel over its usual one [1] from which it is a hole: nobody knows what was there."""
 
 
 def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFinding, ...]:

@@ -34,11 +34,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pneuopt.logs.columns import MAX_MAGNITUDE
 from pneuopt.logs.table import (
     EMPTY_CELL,
-    MAX_BYTES,
-    MAX_COLUMNS,
     Table,
     array_table,
     check_cells,
@@ -48,7 +45,6 @@ from pneuopt.logs.table import (
     run_apart,
 )
 from pneuopt.logs.text import (
-    MAX_HEAD_ROWS,
     MISSING,
     TextBlock,
     decode,
@@ -60,6 +56,20 @@ from pneuopt.logs.text import (
     seconds_from_first,
 )
 from pneuopt.logs.text import read_delimited as csv_read_table
+from pneuopt.logs.tolerances import (
+    COMPRESSED,
+    HEAD_BYTES,
+    MATRIX,
+    MAX_BYTES,
+    MAX_COLUMNS,
+    MAX_DAYS,
+    MAX_DEPTH,
+    MAX_EMPTY_ROWS,
+    MAX_HEAD_ROWS,
+    MAX_LEVELS,
+    MAX_MAGNITUDE,
+    MAX_SHEET_ROWS,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, require
 
@@ -152,8 +162,6 @@ def _rename(names: Sequence[str], index: int) -> list[str]:
 
 _STRUCTURE_REMEDY = "in MATLAB, save('run.mat', '-struct', 'S') with S a structure of vectors; of a table T, "
 _STRUCTURE_REMEDY += "S = table2struct(T, 'ToScalar', true)"
-MAX_DEPTH = 4
-"""Structures in structures [1]: dSPACE's have 2; more depth finds numbers that are settings."""
 
 
 class _Column(NamedTuple):
@@ -223,14 +231,8 @@ def _is_vector(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiub"
 
 
-MAX_LEVELS = 8
-"""Structures in each other [1]: more overflow a stack; MATLAB's own logs have four."""
-HEAD_BYTES = 128
-"""Length of the file's head [byte]; its last two say the order of bytes."""
-
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
-_MATRIX, _COMPRESSED = 14, 15
 _STRUCTURE, _CHARACTERS, _NUMERIC = 2, 4, range(6, 16)
 
 
@@ -269,7 +271,7 @@ def read_elements(raw: bytes) -> list[tuple[str, Any]]:
     order = "<" if raw[HEAD_BYTES - 2 : HEAD_BYTES] == b"IM" else ">"
     budget, found = MAX_BYTES, []
     for element in _elements(memoryview(raw)[HEAD_BYTES:], order):
-        if element.kind == _COMPRESSED:
+        if element.kind == COMPRESSED:
             unpacked = zlib.decompressobj().decompress(element.data, budget)
             budget -= len(unpacked)
             require(budget > 0, "it unpacks to more than a log's size")
@@ -291,11 +293,11 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
             require(size <= 4, "a short element is too long")
         require(start + size <= len(data), "an element is longer than what holds it")
         yield _Element(kind, data[start : start + size])
-        at = start + size if kind == _COMPRESSED else at + 8 * math.ceil((start + size - at) / 8)
+        at = start + size if kind == COMPRESSED else at + 8 * math.ceil((start + size - at) / 8)
 
 
 def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
-    require(element.kind == _MATRIX, f"an element of type {element.kind} stands where a variable should")
+    require(element.kind == MATRIX, f"an element of type {element.kind} stands where a variable should")
     require(level < MAX_LEVELS, "it is nested too deep")
     parts = _elements(element.data, order)
     flags = next(parts, None)
@@ -536,12 +538,6 @@ def _read_waveforms(table: Table, grids: dict[str, _Grid], names: Sequence[str])
     return {name: time if name == "time" else columns[name] for name in names}
 
 
-MAX_SHEET_ROWS = 2**20
-"""Rows of a sheet [1]: Excel's own bound."""
-MAX_EMPTY_ROWS = 10_000
-"""Empty rows one after another [1]: a single stray cell far below makes a million, which take seconds."""
-MAX_DAYS = 2958466
-"""Days of a date [1]: Excel's last, in the year 9999; more overflow as seconds."""
 _SHOWN_DATE = "0:00:00"  # what a date looks like where only its being one counts
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pneuopt.logs.columns import MIN_SAMPLES, split_unit
+from pneuopt.logs.columns import split_unit
 from pneuopt.logs.table import Table
+from pneuopt.logs.tolerances import CENTRES, MIN_SAMPLES, RANGE, SHOWN_CENTRES, VACUUM_LIMIT
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, require
 from pneuopt.quantities.parameters import COMMAND_SUFFIX
@@ -39,12 +40,6 @@ _UNITS: Mapping[str, tuple[str, ...]] = {
 LARGEST_SI = {"s": 0.1, "m": 3.0, "m/s": 5.0, "rad": 30.0, "rad/s": 2000.0}
 """Magnitudes above which numbers are hardly in the SI unit, of the time its step: a shaft turns more often than once, a
 cylinder is shorter than 3 m and slower than 5 m/s. Smaller ones ask about right logs, larger ones miss millimetres."""
-VACUUM_LIMIT = 0.9e5  # [Pa]: a chamber between supply and surroundings is never below; what is, counts from ambient
-_CENTRES = (3.0, 7.0)  # [V]: a command of 0 to 10 V that rests between these is counted from its centre, 5 V
-_SHOWN_CENTRES = (4.0, 6.0)
-"""[V]: where a command of 0 to 10 V that rests between these is logged as it is, its valve's centre is estimated: wider
-leaves a command to `identify` that it does not take for one about 5 V, narrower rounds a centre to 5 V that is not."""
-_RANGE = (-0.3, 10.5)  # [V] of such a command, with the error of its converter
 
 
 @dataclass(frozen=True)
@@ -172,12 +167,12 @@ def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask, 
     if not unit:
         return []
     low, high, middle = (float(f(values)) for f in (np.nanmin, np.nanmax, np.nanmedian))
-    is_offset = channel == "valve_voltage" and unit == "V" and _RANGE[0] <= low and high <= _RANGE[1] and high > 1
+    is_offset = channel == "valve_voltage" and unit == "V" and RANGE[0] <= low and high <= RANGE[1] and high > 1
     if not is_offset:
         return [ColumnGuess(channel, name, unit)]
-    if has_centre and _SHOWN_CENTRES[0] < middle < _SHOWN_CENTRES[1]:
+    if has_centre and SHOWN_CENTRES[0] < middle < SHOWN_CENTRES[1]:
         return [ColumnGuess(channel, name, unit, centre_is_estimated=True)]
-    options = ("5 V", "0 V") if _CENTRES[0] < middle < _CENTRES[1] else ("0 V", "5 V")
+    options = ("5 V", "0 V") if CENTRES[0] < middle < CENTRES[1] else ("0 V", "5 V")
     centre = options[0]
     if low >= 0 and options[0] == "0 V":
         centre = ask(Question(channel, f"{name!r} goes from {low:.3g} to {high:.3g} V. Where is its centre?", options))

@@ -9,31 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.logs.columns import (
-    CHANNELS,
-    MAX_MAGNITUDE,
-    ChannelColumn,
-    Plant,
-    find_columns,
-    nearest_channel,
-    plant_channels,
-)
+from pneuopt.logs.columns import CHANNELS, ChannelColumn, Plant, find_columns, nearest_channel, plant_channels
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.foreign import READERS, read_table
 from pneuopt.logs.read_log import Sidecar, assemble_log, read_sidecar
 from pneuopt.logs.table import Table, read_bytes
 from pneuopt.logs.text import block_table, decode, find_block, mend_cells
 from pneuopt.logs.text import read_delimited as csv_read_table
+from pneuopt.logs.tolerances import MAX_MAGNITUDE, MAX_ROWS_LISTED, MAX_ROWS_OUT
 from pneuopt.quantities.arrays import Mask
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, write_value
-
-MAX_ROWS_OUT = 0.05
-"""Share of the rows [1] that may be left out: with more the log is two recordings, or its time too coarse, and what is
-left misleads; with fewer a logger that stutters is not mended."""
-MAX_ROWS_LISTED = 8
-"""Rows that a change lists [1]: more fill the screen, fewer leave short lists open."""
 
 Rows = NDArray[np.intp]
 

@@ -11,28 +11,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pneuopt.logs.tolerances import (
+    BLOCK,
+    LATTICE_TOLERANCE,
+    MAD_SPREAD,
+    MAX_CORRELATION,
+    MIN_BLOCKS,
+    ORDERS,
+    QUIET_QUARTILE,
+    ROUNDING,
+    WHITE_LAGS,
+)
 from pneuopt.quantities.arrays import Array
-
-ORDERS = (
-    1,
-    2,
-    3,
-    4,
-    6,
-    8,
-    10,
-)  # of the differences; without the high ones motion at a tenth of the rate counts as noise
-# Differences of a block; shorter blocks have uncertain levels, longer ones leave none that is quiet.
-BLOCK = 100
-MIN_BLOCKS = 4  # with fewer a quarter of them is none
-QUIET_QUARTILE = -0.674  # of a normal variable: a quarter of the blocks need to be quiet
-MAD_SPREAD = 1.17  # standard deviation of the median absolute deviation of n normal numbers, over itself, times sqrt(n)
-# Correlation [1] of differences at this many lags beyond their length, above which they are motion or hum: noise has
-# none, and a sine of any frequency nearly 1; lower, filtered noise counts as motion.
-MAX_CORRELATION, WHITE_LAGS = 0.2, 20
-# Distance of a value from the lattice of a resolution, in its steps [1]: rounded decimals lie nearer, noise farther.
-LATTICE_TOLERANCE = 0.02
-ROUNDING = 1e-12  # share of the largest value [1] that is rounding of doubles; above, fine steps are missed
 
 
 class NoiseEstimate(NamedTuple):

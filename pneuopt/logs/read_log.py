@@ -16,6 +16,7 @@ from pneuopt.logs.columns import ACCEPTED_CHECKS, DATE, INTERSAMPLE_KEY, SIDECAR
 from pneuopt.logs.experiment import Experiment, experiment_from_table
 from pneuopt.logs.foreign import read_table
 from pneuopt.logs.table import Table, read_bytes
+from pneuopt.logs.tolerances import STAMP_BYTES
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.output import MAX_TOML_BYTES, check_nesting
 from pneuopt.quantities.parameters import Intersample
@@ -165,8 +166,6 @@ _NAMED_DAY = r"(?P<year>20\d\d)(?P<mark>[-_.]?)(?P<month>\d\d)(?P=mark)(?P<day>\
 _NAMED_TIME = r"(?:[T _-]?(?P<hour>[01]\d|2[0-3])[-:_.h]?(?P<minute>[0-5]\d)(?!\d{3}))?"
 _IN_NAME = re.compile(rf"(?<!\d){_NAMED_DAY}(?:(?!\d)|(?=[T _-])){_NAMED_TIME}")
 _IN_TEXT = re.compile(r"(?<![\w-])(20\d\d-\d\d-\d\d)[T ,;\t]\s*([0-2]\d:[0-5]\d(?::[0-5]\d)?)")
-STAMP_BYTES = 20_000
-"""Bytes of a log in which its first time stamp is looked for: longer heads are none of a log."""
 
 
 def find_date(path: str | Path) -> datetime:

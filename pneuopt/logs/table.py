@@ -23,6 +23,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
+from pneuopt.logs.tolerances import MAX_BYTES, MAX_CELLS, MAX_COLUMNS, MAX_NAME, MAX_SECONDS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, require
 from pneuopt.quantities.output import MAX_REASON, read_source
@@ -82,16 +83,6 @@ def check_columns(path: Path | str, names: Sequence[str]) -> None:
         require(len(name) <= MAX_NAME, text, LogError)
 
 
-MAX_BYTES = 2**29
-"""Size of a log's file [byte], 512 MiB: text takes six times as much memory; smaller refuses an hour at 10 kHz."""
-MAX_COLUMNS = 4096
-"""Columns of a log [1]: more are rows and columns mistaken for each other; fewer refuse large data loggers."""
-MAX_CELLS = 50_000_000
-"""Samples of all channels [1], 400 MB: more fill the memory of a small machine; fewer refuse an hour at 1 kHz."""
-MAX_NAME = 256
-"""Length of a column's name [character]: longer ones are no names, and make messages that nobody can read."""
-
-
 def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
     """Read a whole file, once.
 
@@ -117,9 +108,6 @@ def check_cells(path: Path | str, rows: int, columns: int) -> None:
         LogError,
     )
 
-
-MAX_SECONDS = 120.0
-"""Time for a library [s] in a process of its own: more looks like a hang; less refuses logs of 100 MB."""
 
 Result = TypeVar("Result")
 

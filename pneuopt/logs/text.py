@@ -20,16 +20,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pneuopt.logs.table import EMPTY_CELL, Table, check_cells
+from pneuopt.logs.tolerances import DAY, MAX_HEAD_ROWS, MIN_BLOCK_ROWS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.units import is_unit
 
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?")
 """A number with a decimal point, or a whole one."""
-MAX_HEAD_ROWS = 1000
-"""Rows above the samples [1]: more take seconds to look through; data loggers write up to a few hundred."""
-MIN_BLOCK_ROWS = 4
-"""Rows above the names that begin with a number [1] and count as samples: fewer refuse metadata, more lose samples."""
 TOA5 = "TOA5"
 """The first cell of the files of Campbell Scientific's loggers: names, units and processing in rows 2, 3 and 4."""
 
@@ -504,7 +501,6 @@ _STAMP = re.compile(
     r"(?:\s*(?P<half>[AaPp])\.?[Mm]\.?)?(?:\s*(?P<zone>Z|[+-]\d\d(?::?\d\d)?))?"
 )
 _EXAMPLE = "2026-03-12T10:00:00.000"
-_DAY = 86400 * 10**9  # ns
 
 
 def is_stamp(cell: str) -> bool:
@@ -586,7 +582,7 @@ def _nanoseconds(match: re.Match[str], days: dict[str, int], month_first: bool, 
     zone = (match["zone"] or "Z").replace(":", "").replace("Z", "+0000").ljust(5, "0")
     shift = (int(zone[1:3]) * 60 + int(zone[3:5])) * (-1 if zone[0] == "-" else 1)
     fraction = int((match["f"] or "0").ljust(9, "0"))
-    return days[text] * _DAY + ((hour * 60 + minute - shift) * 60 + second) * 10**9 + fraction
+    return days[text] * DAY + ((hour * 60 + minute - shift) * 60 + second) * 10**9 + fraction
 
 
 def _day_number(text: str, month_first: bool, place: str) -> int:
@@ -610,7 +606,7 @@ def _unwrap_midnights(moments: Sequence[int | None]) -> list[int | None]:
     shift, last = 0, None
     for moment in moments:
         if moment is not None:
-            shift += _DAY if last is not None and moment + _DAY // 2 < last else 0
+            shift += DAY if last is not None and moment + DAY // 2 < last else 0
             last = moment
         unwrapped.append(None if moment is None else moment + shift)
     return unwrapped

@@ -16,6 +16,10 @@ import numpy as np
 
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiment import Experiment
+from pneuopt.plotting.tolerances import (
+    MAX_VECTOR_MARKERS,
+    RASTER_DPI,
+)
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.output import write_bytes
 from pneuopt.quantities.trajectories import Trajectory
@@ -31,12 +35,6 @@ FIGURE_SUFFIXES = ("png", "pdf", "svg")
 GREY, BLUE, ORANGE, RED = "0.55", "#1f6fb2", "#e07b00", "#c0392b"
 PLOT_UNITS = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}
 """SI units that would give an axis many zeros, with the factor and the unit that are drawn in their place."""
-MAX_PLOT_COLUMNS = 3
-"""Columns of axes beside each other: more cannot be read at 1000 pixels, fewer leave logs out."""
-MAX_PLOT_POINTS = 4000
-"""Points of a measured line or cloud: more make a vector figure slow to open, fewer hide short events."""
-NORMAL_QUANTILE_95 = 1.96
-"""Half width of a band that holds 95 % of a normal distribution [standard deviations]."""
 
 
 def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
@@ -163,10 +161,6 @@ def _mend_text(text: "Text") -> None:
             text.set_parse_math(False)
 
 
-MAX_VECTOR_MARKERS = 400
-"""Markers of a cloud that are drawn as vectors: of more an image is made, as they would fill megabytes."""
-RASTER_DPI = 200
-"""Resolution of clouds that become an image [1/inch]: lower blurs in print, higher makes the page large."""
 HASH_SALT = "pneuopt"
 """What matplotlib mixes into the names of marks: without it they are random, and no two pages are the same."""
 _LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")

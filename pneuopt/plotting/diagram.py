@@ -14,6 +14,27 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.pid import AntiWindup, Form
 from pneuopt.control.sensor import Encoder
 from pneuopt.plotting.canvas import BLUE, GREY
+from pneuopt.plotting.tolerances import (
+    ARROW_LENGTH,
+    BLOCK_HEIGHT,
+    BLOCK_TEXT,
+    BRANCH,
+    CIRCLE_RADIUS,
+    COMPENSATOR_WIDTH,
+    FRAME,
+    LEGEND_LETTER_WIDTH,
+    LETTER_WIDTH,
+    MARGIN,
+    OUTPUT_SPACING,
+    PID_WIDTH,
+    PLANT_WIDTH,
+    SENSOR_HEIGHT,
+    SMALL_TEXT,
+    SMALL_WIDTH,
+    SOURCE_HEIGHT,
+    SOURCE_WIDTH,
+    WIRE_HEIGHT,
+)
 from pneuopt.quantities.parameters import Quantity
 
 if TYPE_CHECKING:
@@ -21,11 +42,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-BLOCK_HEIGHT, CIRCLE_RADIUS, ARROW_LENGTH = 0.62, 0.12, 0.3  # [inch]; the arrow's where it has no label
-BLOCK_TEXT, SMALL_TEXT = 9.0, 8.0  # [points] inside a block, and beside an arrow or below a block
-LETTER_WIDTH = 0.064  # [inch] of a letter beside an arrow: with less, labels overlap; with more, arrows are long
-LEGEND_LETTER_WIDTH = 0.055  # [inch] of a letter in running text: with less, lines run off the figure
-MARGIN = 0.15  # [inch] around the diagram
 BLOCK_COLOUR = "#eef4fa"
 
 
@@ -154,12 +170,6 @@ LAWS = {
     Form.STANDARD: r"$K_p\,\left(1 + \dfrac{1}{T_i\,s} + \dfrac{T_d\,s}{1 + s\,T_d/N}\right)$",
     Form.SERIES: r"$K\,\left(1 + \dfrac{1}{T_i\,s}\right)\,\dfrac{T_d\,s + 1}{T_f\,s + 1}$",
 }
-SOURCE_HEIGHT, SENSOR_HEIGHT, WIRE_HEIGHT = 1.2, -1.45, -1.15  # [inch] of what is added, of the sensor, without one
-PID_WIDTH, SOURCE_WIDTH, SMALL_WIDTH, PLANT_WIDTH = 2.1, 1.5, 0.8, 1.7  # [inch] of blocks
-COMPENSATOR_WIDTH = 1.15  # [inch]
-OUTPUT_SPACING = 0.32  # [inch] between the outputs of a plant: closer, their labels overlap
-FRAME = 0.12  # [inch] between the controller and the frame around it
-BRANCH = 0.15  # [inch] from an arrow's begin to where it divides
 
 
 def plot_loop(loop: ClosedLoop) -> "Figure":

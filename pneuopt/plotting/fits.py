@@ -22,9 +22,6 @@ from pneuopt.logs.experiment import Experiment, differentiate
 from pneuopt.plotting.canvas import (
     BLUE,
     GREY,
-    MAX_PLOT_COLUMNS,
-    MAX_PLOT_POINTS,
-    NORMAL_QUANTILE_95,
     ORANGE,
     RED,
     axes_grid,
@@ -33,6 +30,15 @@ from pneuopt.plotting.canvas import (
     legend_above,
     note_omissions,
     plot_unit,
+)
+from pneuopt.plotting.tolerances import (
+    MAX_CORRELATION_LAG,
+    MAX_NUMBERED_PARAMETERS,
+    MAX_PLOT_CHANNELS,
+    MAX_PLOT_COLUMNS,
+    MAX_PLOT_POINTS,
+    NORMAL_QUANTILE_95,
+    SLOPE_SAMPLES,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -119,14 +125,6 @@ def _draw_comparison(
     top.set_ylabel(f"{channel} [{unit}]")
     bottom.set_ylabel(f"measured\n- {label} [{unit}]", fontsize=8)
     bottom.axhline(0, color=GREY, lw=0.8)
-
-
-MAX_CORRELATION_LAG = 40
-"""Largest lag of a correlation [samples]: more crowd the axis, fewer hide slow dynamics."""
-MAX_PLOT_CHANNELS = 4
-"""Channels below each other: more cannot be read, fewer leave channels out."""
-MAX_NUMBERED_PARAMETERS = 12
-"""Parameters up to which each cell has room for its number; with more, numbers overlap."""
 
 
 def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> "Figure":
@@ -307,9 +305,6 @@ def _set_symmetric_limits(axes: "Axes", rho: Array) -> None:
 
 def _format_probability(p: float) -> str:
     return f"{p:.2g}" if p >= 1e-4 else "< 1e-4"
-
-
-SLOPE_SAMPLES = 20  # of a local derivative
 
 
 def plot_friction(system: System, result: IdentificationResult, experiments: Sequence[Experiment]) -> "Figure":

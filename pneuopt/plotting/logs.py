@@ -15,8 +15,6 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.plotting.canvas import (
     BLUE,
     GREY,
-    MAX_PLOT_COLUMNS,
-    MAX_PLOT_POINTS,
     ORANGE,
     PLOT_UNITS,
     RED,
@@ -25,6 +23,7 @@ from pneuopt.plotting.canvas import (
     note_omissions,
     plot_unit,
 )
+from pneuopt.plotting.tolerances import LABEL_WIDTH, MAX_PLOT_COLUMNS, MAX_PLOT_POINTS, MAX_ZOOM_SHARE, TITLE_WIDTH
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 
@@ -86,12 +85,6 @@ def _envelope(t: Array, y: Array) -> tuple[Array, Array]:
 
 
 COLOURS = (BLUE, ORANGE, GREY, RED)
-MAX_ZOOM_SHARE = 0.6
-"""Share of a log [1] from which it is drawn once, not whole and enlarged; lower, one event fills both columns."""
-TITLE_WIDTH = 118
-"""Letters of a line of the title: more are cut off at 10 inches, fewer take a line more."""
-LABEL_WIDTH = 24
-"""Letters of a line of a label beside an axis: more run into the next panel's, fewer make three lines."""
 
 
 def plot_finding(finding: LogFinding) -> "Figure":

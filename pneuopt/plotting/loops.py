@@ -15,7 +15,8 @@ from pneuopt.control.reference import Reference, Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.margins import Margins, frequency_grid, frequency_response, margins
 from pneuopt.evaluation.metric import Band, band_share, describe_band
-from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_COLUMNS, ORANGE, RED, axes_grid, finish_columns, legend_above
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, finish_columns, legend_above
+from pneuopt.plotting.tolerances import CURVE_POINTS, MAX_PLOT_COLUMNS, MIN_PLOTTED_SENSITIVITY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-CURVE_POINTS = 500  # of a reference: fewer show corners in its bends, more make figures larger
 DRIVE_SIGNALS = {"valve.spool": ("valve [%]", 100.0), "friction.force": ("friction [{force}]", 1.0)}
 
 
@@ -150,10 +150,6 @@ def _set_view_limits(axes: "Axes", y: Array, others: Sequence[float], before: Ar
     high = min(max(high, float(np.max(before))), high + span / 2)
     margin = 0.08 * (high - low or 1.0)
     axes.set_ylim(low - margin, high + margin)
-
-
-MIN_PLOTTED_SENSITIVITY = 0.03
-"""The lowest sensitivity that is drawn [1]: lower flattens the peak, which matters; higher cuts the slope off."""
 
 
 def plot_bode(open_loop: Linearisation, before: Linearisation | None = None) -> "Figure":

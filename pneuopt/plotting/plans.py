@@ -13,7 +13,6 @@ from pneuopt.identification.tracking import Tracking
 from pneuopt.plotting.canvas import (
     BLUE,
     GREY,
-    NORMAL_QUANTILE_95,
     ORANGE,
     PLOT_UNITS,
     RED,
@@ -22,21 +21,19 @@ from pneuopt.plotting.canvas import (
     legend_above,
     note_omissions,
 )
+from pneuopt.plotting.tolerances import (
+    INCHES_A_PARAMETER,
+    MAX_PANELS,
+    MAX_SIGNALS,
+    NORMAL_QUANTILE_95,
+    SHOWN_LIMIT_SHARE,
+    TICKS,
+)
 from pneuopt.quantities.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-MAX_SIGNALS = 4
-"""Panels of signals [1]: more do not fit a page beside the intervals."""
-INCHES_A_PARAMETER = 0.24
-"""Height of a parameter's line [inch]: less and their names touch."""
-TICKS = (1.0, 2.0, 5.0)
-"""Numbers on a logarithmic axis, of each decade: more touch, one alone leaves short axes bare."""
-SHOWN_LIMIT_SHARE = 0.35
-"""Share of a panel's range [1] within which a limit is drawn: a farther one would squeeze the signal."""
 
 
 def plot_experiment(design: ExperimentDesign) -> "Figure":
@@ -117,10 +114,6 @@ def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
     panel.set_yticks(places, names)
     panel.set_ylim(len(table) - 0.5, -0.5)
     panel.set_xlabel("half of the 95 % interval, of the value [%]")
-
-
-MAX_PANELS = 6
-"""Parameters that are drawn: more do not fit a page, and those with an alarm come first."""
 
 
 def plot_tracking(found: Tracking) -> "Figure":

@@ -14,16 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.evaluation.requirements import METRICS, larger_is_better
-from pneuopt.plotting.canvas import (
-    BLUE,
-    GREY,
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, axis_label, legend_above, note_omissions
+from pneuopt.plotting.tolerances import (
+    INCHES_AN_AXIS,
+    LABELS_PER_LONG_AXIS,
+    MARKED_SHARE,
+    MAX_NUMBERED_CELLS,
     MAX_PLOT_COLUMNS,
-    ORANGE,
-    RED,
-    axes_grid,
-    axis_label,
-    legend_above,
-    note_omissions,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
@@ -37,10 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-MAX_NUMBERED_CELLS = 12
-"""Cells along an axis up to which each has room for its number; with more, numbers overlap."""
-LABELS_PER_LONG_AXIS = 6
-"""Labels along an axis of more cells than that: more overlap, fewer are hard to read between."""
 COLOUR_MAP = "viridis_r"
 
 
@@ -169,10 +162,6 @@ def plot_front(table: "pd.DataFrame", requirements: Mapping[str, str]) -> "Figur
     return figure
 
 
-MARKED_SHARE = 0.95
-"""Share of the cases whose bound is marked [1]: a larger one hangs on the last few of a hundred samples."""
-
-
 def plot_distribution(table: "pd.DataFrame", metrics: Mapping[str, str]) -> "Figure":
     """The share of the cases that keep a bound over the bound, a panel a metric; the bound that 95 % keep is marked.
 
@@ -224,10 +213,6 @@ def _draw_shares(panel: "Axes", table: "pd.DataFrame", metric: str) -> None:
         side = "at least" if at_least else "at most"
         label = f"{100 * MARKED_SHARE:g} % {side} {values[k]:.4g}"
         panel.annotate(label, (values[k], 0.03), xytext=(-3, 0), textcoords="offset points", ha="right", fontsize=8)
-
-
-INCHES_AN_AXIS = 0.42
-"""Height of an axis' two bars [inch]: less and their names touch, more and ten axes do not fit a page."""
 
 
 def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) -> "Figure":

@@ -27,12 +27,10 @@ from pneuopt.quantities.status import report_status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
 from pneuopt.report.page import Page, Picture, Section, data_section, provenance_section
+from pneuopt.report.tolerances import MIN_CORRELATED
 
 if TYPE_CHECKING:
     import pandas as pd
-
-MIN_CORRELATED = 2
-"""Estimates with a standard deviation from which their correlation is drawn: of one there is none."""
 
 
 @dataclass(frozen=True)

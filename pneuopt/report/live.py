@@ -17,25 +17,27 @@ from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, Step, disturbance_input
 from pneuopt.evaluation.evaluate import relevant_units
-from pneuopt.evaluation.metric import EDGE_ROUNDING, TAIL_SHARE, Band, band_share
-from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
+from pneuopt.evaluation.metric import Band, band_share
+from pneuopt.evaluation.tolerances import EDGE_ROUNDING, MIN_SETTLED_PERIODS, TAIL_SHARE
 from pneuopt.export.languages import write_loop_javascript
 from pneuopt.models.load import GRAVITY
 from pneuopt.plotting.canvas import PLOT_UNITS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.report.tolerances import (
+    INCLINE,
+    INDEPENDENT,
+    LOG_RANGE,
+    RANGE,
+    RESIDUAL,
+    SHRINKAGES,
+    UNCHANGED_LEAST,
+    UNCHANGED_RATIO,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-RESIDUAL = 1e-6
-"""Share of a state's nominal size, a second, that counts as zero: what a rest's own root searches leave is below."""
-UNCHANGED_RATIO, UNCHANGED_LEAST = 1e-9, 1e-12
-"""When two rests are one, as a share and in SI: below these a response cannot be told from the other."""
-INDEPENDENT = 1e-9
-"""Least share of the largest singular value of the residuals' slopes: below it a direction is undetermined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,16 +138,8 @@ PLANT_SECTIONS = ("load", "supply", "friction")
 """Sections of a plant's parameters that have sliders."""
 NOT_MOVED = ("pid.Tt", "pid.lower", "pid.upper", "pid.fault_samples", "pid.fault_output", "friction.smoothing")
 """Parameters without a slider: limits of hardware, what only a fault shows, and what makes a loop too stiff here."""
-RANGE = 3.0
-"""A slider goes from a third to three times its value where no bounds say more: less hides what changes."""
 RANGES = {"supply.pressure": 1.5}
 """The same where hardware varies less: no shop's air has three times its pressure."""
-INCLINE = 0.5
-"""Share of the load's weight, either way, that a load's force is moved by: as if its axis were tilted by 30 degrees."""
-SHRINKAGES = 4
-"""How often the way to a slider's end is halved where the loop cannot rest there; beyond it is hardly a way."""
-LOG_RANGE = 20.0
-"""Ratio of a slider's ends from which it is logarithmic: else most of its way is one value."""
 
 
 def live_script(

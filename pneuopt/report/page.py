@@ -46,6 +46,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import unit_ratio, write_value
+from pneuopt.report.tolerances import GAIN_DIGITS
 
 if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure
@@ -234,8 +235,6 @@ def _channel_row(log: Experiment, channel: str, counted: Mapping[tuple[str, str]
     return (log.name or "log", channel, column.name if column else "", low, high, noise, missing)
 
 
-GAIN_DIGITS = 6
-"""Significant digits of converted gains: fewer change the loop that was certified, more are of no controller."""
 LAW_TEXTS = {
     "parallel": "Kp~(b~r~−~y) + Ki~e/s + Kd~s/(Tf~s~+~1)~(c~r~−~y)",
     "standard (ISA)": "Kp~((b~r~−~y) + e/(Ti~s) + Td~s/(1~+~s~Td/N)~(c~r~−~y))",

@@ -45,6 +45,7 @@ from pneuopt.report.page import (
     report_settings,
     write_page,
 )
+from pneuopt.report.tolerances import MOST_NAMES
 from pneuopt.studies.sensitivity import Sensitivity
 from pneuopt.tuning.result import TuningResult, report_active, report_certificate_status, report_gains, report_refusal
 from pneuopt.tuning.validation import report_validation, report_validation_verdict
@@ -332,10 +333,6 @@ def title_of(what: str, file: Path, logs: Sequence[Path]) -> str:
     """What a page is of: "Check of drive.toml with run_01.csv"; of many logs their number."""
     names = ", ".join(log.name for log in logs) if len(logs) <= MOST_NAMES else f"{len(logs)} logs"
     return f"{what} of {file.name}" + (f" with {names}" if logs else "")
-
-
-MOST_NAMES = 3
-"""Logs that a title names: more make it longer than a line."""
 
 
 LOGS = "an Experiment or several, as read_log(path) gives them"

@@ -12,16 +12,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from pneuopt.quantities.arrays import Array, Indices, Mask
-
-# smallest eigenvalue [1] of a matrix of unit diagonal that counts: lower takes rounding for information, higher calls
-# separable parameters indistinguishable
-RANK_TOLERANCE = 1e-12
-# relative rounding error of a Schur complement from long chains of tight gaps (1 to 5e-16 measured): lower trusts lost
-# digits, higher gives up parameters that the data determine
-SCHUR_ROUNDING = 1e-14
-# added to D's diagonal (scaled states): a state that no data depend on stays in place, and the optimum does not move;
-# lower leaves D singular, higher slows the other states
-STATE_REGULARISATION = 1e-6
+from pneuopt.shooting.tolerances import RANK_TOLERANCE, SCHUR_ROUNDING, STATE_REGULARISATION
 
 
 class GaussNewtonStep(NamedTuple):

@@ -8,27 +8,24 @@ from scipy.linalg.lapack import dtbtrs
 
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.shooting.arrow import (
-    SCHUR_ROUNDING,
     ArrowEquations,
     ReducedEquations,
     indistinguishable_parameters,
     positive_definite_inverse,
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments
+from pneuopt.shooting.tolerances import (
+    CURVATURE_RESOLUTION,
+    FLAT_PRIOR_WIDTH,
+    MAX_NODE_DAMPING,
+    MAX_OVERSHOOTING_SHARE,
+    MIN_LOCAL_EXCESS,
+    MIN_LOG_INFORMATION,
+    MIN_OVERSHOOTING_NODES,
+    SCHUR_ROUNDING,
+    START_PRIOR_DEVIATION,
+)
 from pneuopt.shooting.transcription import Transcription
-
-# width of a flat prior, in standard deviations by the data with all else known: lower lets the prior narrow intervals,
-# higher loses digits
-FLAT_PRIOR_WIDTH = 1e3
-# share [1] of a step's squares below which a segment's excess is no curvature: lower takes rounding for it, higher
-# leaves a node that overshoots
-CURVATURE_RESOLUTION = 1e-6
-# share of all nodes [1], and least number, that may overshoot: more slow a search down that is still far off, fewer
-# leave the step of all to be cut for the sake of some
-MAX_OVERSHOOTING_SHARE, MIN_OVERSHOOTING_NODES = 0.02, 3
-# share of the excess [1] that these nodes must make up: lower damps nodes where the parameters' step is too long
-MIN_LOCAL_EXCESS = 0.9
-MAX_NODE_DAMPING = 1e6  # times a node's diagonal [1]: higher overflows, lower lets a node move that must not
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,15 +377,6 @@ def _assemble(segments: Segments, slopes: SegmentLinearisation, weight: Array) -
 
 # What the data of a search do not determine; each threshold is in the units in which the search moves.
 WEAK_PRIOR_DEVIATION = math.log(10)  # standard deviation of a weak prior, in e-folds: a factor of ten either way
-# standard deviation over a weak prior's from which a parameter is held: there the prior makes up a tenth of the
-# information of both; smaller holds what the data do determine, larger lets a search crawl along a valley
-UNIDENTIFIABLE_PRIOR_RATIO = 1 / 3
-# standard deviation of the prior about a start, in e-folds: lower holds wrong guesses, higher lets what wide gaps hide
-# drift to where tight ones cannot tell it any more
-START_PRIOR_DEVIATION = 1.0
-# squared residuals that an e-fold change of a log parameter has to move, or it has no effect: smaller searches in
-# rounding, larger holds what good data would show
-MIN_LOG_INFORMATION = 1e-6
 
 
 class ParameterScaling:

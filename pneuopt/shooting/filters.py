@@ -27,18 +27,24 @@ from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.shooting.equations import NormalEquations, ParameterScaling
 from pneuopt.shooting.least_squares import Optimum
 from pneuopt.shooting.segments import Segments, choose_integration
-
-PIECE_SEGMENTS = 300  # segments a piece: more take more steps one after the other, fewer waste more on the lead
-# segments before a piece from which its states come: fewer leave it the error of its start, more cost time
-LEAD_SEGMENTS = 300
-START_DEVIATION = 0.1  # of the state where a piece or a log begins, in nominal sizes [1]: about that of rough states
-# deviation that a state gathers from one node to the next, in nominal sizes [1], by parameters that are not known well:
-# lower follows wrong ones away from the measurements, higher leaves states that do not fit together
-GATHERED_DEVIATION = 1e-4
-KNOWN_DEVIATION = 1e-6  # of a state that is given, likewise
-UPDATES = 4  # linearisations a segment: fewer miss a slip, more cost time
-SETTLED_SQUARES = 0.01  # change of the squares [1] by which no state counts: lower takes updates that move none
-STEP_CUT = 0.3  # of a step that has not helped [1]: higher tries it again too far, lower hardly moves
+from pneuopt.shooting.tolerances import (
+    DAMPINGS,
+    FIRST_DAMPING,
+    GATHERED_DEVIATION,
+    GIVEN_UP_DAMPING,
+    KNOWN_DEVIATION,
+    LEAD_SEGMENTS,
+    LEAST_DAMPING,
+    MAX_BATCH_NUMBERS,
+    MAX_STEP,
+    PIECE_SEGMENTS,
+    ROBUST_SQUARES,
+    SETTLED_DECREASE,
+    SETTLED_SQUARES,
+    START_DEVIATION,
+    STEP_CUT,
+    UPDATES,
+)
 
 
 def filter_nodes(segments: Segments, nodes: Array, q: Array, gathered: float = GATHERED_DEVIATION) -> Array:
@@ -175,18 +181,6 @@ def solve_each(A: Array, b: Array) -> Array:
             with suppress(np.linalg.LinAlgError):
                 out[i] = np.linalg.solve(A[i], b[i])
         return out
-
-
-# squares of a segment, over its samples, beyond which they count by their logarithm [1]: lower is blind to what wrong
-# parameters miss, higher lets one lost slip outweigh a log
-ROBUST_SQUARES = 4.0
-DAMPINGS = (1e-2, 10**-0.75, 10**0.5, 10**1.75, 1e3)  # over the last one, tried side by side: wider spreads overshoot
-FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-6  # over the diagonal [1]: lower takes wild first steps, higher small ones
-GIVEN_UP_DAMPING = 10.0  # where no damping helps beyond it, a descent has ended; higher takes time
-MAX_STEP = (
-    1.0  # of a parameter as searched, over its size where it is no log parameter: longer leaves the model's range
-)
-SETTLED_DECREASE = 1e-4  # of the cost [1] at which a descent has ended: lower takes time, higher ends too early
 
 
 class Errors(NamedTuple):
@@ -337,9 +331,6 @@ class PredictionErrors:
         step[free] = -np.linalg.lstsq(own + damping * np.diag(np.diag(own)), gradient[free], rcond=None)[0]
         longest = MAX_STEP * np.where(self.scaling.log, 1.0, np.maximum(np.abs(z), 1.0))
         return self.scaling.project_to_bounds(z + np.clip(step, -longest, longest))
-
-
-MAX_BATCH_NUMBERS = 4_000_000  # numbers of 8 bytes in a batch: more take memory, fewer time
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,11 +22,15 @@ from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.tolerances import (
+    MAX_EXPANDED_OPERATIONS,
+    MAX_EXPANDED_STEPS,
+    MAX_EXTRAPOLATION,
+    WARM_START_BARRIER,
+)
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, phases_of
 
 ArrayOrMX = TypeVar("ArrayOrMX", NDArray[np.float64], ca.MX)
-# integration steps up to which a segment is flattened to scalars, which evaluate faster: higher takes long to flatten
-MAX_EXPANDED_STEPS = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,14 +319,6 @@ def _phase_values(term: Cost | Limit, run: _PhaseGraph) -> ca.MX:
     return term.function.map(n)(run.t[nodes], run.nodes[:, :n], run.u[:, nodes], ca.repmat(run.p, 1, n))
 
 
-# scalar operations up to which the whole graph is flattened to scalars: higher takes long to flatten, lower evaluates
-# slowly
-MAX_EXPANDED_OPERATIONS = 200_000
-# barrier and distances from bounds [1] with which a solution's neighbour starts, in 9 iterations instead of 18: higher
-# forgets the solution, lower starts on the bounds
-WARM_START_BARRIER = 1e-5
-# extrapolation along a path, in its last steps [1]: higher overshoots where the path bends, lower takes more iterations
-MAX_EXTRAPOLATION = 1.5
 _PUSH_OPTIONS = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 
 

@@ -23,7 +23,6 @@ from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations, positive_definite_inverse
 from pneuopt.shooting.equations import (
-    UNIDENTIFIABLE_PRIOR_RATIO,
     NormalEquations,
     ParameterScaling,
     correct_residuals,
@@ -35,10 +34,6 @@ from pneuopt.shooting.equations import (
     weigh_gaps,
 )
 from pneuopt.shooting.segments import (
-    MAX_SEARCH_SUBSTEPS,
-    MAX_STAGE_REFINEMENT,
-    MIN_IMPLICIT_SUBSTEPS,
-    STIFFNESS_UPDATE_CHANGE,
     IntegrationCorrection,
     Segments,
     choose_integration,
@@ -46,6 +41,49 @@ from pneuopt.shooting.segments import (
     gap_scales,
     segment,
     start_nodes,
+)
+from pneuopt.shooting.tolerances import (
+    COARSE_TOLERANCE,
+    CREEPING_SHARE,
+    FINAL_COST_TOLERANCE,
+    FINE_TOLERANCE,
+    FIRST_JOINING_STAGE,
+    INITIAL_DAMPING,
+    JOINED_COST_TOLERANCE,
+    JUMP_COST_TOLERANCE,
+    JUMP_ITERATIONS,
+    MAX_CHI_SQUARE_RATIO,
+    MAX_CREEPING_STEPS,
+    MAX_GAP_SHARE,
+    MAX_GRADIENT_ERROR,
+    MAX_JUMP_MISFIT,
+    MAX_LOG_CHANGE,
+    MAX_LOOSENED,
+    MAX_NODE_STEPS,
+    MAX_NOISY_STEP,
+    MAX_REPEATS,
+    MAX_SEARCH_SUBSTEPS,
+    MAX_SETTLED_STEP,
+    MAX_SHIFT,
+    MAX_STAGE_REFINEMENT,
+    MAX_STEP_HALVINGS,
+    MAX_STEPS,
+    MAX_TRIES,
+    MAX_UNDAMPED_STEPS,
+    MIN_DAMPING,
+    MIN_GAIN_RATIO,
+    MIN_IMPLICIT_SUBSTEPS,
+    MISFIT_TOLERANCE,
+    PATIENT_ITERATIONS,
+    REPEAT_ITERATIONS,
+    SETTLED_COST_DECREASE,
+    STAGE_COST_TOLERANCE,
+    STALL_COST_DECREASE,
+    STEEP_DECREASE,
+    STIFFNESS_UPDATE_CHANGE,
+    TRAPPING_DAMPING,
+    UNIDENTIFIABLE_PRIOR_RATIO,
+    WIDE_GAP,
 )
 from pneuopt.shooting.transcription import Transcription
 
@@ -205,11 +243,6 @@ class Fit:
         return replace(self, stats={**self.stats, **total})
 
 
-# gap [1] beyond which log parameters are drawn to their start: lower biases what tight gaps tell, higher lets them
-# drift to where tight gaps cannot tell them any more
-WIDE_GAP = 2e-4
-
-
 @dataclass(frozen=True)
 class Stage:
     """A stage of the search: how tight the gaps are, and how long it runs.
@@ -336,11 +369,6 @@ def solve_least_squares(transcription: Transcription, method: LeastSquares | Non
     return end_search(state, time.perf_counter() - began)
 
 
-# share of the cost [1] that the gaps may carry: above it they absorb the misfit of a model; lower refuses good fits
-MAX_GAP_SHARE = 0.05
-# squared residuals a sample, in noise variances [1], up to which a fit explains the log to its noise: lower takes
-# chance for misfit, higher passes a wrong model
-MAX_CHI_SQUARE_RATIO = 1.2
 NO_POSITIONS = np.zeros(0, dtype=np.intp)
 
 
@@ -455,24 +483,6 @@ def _least_certain(positions: Indices, spread: Array, space: ParameterScaling, z
     if not share.size or not share.max() > UNIDENTIFIABLE_PRIOR_RATIO:
         return NO_POSITIONS
     return positions[[int(np.argmax(share))]]
-
-
-# Marquardt's damping over the diagonal [1] with loose gaps: lower takes wild first steps, higher small ones
-INITIAL_DAMPING = 1e-3
-# least damping over the diagonal [1], in which the gaps weigh up to 1e14: higher slows parameters, lower is rounding
-MIN_DAMPING = 1e-15
-# actual over promised decrease [1] below which the nodes settle after a step: higher costs evaluations, lower crawls in
-# valleys
-MIN_GAIN_RATIO = 0.5
-# steps of the nodes alone after a step whose gaps miss its promise: fewer creep along the bend of a valley (bristles at
-# 60 s: .05 % an iteration), more follow nodes that do not settle
-MAX_NODE_STEPS = 3
-MAX_TRIES = 10  # dampings tried for a step: fewer give up where a step exists, more try what no longer moves anything
-# undamped steps over a kink: fewer turn back before the cost has fallen again, more follow steps that diverge
-MAX_UNDAMPED_STEPS = 10
-MAX_LOG_CHANGE = (
-    2.0  # e-folds of a log parameter in a step: longer ones leave the model's range, shorter ones take more
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -645,46 +655,6 @@ def _misses_by_gaps(current: Iterate, trial: Iterate) -> bool:
     """Whether the gaps of a trial, more than its data, make it cost more than where it comes from."""
     by_data = 0.5 * (trial.equations.chi_square - current.equations.chi_square)
     return math.isfinite(trial.cost) and trial.cost - current.cost > 2 * by_data
-
-
-# relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
-STALL_COST_DECREASE = 2e-3
-# error of the parameters [standard deviations] by derivatives from before the integration was refined: higher shifts
-# estimates, lower costs a run with sensitivities
-MAX_GRADIENT_ERROR = 0.01
-# iterations of the last stage right after the first: more are lost where stages between are needed, fewer may not
-# converge
-JUMP_ITERATIONS = 10
-# squares that the last stage promises by the linearised equations, in noise variances [1], above which it is not tried
-# right after the first: lower passes over it for a start that is only not yet near, higher iterates for wrong models
-MAX_JUMP_MISFIT = 10.0
-# stages at whose gaps noise of the states is tried [1]: fewer miss those at which a search settles, more of them hardly
-# hold the states together
-MAX_LOOSENED = 2
-# creeping steps in a row after which a search with noise of the states takes undamped ones: fewer leave a way that
-# leads on, more take long
-MAX_CREEPING_STEPS = 3
-
-MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
-# times that the iterations of the last stage are repeated near the noise [1]: fewer leave a search over kinks (bristles
-# at rest) before its end, for other starts that take longer; more follow one that does not end
-MAX_REPEATS = 3
-REPEAT_ITERATIONS = 10  # of a repeat, at most: fewer take a slow search for settled, more go on after it has
-# decrease of the cost by an iteration, over itself [1], with which a search goes on that is not near the noise yet:
-# lower follows one that creeps, higher ends one that is about to come there
-STEEP_DECREASE = 0.1
-# step [standard deviations] up to which a search has settled where a repeat has moved no estimate: lower follows what
-# kinks ask for in vain (100 iterations of bristles at rest for .1 deviations), higher takes a slow search for one that
-# has settled; and where the gaps stand for noise of the states, whose every estimate is marked anyway
-MAX_SETTLED_STEP, MAX_NOISY_STEP = 0.5, 1.0
-# damping of a node alone, over its diagonal [1], beyond which a kink traps it, for it moves less than half as far as
-# its equations ask: lower moves nodes that are only slow, higher leaves some behind
-TRAPPING_DAMPING = 1.0
-
-FIRST_JOINING_STAGE = 2  # stage from which two searches may join: before it the gaps are so wide that all cost alike
-# difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
-# one
-JOINED_COST_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -1343,30 +1313,6 @@ def unsettled_covariance(state: SearchState) -> Array:
     return np.outer(asked, asked)
 
 
-# promised decrease over the cost [1] at which a stage ends: lower wastes iterations, higher ends it too early
-STAGE_COST_TOLERANCE = 1e-3
-# promised decrease at which the last stage ends, in noise variances: half of (0.1 % of a standard deviation)^2
-FINAL_COST_TOLERANCE = 5e-7
-# promised decrease in noise variances at which the last stage ends where no parameter moves: lower iterates for states
-# that no parameter depends on, higher leaves costs that are compared short of their least
-SETTLED_COST_DECREASE = 0.01
-# step of a parameter over the tolerance of convergence [1] at which the last stage ends: lower settles states that no
-# parameter depends on, higher leaves the parameters short of their optimum; and where finer steps follow, which move it
-FINE_TOLERANCE, COARSE_TOLERANCE = 0.01, 0.5
-# the same where the model misses the logs, in deviations by the residuals: lower follows Gauss-Newton steps that go to
-# and fro (30 iterations of .02 deviations on a log with sensor lag), higher leaves costs that differ at one optimum
-MISFIT_TOLERANCE = 0.2
-# iterations of a stage after which that counts: fewer leave optima that soon would be exact, more take time
-PATIENT_ITERATIONS = 8
-# promised decrease over the cost [1] at which such a first stage ends: lower iterates for what the last one finds
-# anyway, higher jumps from a start that is not near
-JUMP_COST_TOLERANCE = 1e-2
-
-# actual over promised decrease [1] below which a search with noise of the states creeps: higher leaves a fit that
-# converges, lower follows a kink of the model for hundreds of steps (encoder steps: 50 of .13 each, of 35 promised)
-CREEPING_SHARE = 0.3
-
-
 def is_negligible_step(state: SearchState, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
     """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
 
@@ -1544,12 +1490,6 @@ def _integration_error(state: SearchState, run: RolloutResult) -> float:
             return state.largest_change(state.run(2 * state.output_substeps).y - run.y)
     except BudgetSpentError:
         return math.nan
-
-
-# Newton steps: fewer leave gaps that another would close, more cost as much as a run from end to end
-MAX_STEPS = 3
-# shift of a node that open gaps still cause, in nominal sizes: higher shows in the errors of the run, lower is rounding
-MAX_SHIFT = 1e-6
 
 
 def close_gaps(optimum: Optimum) -> Array | None:

@@ -13,15 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled.rollout import Gram, Pieces, Rollout, RolloutResult
-from pneuopt.dynamics.integrators import PARTITIONED_MAX_H_GROWTH, PARTITIONED_MAX_H_LAMBDA, RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import DiscreteSystem, names
+from pneuopt.dynamics.tolerances import PARTITIONED_MAX_H_GROWTH, PARTITIONED_MAX_H_LAMBDA, RK4_MAX_H_LAMBDA
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.tolerances import (
+    GROWTH_POINTS,
+    GROWTH_RANGE,
+    IMPLICIT_REFINEMENT,
+    MAX_STIFFNESS_NODES,
+    MIN_IMPLICIT_GAIN,
+    MIN_IMPLICIT_SUBSTEPS,
+    STABILITY_RESERVE,
+    SUBSTEPS_CAP,
+)
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription
-
-SUBSTEPS_CAP = 1000  # integration steps a sample, at most: more take hours, fewer hide how stiff an absurd start is
-MAX_STIFFNESS_NODES = 100  # nodes at which the stiffness is computed: more cost time, fewer miss the stiffest
 
 
 class Block(NamedTuple):
@@ -361,25 +368,6 @@ def _cut_phase(
         np.full(m, index),
         ends - phase.nodes,
     )
-
-
-# relative change of a parameter [1] after which the stiffness is computed anew: higher risks unstable steps
-STIFFNESS_UPDATE_CHANGE = 0.03
-MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample: a search with more would take hours, fewer refuse stiff models
-MAX_STAGE_REFINEMENT = 8  # factor on the start's integration steps in a stage: higher takes long, lower may be unstable
-# RK4 steps over steps that are implicit in a state, at least [1]: such a step takes as long as one and a half of RK4's
-# and is of lower order; higher leaves stiff plants slow, lower gives exactness away
-MIN_IMPLICIT_GAIN = 4.0
-# steps a sample that are implicit in a state, at least: fewer take crossings of rest so coarsely that estimates move,
-# more take longer
-MIN_IMPLICIT_SUBSTEPS = 4
-# factor on a stage's refinement where steps are implicit in a state [1]: lower leaves errors that add up along a log,
-# higher takes longer
-IMPLICIT_REFINEMENT = 4
-STABILITY_RESERVE = 1.3  # RK4 steps over those that it needs, as they are counted, below which it becomes unstable [1]
-# values of a state at which its growth rate is asked for, on either side of zero, and the range that they span [1]:
-# fewer may miss the steepest fall of friction, more take longer
-GROWTH_POINTS, GROWTH_RANGE = 12, 1e-3
 
 
 def choose_integration(

@@ -38,8 +38,8 @@ from pneuopt.studies.executors import Processes
 from pneuopt.studies.journal import CaseMarks, Journal
 from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
 from pneuopt.studies.sweep import sweep
+from pneuopt.studies.tolerances import CHUNK_A_CORE, MAX_PROBED, RATE_MARGIN, SAME_START, USUAL_TOLERANCE
 from pneuopt.tuning.space import (
-    MAX_LOOP_SUBSTEPS,
     LoopLanes,
     ReferenceGrid,
     dither_resolution_rate,
@@ -47,6 +47,7 @@ from pneuopt.tuning.space import (
     reference_grids,
     rk4_substeps,
 )
+from pneuopt.tuning.tolerances import MAX_LOOP_SUBSTEPS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,12 +56,6 @@ if TYPE_CHECKING:
 BATCH_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl")
 LANE_METRICS = tuple(n for n, m in METRICS.items() if m.source is not Source.LINEAR_LOOP and n != "StepEnvelope")
 """The metrics that lanes can tell: those of the response, the command and the meter."""
-CHUNK_A_CORE = 8
-"""Plants that a core runs before they are read: fewer fill no lanes; the responses of more leave its cache, for fresh
-pages, and 16 take two fifths longer."""
-USUAL_TOLERANCE = 0.01
-"""Share of a metric, or of its median over the plants, by which lanes and certificate may differ: a search claims no
-figure that differs by more."""
 
 CERTIFIED = "certified "  # before a plant's name where a journal keeps its certificate, beside its metrics in lanes
 
@@ -316,13 +311,6 @@ def _certify(
     return pd.DataFrame(rows, columns=["case", "metric", "batch", "certified", "difference", "agrees"])
 
 
-MAX_PROBED = 64
-"""Plants, beside those with an extreme value, whose fastest mode is sought: fewer may miss a stiff one, on which RK4
-is then unstable; each more costs an eigenvalue problem a plant and state."""
-RATE_MARGIN = 1.2
-"""Factor on the fastest mode found [1]: the plants that are not probed may be faster by that much."""
-SAME_START = 1e-9
-"""Share of the states' nominal sizes [1] by which starts differ by rounding: at 0 each plant's is computed anew."""
 RAN_AWAY = "the response runs away"
 
 

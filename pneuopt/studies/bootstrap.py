@@ -45,20 +45,11 @@ from pneuopt.quantities.status import Progress
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.studies.sweep import sweep
+from pneuopt.studies.tolerances import MAX_WANDER, MIN_CHANCE, MIN_ROWS, SIGNIFICANT
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_WANDER = 0.1
-"""Share of a channel's range [1] by which a simulated log may leave the fitted one: with more the excitation is another
-than the log's, with less the log falls into short parts, each with a start of its own, which tell less."""
-MIN_ROWS = 50
-"""Rows of a part of a log: a shorter one hardly tells more than its own start."""
-MIN_CHANCE = 0.01
-"""Chance [1] of so few intervals that hold the value, if each did so 95 times in 100, below which they are told: with
-a larger one good intervals are told too often, with a smaller one twenty draws tell nothing."""
-SIGNIFICANT = 3.0
-"""Deviations [1] of a mean from the value from which it is a bias, and no chance."""
 _DRAW = "draw"
 _RIGHT = tuple(check for check in CHECKS if check not in NEEDED)  # a simulated log jumps where it begins anew
 

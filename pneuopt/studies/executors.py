@@ -34,17 +34,19 @@ from typing import TYPE_CHECKING, Any
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet, check_number
 from pneuopt.studies.outcome import CaseFunction, CaseValues, Outcome, describe_error, evaluate_cases, limit_memory
+from pneuopt.studies.tolerances import (
+    CHUNK_SECONDS,
+    CHUNKS_A_WORKER,
+    CONNECT_SECONDS,
+    LIMIT_SHARE,
+    MAX_CHUNK,
+    MAX_PROCESSES,
+    TRIES,
+    UNKNOWN_WORKERS,
+)
 
 if TYPE_CHECKING:
     import loky
-
-
-CHUNK_SECONDS = 0.5
-"""Time that a chunk of cases shall take [s]: longer chunks lose more where a process dies, shorter ones cost more to
-send."""
-MAX_CHUNK = 1000
-"""Cases in a chunk [1]: more hold up the table, and fill the memory where each is large."""
-_TRIES = 2  # runs of a case whose process dies [1]: a second one tells a case that kills from a machine that went away
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class CaseQueue:
         """Take back a chunk whose process died: its cases are tried one by one; one that dies twice is said."""
         if len(chunk.cases) > 1:
             self._again.extend(Chunk({name: values}) for name, values in chunk.cases.items())
-        elif chunk.tries + 1 < _TRIES:
+        elif chunk.tries + 1 < TRIES:
             self._suspect.append(Chunk(chunk.cases, chunk.tries + 1))
         else:
             for name in chunk.cases:
@@ -111,7 +113,7 @@ class CaseQueue:
 
     def separate(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
         """Take back a chunk that took too long: a case alone is said, several are tried one by one."""
-        yield from self.give_back(Chunk(chunk.cases, _TRIES), reason)
+        yield from self.give_back(Chunk(chunk.cases, TRIES), reason)
 
     def _size(self) -> int:
         if not self._done:
@@ -121,15 +123,12 @@ class CaseQueue:
 
 
 Outcomes = Generator[tuple[str, Outcome], None, None]
-_MAX_PROCESSES = 60
-"""Processes at once: Windows cannot wait for more than 63, and each takes memory for CasADi and the model."""
 _THREADS_REMEDY = "in this process, executor=ThreadPoolExecutor()"
 _NO_START = (
     'the processes of a study cannot start; a script must call the study under `if __name__ == "__main__":`, '
     f"or compute {_THREADS_REMEDY}"
 )
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_LIMIT_SHARE = 0.25  # of a case's time limit that a chunk shall take [1]: one that takes all of it is cut up
 _packed = b""  # of a spawned process: its function, as it came
 _task: "tuple[CaseFunction, ParameterSet, Processes] | None" = None  # of a spawned process: what it evaluates
 
@@ -203,8 +202,8 @@ def run_in_processes(
     InputError
         If the function cannot travel, or no process can start.
     """
-    wanted = min(count, chosen.count or os.cpu_count() or 1, _MAX_PROCESSES)
-    queue = CaseQueue(cases, count, wanted, _LIMIT_SHARE * chosen.seconds)
+    wanted = min(count, chosen.count or os.cpu_count() or 1, MAX_PROCESSES)
+    queue = CaseQueue(cases, count, wanted, LIMIT_SHARE * chosen.seconds)
     crew = _Crew(pickle_function(fn, parameters, chosen), chosen)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="A worker was restarted")  # its chunk is given to its successor
@@ -395,12 +394,7 @@ def pickle_function(fn: CaseFunction, *others: object) -> bytes:
         ) from None
 
 
-_CHUNKS_A_WORKER = 3
-"""Chunks that wait for each worker [1]: fewer leave it idle while a result travels, more fill the memory."""
 _ChunkFunction = Callable[[list[CaseValues]], list[Outcome]]
-UNKNOWN_WORKERS = 64
-"""Workers [1] of an executor that does not say how many it has, or of a cluster that may grow: more make chunks so
-small that each costs more to send than to compute, fewer leave workers idle."""
 
 
 def run_in_executor(
@@ -416,7 +410,7 @@ def run_in_executor(
     running: dict[Future[list[Outcome]], Chunk] = {}
     try:
         while queue or running:
-            while len(running) < _CHUNKS_A_WORKER * workers and (chunk := queue.take(alone=not running)):
+            while len(running) < CHUNKS_A_WORKER * workers and (chunk := queue.take(alone=not running)):
                 yield from _submit(executor, task, chunk, running)
             done = wait(running, return_when=FIRST_COMPLETED).done
             for future in [future for future in running if future in done]:  # in the order of the cases
@@ -480,7 +474,6 @@ def _receive_chunk(future: "Future[list[Outcome]]", chunk: Chunk, queue: CaseQue
 LOCAL_CLUSTER = "dask"
 """The word for a cluster of dask on this machine, which is there for the study alone."""
 _SCHEMES = ("tcp://", "tls://", "ws://", "wss://", "ucx://")
-_CONNECT_SECONDS = 10.0  # patience with a scheduler [s]: shorter gives up on a slow net, longer looks like a hang
 
 _OWN_CLUSTER: dict[str, Any] = {
     "distributed.scheduler.allowed-failures": 0,  # the study itself tries again, case by case
@@ -552,7 +545,7 @@ def _make_client(distributed: Any, where: str) -> Iterator[Any]:
             yield client
         return
     try:
-        client = distributed.Client(where, timeout=_CONNECT_SECONDS)
+        client = distributed.Client(where, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:
         raise InputError(f"executor {where}: there is no dask scheduler ({' '.join(str(error).split())})") from None
     with client:

@@ -23,12 +23,11 @@ from pneuopt.quantities.output import format_cell, write_bytes, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import provenance
 from pneuopt.studies.outcome import CaseValues, Outcome
+from pneuopt.studies.tolerances import REWRITE_SECONDS, REWRITE_SHARE, SYNC_SECONDS
 
 PARQUET = ".parquet"
 """What the name of a file ends in that is Parquet; any other is CSV."""
 LAST_COLUMNS = ("seconds", "error")
-_REWRITE_SECONDS = 5.0  # least time between two Parquet files [s]: less writes without end, more is lost with a kill
-_REWRITE_SHARE = 0.05  # most of the time that may go into writing them [1]
 _Row = Mapping[str, Any]
 
 
@@ -181,7 +180,7 @@ class _ParquetRows:
         begun = time.monotonic()
         write_bytes(self._path, parquet_bytes({n: self._columns[n] for n in _order([self._columns], self._last)}))
         self._is_written, now = True, time.monotonic()
-        self._due = now + max(_REWRITE_SECONDS, (now - begun) / _REWRITE_SHARE)
+        self._due = now + max(REWRITE_SECONDS, (now - begun) / REWRITE_SHARE)
 
 
 def parquet_bytes(columns: Mapping[str, Sequence[Any]]) -> bytes:
@@ -204,11 +203,6 @@ def _order(rows: Iterable[Iterable[str]], last: Sequence[str]) -> list[str]:
     """All columns in the order in which they came, time and error last."""
     seen = dict.fromkeys(n for row in rows for n in row)
     return [*(n for n in seen if n not in last), *(n for n in last if n in seen)]
-
-
-_SYNC_SECONDS = 1.0
-"""Time between two waits for the disk [s]: only what came since is lost where the machine itself loses power; a wait a
-case slows quick cases down. A process that is killed loses nothing."""
 
 
 class Journal:
@@ -303,7 +297,7 @@ class Journal:
         self._file.write("\n" * self._is_cut + "".join(f"{line}\n" for line in lines))
         self._file.flush()
         self._is_cut = False
-        if time.monotonic() - self._synced > _SYNC_SECONDS:
+        if time.monotonic() - self._synced > SYNC_SECONDS:
             os.fsync(self._file.fileno())
             self._synced = time.monotonic()
 

@@ -17,14 +17,12 @@ from pneuopt.studies.executors import Processes
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction
 from pneuopt.studies.sweep import grid, sweep
+from pneuopt.studies.tolerances import BREAK_RATIO
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Places = Mapping[str, Mapping[float, int]]
-# Ratio to the best neighbour from which a cell breaks with it. A smaller one computes cells again on a steep slope; a
-# larger one leaves local optima in the table.
-BREAK_RATIO = 3.0
 
 
 def sweep_from_neighbours(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pneuopt.quantities.errors import InputError, PneuoptError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.studies.tolerances import MEGABYTE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,9 +112,6 @@ def _check_plain(value: Any, name: str) -> Any:
     return value
 
 
-_MEGABYTE = 2**20
-
-
 def limit_memory(megabytes: float) -> None:
     """Let this process have so much more memory than it has now; beyond it an allocation fails.
 
@@ -125,6 +123,6 @@ def limit_memory(megabytes: float) -> None:
 
     with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123 - no file of ours
         pages = int(file.read().split()[5])  # data and stack
-    most = pages * resource.getpagesize() + int(megabytes * _MEGABYTE)
+    most = pages * resource.getpagesize() + int(megabytes * MEGABYTE)
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     resource.setrlimit(resource.RLIMIT_DATA, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))

@@ -38,16 +38,13 @@ from pneuopt.studies.executors import Processes
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.outcome import CaseFunction
 from pneuopt.studies.sweep import sweep
+from pneuopt.studies.tolerances import MAX_LOST, RESAMPLES, SIDE, SPREAD_POINTS, START_SIDE
 from pneuopt.tuning.space import LoopLanes, ReferenceGrid, read_metrics
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-MAX_LOST = 0.1
-"""Share of points [1] without a figure, beyond which its indices are not given: they would tell of other plants."""
-RESAMPLES = 400
-"""Bootstrap samples of an index: fewer make its ends jump, more only take time."""
 _COLUMNS = tuple(f"{index}{end}" for index in ("first", "total") for end in ("", "_low", "_high"))
 
 
@@ -237,13 +234,6 @@ def _row(axis: str, row: "pd.Series[Any]") -> tuple[str, ...]:
 
 
 LOCAL_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError")
-SPREAD_POINTS = 64
-"""Quantiles of an axis from which its standard deviation is computed [1]: fewer cut a normal's tails, 2 % here."""
-SIDE = 1e-4
-"""Part of a standard deviation by which a response is moved along its sensitivity [1]: with a larger one a figure that
-bends is off, with a smaller one its digits are lost in the difference."""
-START_SIDE = 1e-3
-"""The same for the state before the step, which is found by iteration, to fewer digits."""
 GRID_PARAMETERS = ("dither.frequency",)
 """Parameters with which the samples of a response move: its derivative at samples that stay is not the figure's."""
 

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
-from pneuopt.dynamics.simulate import MAX_STEPS
+from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Band
 from pneuopt.quantities.errors import InputError, check_names, require
@@ -43,13 +43,12 @@ from pneuopt.quantities.units import si_conversion, write_value
 from pneuopt.studies.executors import Processes, run_in_executor, run_in_processes
 from pneuopt.studies.journal import CaseMarks, Journal
 from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, CaseValues, Outcome
+from pneuopt.studies.tolerances import MAX_TABLE_BYTES, RATE_AFTER
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-MAX_TABLE_BYTES = 2**28
-"""Size of a table of cases [byte], 256 MiB: more fills the memory; less refuses a million cases of ten parameters."""
 _NAMES = "case"  # the column of a table that names its cases, as in the table that `sweep` returns
 
 
@@ -273,9 +272,6 @@ def _check_column_names(outcome: Outcome, taken: set[str]) -> Outcome:
     return Outcome(seconds=outcome.seconds, error=said)
 
 
-_RATE_AFTER = 5.0  # time after the first case until a rate is shown [s]: earlier ones jump
-
-
 def sweep(
     fn: CaseFunction,
     parameters: ParameterSet,
@@ -373,7 +369,7 @@ class _Meter:
         rows, now = self._rows, time.monotonic()
         known, begun = self._first = self._first or (rows.done, now)
         text = f"{rows.done} of {rows.count} cases" + (f", {rows.failed} failed" if rows.failed else "")
-        if now - begun < _RATE_AFTER:
+        if now - begun < RATE_AFTER:
             return text
         rate = (rows.done - known) / (now - begun)
         left = round((rows.count - rows.done) / rate)

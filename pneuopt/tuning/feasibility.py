@@ -15,7 +15,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Reference, Step
 from pneuopt.evaluation.certificate import describe_counts, sees_speed
 from pneuopt.evaluation.margins import are_stable
-from pneuopt.evaluation.metric import TAIL_SHARE, band_share
+from pneuopt.evaluation.metric import band_share
 from pneuopt.evaluation.moves import check_motion
 from pneuopt.evaluation.requirements import (
     FollowingError,
@@ -29,24 +29,15 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.response import TuningCase, check_travel, highest_dither_frequency
 from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.tolerances import TAIL_SHARE
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 from pneuopt.tuning.space import Space
+from pneuopt.tuning.tolerances import BISECTION_STEPS, JUST_BELOW, LEAST_GROWTH, MAX_CORNER_NAMES, POINTS_INSIDE
 
 SIGNED_GAINS = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")  # which turn with the actuator; times and ratios do not
-# Growth of a deviation over the horizon, in its logarithm, below which nothing is called unstable before a search. A
-# smaller one meets the rounding of poles at zero; a larger one leaves slow instabilities to the certificate.
-LEAST_GROWTH = 1e-3
-JUST_BELOW = 0.999  # of a pole: where the number of poles beyond is counted, far from rounding
-# Parameters over whose corners a loop's instability is proved, at most: their corners double with each.
-MAX_CORNER_NAMES = 10
-# Points within the bounds that count beside the corners. Fewer may miss a dither that stabilises the loop.
-POINTS_INSIDE = 100
-# Bisections for the largest part of a reference that can be held. Fewer make the message's figure coarse; each more
-# costs an equilibrium.
-BISECTION_STEPS = 10
 
 
 def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Space, spec: Specification) -> None:

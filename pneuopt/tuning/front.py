@@ -20,7 +20,7 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
-from pneuopt.dynamics.simulate import MAX_STEPS
+from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.requirements import (
     Requirement,
     metric_name,
@@ -43,27 +43,17 @@ from pneuopt.tuning.relaxation import limits_with_settling
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, end_point
 from pneuopt.tuning.simulator import to_records
+from pneuopt.tuning.tolerances import (
+    LOG_SPACING_RATIO,
+    MAX_IMPROVEMENT_ROUNDS,
+    MIN_IMPROVEMENT,
+    RIVAL_SAMPLES,
+    SECONDARY_WEIGHT,
+)
 from pneuopt.tuning.tune import prepare_search, prepare_task
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-# Ratio of the ends from which on the limits lie evenly in the logarithm. With a larger one a wide front has one design
-# in its lowest decade; with a smaller one the limits of a narrow front are needlessly uneven.
-LOG_SPACING_RATIO = 8.0
-# Rounds of searching again for designs that others beat. Fewer leave such designs in the table; each more costs a
-# search for each of them.
-MAX_IMPROVEMENT_ROUNDS = 2
-# Points at which all requirements are read in search of branches that neither end leads to. Fewer miss branches; each
-# more costs a simulation of every case.
-RIVAL_SAMPLES = 2000
-# Relative improvement from which another design counts as better. A smaller one repeats searches for rounding; a larger
-# one leaves designs in the table that another beats.
-MIN_IMPROVEMENT = 1e-3
-# Weight of the other requirement at an end, relative to the one that is best there. At zero, an arbitrary one is taken
-# of designs that are equally good by the first; a larger one moves the end inwards.
-SECONDARY_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,6 @@ from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
 from pneuopt.evaluation.metric import (
-    RIPPLE_ALLOWANCE,
-    TAIL_SHARE,
     DitherPeriodMean,
     SettlingBand,
     StepRecord,
@@ -46,7 +44,7 @@ from pneuopt.evaluation.metric import (
     ripple_and_slopes,
     wave_instants,
 )
-from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS, Envelope
+from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.requirements import (
     PUSH,
     REQUIREMENT_KINDS,
@@ -57,12 +55,12 @@ from pneuopt.evaluation.requirements import (
     requirement_values,
 )
 from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.tolerances import MIN_SETTLED_PERIODS, RIPPLE_ALLOWANCE, TAIL_SHARE
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import require
-from pneuopt.tuning.simulator import KEPT_STATES, ResponsePoints, Simulator, to_records
+from pneuopt.tuning.simulator import ResponsePoints, Simulator, to_records
 from pneuopt.tuning.space import (
     CONTROL_OUTPUT,
-    INTEGRAL_OUTPUT,
     SIGNAL_OUTPUT,
     ReferenceGrid,
     Space,
@@ -70,23 +68,26 @@ from pneuopt.tuning.space import (
     loop_pieces,
     meter_values,
 )
-
-# Curvature of the quadratic program over the objective's slope. At 1e-5 the solver fails on nearly flat programs; a
-# larger one shortens the steps.
-QP_CURVATURE = 3e-3
-# Numbers of rows are rounded up to multiples of it, so that few programs are built. With a smaller one each program is
-# built anew; a larger one makes the solver work on empty rows.
-ROW_PADDING = 32
-# Rounds in which rows that a step violates are added to its program. Fewer may return a step that violates rows; each
-# more costs a program.
-MAX_CUTTING_ROUNDS = 20
-# Violation from which a row is added, as rows count. A smaller one adds rows for rounding errors; a larger one leaves
-# violations in the step.
-VIOLATION_TOLERANCE = 1e-7
-# Actual over predicted decrease below which the trust region shrinks, and above which it grows. Higher ones keep steps
-# short; lower ones accept steps that the linearisation does not predict.
-SHRINK_GAIN_RATIO, GROW_GAIN_RATIO = 0.25, 0.75
-INFINITE_BOUND = 1e20  # stands for no bound; a smaller one might be reached by a slack of a badly scaled objective
+from pneuopt.tuning.tolerances import (
+    DIFFERENCE_STEP,
+    GROW_GAIN_RATIO,
+    INFINITE_BOUND,
+    INTEGRAL_OUTPUT,
+    KEPT_STATES,
+    MAX_CUTTING_ROUNDS,
+    MAX_SENSITIVITY_LANES,
+    NEAR_LIMIT,
+    NODES,
+    PENALTY_RAISES,
+    PROGRAM_BAND_PENALTY,
+    PROGRAM_LIMIT_PENALTY,
+    PROGRAM_MARGIN,
+    QP_CURVATURE,
+    ROW_PADDING,
+    SETTLING_RADIUS_RATIO,
+    SHRINK_GAIN_RATIO,
+    VIOLATION_TOLERANCE,
+)
 
 
 @dataclass(frozen=True)
@@ -375,22 +376,6 @@ def _qp_solver(n: int, m: int) -> Any:
 ROW_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.slope is not None)
 SMOOTH_REQUIREMENTS: tuple[type[Requirement], ...] = (SettlingTime, *ROW_REQUIREMENTS, *ROBUSTNESS_REQUIREMENTS)
 """Requirements of which there are derivatives to the gains."""
-# Least penalty of leaving the settling band by the whole step, over the objective's scale. With a smaller one leaving
-# the band pays; with a larger one a search stays in the first basin that it meets.
-PROGRAM_BAND_PENALTY = 50.0
-# Penalty of exceeding a limit by its own size, over the objective's scale; below and above as for the band.
-PROGRAM_LIMIT_PENALTY = 2.0
-# Trust region of Ts over that of the gains, both fractions of their ranges. At 1 the settling time, not the gains, held
-# steps back; far above it the linearisation in time fails first.
-SETTLING_RADIUS_RATIO = 5.0
-# Lanes with sensitivities that are run and read at a time. Fewer leave cores idle; more do not fit the cache.
-MAX_SENSITIVITY_LANES = 64
-# Share of a limit on a margin from which on it has derivatives. Below it no step of a descent reaches the limit; nearer
-# to it a step breaks a limit that it did not see; farther ones cost a frequency response a gain.
-NEAR_LIMIT = 0.75
-# Step of the difference quotients of margins and rest, a fraction of a gain's range. A smaller one divides rounding
-# errors; a larger one linearises a curved function.
-DIFFERENCE_STEP = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -869,11 +854,6 @@ def _move(signal: ValuesAndSlopes, mean: ValuesAndSlopes, reach: ValuesAndSlopes
 # meets has derivative zero.
 NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
 QUANTISER_PARAMETERS = ("sensor.resolution",)  # an encoder's: its counts make responses piecewise flat
-# Share by which the programs' band and limits are tighter than the search's. With less, a solution, which lies on its
-# limits, breaks them between the nodes; more gives performance away.
-PROGRAM_MARGIN = 0.005
-PENALTY_RAISES = 2  # descents with penalties ten times the last where limits stay broken; more slow each program
-NODES = 2000  # instants at which a response is read, at most: fewer miss what a response does between them
 
 
 def nonsmooth_terms(loop: ClosedLoop, space: Space, spec: Specification) -> list[str]:

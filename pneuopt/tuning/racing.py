@@ -28,7 +28,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from pneuopt.dynamics.compiled.race import RACE_VALUES, RaceCourse, RaceField, RaceMerit, race
-from pneuopt.evaluation.metric import EDGE_ROUNDING, Band, band_number, band_share, band_unit
+from pneuopt.evaluation.metric import Band, band_number, band_share, band_unit
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     ROBUSTNESS_REQUIREMENTS,
@@ -40,22 +40,50 @@ from pneuopt.evaluation.requirements import (
     metric_name,
     upper_limit,
 )
-from pneuopt.evaluation.specification import STABILITY_SENSITIVITY, Specification
+from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.tolerances import EDGE_ROUNDING, STABILITY_SENSITIVITY
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import check_argument, check_number
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.gradients import Polish
 from pneuopt.tuning.method import SearchResult, TuningTask, check_method_options
-from pneuopt.tuning.simulator import KEPT_STATES, Responses, Simulator, to_records
-from pneuopt.tuning.space import RUNAWAY_LEVEL, WORST_MERIT, Space, penalty_settling_time
+from pneuopt.tuning.simulator import Responses, Simulator, to_records
+from pneuopt.tuning.space import Space, penalty_settling_time
+from pneuopt.tuning.tolerances import (
+    AGREEMENT,
+    BAND_SHARES,
+    BEST_SHARE,
+    CUT_SETTLING_TIMES,
+    FEW_BEST,
+    FINE_MEMBERS,
+    KEPT_STATES,
+    LAGGING,
+    LEAST_CUT,
+    LEAST_MEMBERS,
+    LEAST_PROGRESS,
+    LEAST_SHORT_TRIALS,
+    LEAST_SPREAD,
+    LENGTH_SPREAD,
+    LIMIT_TOLERANCE,
+    MAX_RECORDED_NUMBERS,
+    MEMORY_OF_KILLS,
+    MEMORY_SIZE,
+    MIN_DISTANCE,
+    NEARBY,
+    NO_DITHER,
+    PATIENCE,
+    POLISHED,
+    POLISHED_NEARBY,
+    RATE_SPREAD,
+    RUNAWAY_LEVEL,
+    SHORT_MEMBERS,
+    SIMULATION_PEAK_MARGIN,
+    START_SHARES,
+    VIOLATION_PENALTY,
+    WORST_MERIT,
+)
 
-# Share of its weight that a case's victory keeps from race to race. Below, the order of the cases follows chance; near
-# 1, it lags behind the search.
-MEMORY_OF_KILLS = 0.95
-# Numbers that a race records, at most. Fewer split a generation into several races, whose lanes idle at each end; more
-# take memory (8 bytes each).
-MAX_RECORDED_NUMBERS = 2**25
 # What may be asked for where responses are cut short: nothing of it grows after the response has settled.
 CUT_REQUIREMENTS = (SettlingTime, Overshoot, PeakControl, ControlRate, *ROBUSTNESS_REQUIREMENTS)
 
@@ -222,15 +250,6 @@ def _merit_bounds(spec: Specification, bands: Sequence[Band]) -> RaceMerit:
     return RaceMerit(edges, weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL)
 
 
-# Entries of the memory of successful step lengths and crossover rates. Fewer follow chance; more forget too slowly.
-MEMORY_SIZE = 6
-# Share of the population that counts as its best, towards which every trial moves: a smaller one draws the population
-# into the first basin, a larger one slows it down.
-BEST_SHARE = 0.15
-# Spread of the step lengths (Cauchy) and the crossover rates (normal) about their memory, as published.
-LENGTH_SPREAD, RATE_SPREAD = 0.1, 0.1
-
-
 class SuccessHistory:
     """A population of points of the unit cube with their merits, and what its trials have taught it.
 
@@ -330,16 +349,7 @@ def _others(m: int, size: int, rng: np.random.Generator) -> tuple[Indices, Indic
     return one, third + (third >= high)
 
 
-# Relative excess over a limit with which a search still counts as successful. At zero, rounding errors make a design
-# that lies on its limit infeasible; a larger one hands over designs whose certificate is bound to fail.
-LIMIT_TOLERANCE = 1e-4
-# Share of the margin that limits on peaks of command and sensitivity are tightened by. A smaller one than a search's
-# coarse samples miss of a peak makes the certificate fail; a larger one gives performance away.
-SIMULATION_PEAK_MARGIN = 1 / 5
 WIDEN_BOUNDS = "widen the gains' bounds, or lower their lower ends"  # the remedy where no stable loop is found
-# Weight of a limit's relative violation beside that of never settling. With a smaller one a search stays with designs
-# that settle and break a limit; with a larger one with loops so slow that they keep every limit and never settle.
-VIOLATION_PENALTY = 20.0
 
 
 def compute_merits(values: Mapping[str, Array], spec: Specification, scale: float) -> Array:
@@ -413,43 +423,6 @@ def _active_limits(space: Space, spec: Specification, point: Array, values: Mapp
     low, up = space.bounds.T
     near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
     return (*limits, *(n for n, held in zip(space.names, near, strict=True) if held))
-
-
-# Shares of the trials that the starts get on coarse samples; the rest is for fine ones. Less for the first ends in the
-# nearest optimum, less for the second is no second opinion, less for the rest leaves an optimum of the coarse samples.
-START_SHARES = (0.5, 0.35)
-# Shares of a start's trials over all bands, and over the nearest wider one. Less ends in the nearest optimum; more
-# leaves the band asked for too few.
-BAND_SHARES = (0.4, 0.25)
-# Generations over which the best merit, or the median, must improve by this share for a phase to go on, and the spread
-# of the whole population, a share of its best, below which it ends. Shorter or larger ends a search that still
-# advances; so does to look at the best alone, which stands while the others catch up.
-PATIENCE, LEAST_PROGRESS, LEAST_SPREAD = 25, 1e-3, 1e-4
-# Members of the phase on fine samples. Fewer lose the optimum where coarse and fine samples rank points differently;
-# each more costs fine simulations.
-FINE_MEMBERS = 20
-# Best points of the first start from which the second one begins, and its amplitudes, a share of their range: hardly
-# any dither, where optima lie that a population with dither does not see.
-FEW_BEST, NO_DITHER = 6, 0.02
-# Points, as far from each other as this share of a gain's range, that gradients improve at a time, on whole responses:
-# cut ones end at other operating points, whose margins they meet. Fewer or farther points miss basins; each more costs
-# a descent, and closer ones end in the same point. A search near its start has fewer trials, so it gets more points.
-POLISHED, POLISHED_NEARBY, MIN_DISTANCE = 2, 4, 0.03
-AGREEMENT = 0.01  # relative difference of two starts' merits that count as one: larger ones hide a second optimum
-# Best merit after the wide bands, over that with which the first start ended, from which on a start is given up; and a
-# point's merit over the best, from which on gradients leave it. A smaller one gives up what gradients may still bring
-# to the front; a larger one searches on behind it.
-LAGGING = 1.3
-# Best settling times, and shares of the horizon, that a race sees of each response, whichever is longer. Less takes for
-# settled what leaves the band later; more simulates what seldom changes a merit. Each new best is proved on the whole.
-CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15
-# Trials for each free gain of a short search, unless the whole one has fewer. With 200 the smallest relaxation of one
-# gain's limit came out 4 % too large; more cost time where there are many gains.
-LEAST_SHORT_TRIALS = 400
-# Members of a search, at least: a trial mixes four of them. Share of them in a short search: more take generations
-# from its trials, fewer leave it to its start.
-LEAST_MEMBERS, SHORT_MEMBERS = 5, 0.6
-NEARBY = 0.05  # spread about a start that is close, a share of each range: a wider one leaves it, a narrower one sticks
 
 
 @dataclass(frozen=True)

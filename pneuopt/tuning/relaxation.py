@@ -14,22 +14,14 @@ import numpy as np
 from scipy.optimize import minimize
 
 from pneuopt.control.reference import Reference
-from pneuopt.evaluation.metric import TAIL_SHARE, Requirement, Sense
+from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import SettlingTime, upper_limit, user_limit, with_user_limit
 from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.tolerances import TAIL_SHARE
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-
-# Significant digits of a relaxed limit, rounded so that the design that was found keeps it. Fewer relax it needlessly;
-# more claim a precision that a search does not have.
-RELAXED_LIMIT_DIGITS = 3
-# Relative excess over its limits that a response counts as which never settles, before its error at the end is added.
-# A smaller one prefers such a response to one that settles and breaks a limit; a larger one only changes the scale.
-UNSETTLED_EXCESS = 10.0
-# Simulations of the local search for all limits together. Fewer report a relaxation larger than is needed; more cost
-# time in proportion.
-MAX_LOCAL_SIMULATIONS = 200
+from pneuopt.tuning.tolerances import MAX_LOCAL_SIMULATIONS, RELAXED_LIMIT_DIGITS, UNSETTLED_EXCESS
 
 
 def relaxation_specification(

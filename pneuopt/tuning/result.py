@@ -28,17 +28,13 @@ from pneuopt.quantities.results import NOT_SAVED, Result
 from pneuopt.quantities.status import Code, Status, report_status
 from pneuopt.quantities.units import write_value
 from pneuopt.tuning.relaxation import describe_relaxations
+from pneuopt.tuning.tolerances import ACTIVE_ROOM, MIN_DERIVATIVE_RATIO
 from pneuopt.tuning.validation import DesignValidation, report_validation, report_validation_verdict
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Room left of a limit, a fraction of it, within which it counts as active. A smaller one misses limits that the
-# search's margin keeps a design away from; a larger one names limits that hold nothing back.
-ACTIVE_ROOM = 0.02
 RELAXATION_COLUMNS = ("asked", "needed", "share")
-MIN_DERIVATIVE_RATIO = 0.01
-"""Td/Tf below which a derivative adds less than 1 % to Kp at any frequency: its time would be a riddle."""
 
 
 class Refusal(Enum):

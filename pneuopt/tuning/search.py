@@ -64,17 +64,27 @@ from pneuopt.tuning.result import (
 )
 from pneuopt.tuning.simulator import Simulator, to_records, worst_values
 from pneuopt.tuning.space import Space
+from pneuopt.tuning.tolerances import (
+    CANDIDATE_DISTANCE,
+    HORIZON_FACTORS,
+    MARGINS_TO_TRY,
+    MAX_CANDIDATES,
+    MAX_CERTIFIED_EXCESS,
+    MAX_CERTIFIED_POINTS,
+    MAX_DEFECTS_TOLD,
+    MAX_REFINED_SEARCHES,
+    MEMBERS_A_GAIN,
+    RELAXATION_MARGIN,
+    ROUNDING_ROUNDS,
+    SAMPLING_TOLERANCE,
+    SEED,
+    TRIALS_A_GAIN,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-# Relative difference of the certified from the claimed objective that a certificate allows, up or down. A smaller one
-# refuses designs for the search's coarser samples; a larger one certifies designs whose response grazes the band, and
-# claims that the search has misread.
-MAX_CERTIFIED_EXCESS = 0.01
-# Defects that a status tells: fewer hide that there are several; more bury the remedy.
-MAX_DEFECTS_TOLD = 3
 # What is said of a design that has no value of a metric; where nothing stands here, it "has no" that metric.
 WORDS_WITHOUT_VALUE = {
     SettlingTime.metric.name: "does not settle within its horizon",
@@ -290,32 +300,10 @@ def _contact_status(contacts: Sequence[str]) -> Status:
     return Status(Code.NOT_CERTIFIED, (*dict.fromkeys(contacts), remedy))
 
 
-# Margins tried, each twice the one before. Fewer give up on designs that need more room to survive the certificate;
-# each more costs another search where no design exists.
-MARGINS_TO_TRY = 3
 # Defects of designs that no requirement makes move to the reference and stay there.
 ENDS_ELSEWHERE = (Defect.STANDS_STILL, Defect.MISSES_REFERENCE, Defect.CREEPS, Defect.NEVER_SETTLES)
-# Rounded designs certified at each margin, at most. Fewer miss the one that survives; each more costs an independent
-# simulation of every case.
-MAX_CERTIFIED_POINTS = 5
-# Rounds in which the neighbours of the best rounded design are simulated. Fewer miss a rounding that loses next to
-# nothing; more move the design away from the one that was found.
-ROUNDING_ROUNDS = 3
-# Horizons over which a design is sought whose rival hunted or crept after one, the first that the stroke allows: fewer
-# do not show it; more cost time in proportion.
-HORIZON_FACTORS = (4.0, 2.8, 2.0, 1.4)
 # Defects of responses that a longer horizon, over which they have to settle, shows to a search.
 LATE_DEFECTS = (Defect.GROWS, Defect.HUNTS, Defect.CREEPS, Defect.NEVER_SETTLES, Defect.UNDECIDED)
-# Searches on closer samples or with shorter steps, at most: fewer claim figures of responses that are not resolved;
-# more cost a search each.
-MAX_REFINED_SEARCHES = 3
-# Change of a requirement on closer samples, relative to its value and its limit, above which a search is repeated on
-# them. A smaller one repeats searches for digits that no ranking needs; a larger one claims figures that the
-# certificate refuses.
-SAMPLING_TOLERANCE = 5e-3
-# Margin of the search for the least relaxation of a limit, a fraction. A larger one reports more than is needed; at
-# zero the design found does not survive its certificate.
-RELAXATION_MARGIN = 0.002
 UNTRIED = "it was not tried on other plants"
 
 
@@ -714,15 +702,6 @@ def _improve(search: Search, longer: Search, held: TuningResult) -> tuple[Tuning
         return held, True
     before, after = (certified_objective(search.spec, result) for result in (held, better))
     return (better if better.status.converged and after < before else held), False
-
-
-# Members of the population and trials in all, for each free gain. Fewer miss designs that keep the limits; more delay
-# the answer where there is none.
-MEMBERS_A_GAIN, TRIALS_A_GAIN = 15, 900
-SEED = 0  # of the random numbers, so that an answer repeats
-# Designs that are certified one after the other, at most, and how far apart they lie, a share of a gain's range. Fewer
-# or closer ones fail alike; each more costs an independent simulation of every case.
-MAX_CANDIDATES, CANDIDATE_DISTANCE = 8, 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,20 +23,20 @@ from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import names
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.batch_margins import MarginFunction, batch_margin_function
 from pneuopt.evaluation.margins import first_largest, lowest_noise_frequency, without_ripple
-from pneuopt.evaluation.metric import RIPPLE_ALLOWANCE, Band, Source, move_towards
+from pneuopt.evaluation.metric import Band, Source, move_towards
 from pneuopt.evaluation.metrics import check_channels
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS, larger_is_better, requirement_values
-from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, cases
+from pneuopt.evaluation.response import cases
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.tolerances import RIPPLE_ALLOWANCE, SAMPLES_A_DITHER_PERIOD
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.space import (
     CONTROL_OUTPUT,
-    MAX_LOOP_SUBSTEPS,
     SIGNAL_OUTPUT,
     LoopLanes,
     ReferenceGrid,
@@ -50,10 +50,15 @@ from pneuopt.tuning.space import (
     speed_output,
     starts_before_step,
 )
-
-# Samples between two states that a run keeps, from which a second one sets out for the fastest sample. Fewer take
-# memory and time to write; more lengthen that second run.
-KEPT_STATES = 64
+from pneuopt.tuning.tolerances import (
+    COARSE_SAMPLES_A_PERIOD,
+    KEPT_STATES,
+    MAX_CHUNK_LANES,
+    MAX_LOOP_SUBSTEPS,
+    MAX_MIXED_LANES,
+    MAX_SAMPLE_ANGLE,
+    STIFFEST_CORNERS,
+)
 
 
 class ResponsePoints(NamedTuple):
@@ -369,20 +374,6 @@ class MarginReader:
 HEADLINES = {name: metric.source is Source.LINEAR_LOOP for name, metric in METRICS.items() if metric.headline}
 BASE_METRICS = (*(name for name, linear in HEADLINES.items() if not linear), "SettlingTimeRaw", "Ripple", "Excess")
 BASE_MARGINS = tuple(name for name, linear in HEADLINES.items() if linear)
-# Lanes up to which different references run together, the shorter ones padded. Fewer leave a processor's lanes empty;
-# more waste time on the padding.
-MAX_MIXED_LANES = 32
-# Lanes that are run and read at a time. Fewer leave cores idle; the responses of more do not fit a processor's cache.
-MAX_CHUNK_LANES = 128
-# Samples of a dither period during a search. Fewer shift settling times by more: at ten by 0.1 ms on the drive of
-# problems/speed/t32.py, 3 ms at worst; more cost time in proportion.
-COARSE_SAMPLES_A_PERIOD = 10
-# Corners of the gains' box, the fastest on the nominal plant, at which the fastest mode is sought on the scenarios'
-# plants. Fewer may miss a stiff one, on which RK4 is then unstable; each more costs an eigenvalue problem a plant.
-STIFFEST_CORNERS = 8
-# Highest frequency at which a sampled loop is read, times its sample time [rad]: below ten, its last crossings are
-# missed; more thin out the grid.
-MAX_SAMPLE_ANGLE = 20.0
 LaneRun = tuple[Array, Array, Array]  # states at every `KEPT_STATES`-th sample, outputs and end states of lanes
 
 

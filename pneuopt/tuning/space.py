@@ -19,11 +19,11 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, RolloutResult
-from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA, rk4
+from pneuopt.dynamics.integrators import rk4
 from pneuopt.dynamics.system import names
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.metric import Band, DitherPeriodMean, band_share
 from pneuopt.evaluation.metrics import (
-    MAX_REFINEMENTS,
     BandCentre,
     Envelope,
     batch_metrics,
@@ -34,8 +34,6 @@ from pneuopt.evaluation.metrics import (
 )
 from pneuopt.evaluation.requirements import FOLLOWING_METRICS, PUSH
 from pneuopt.evaluation.response import (
-    MAX_READINGS_A_SAMPLE,
-    SAMPLES_A_DITHER_PERIOD,
     TuningCase,
     command_range,
     highest_dither_frequency,
@@ -43,19 +41,19 @@ from pneuopt.evaluation.response import (
     readings_a_sample,
     sample_spacing,
 )
+from pneuopt.evaluation.tolerances import MAX_READINGS_A_SAMPLE, MAX_REFINEMENTS, SAMPLES_A_DITHER_PERIOD
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-
-# RK4 steps between two samples, at most. A lower limit refuses stiff loops that could be run; with a higher one a
-# search whose bounds let a filter get too fast takes hours instead of naming them.
-MAX_LOOP_SUBSTEPS = 100
-# Distance from a bound, a fraction of the range, within which a gain is rounded to the bound. A larger one moves gains
-# that matter; below a solver's tolerance an unused derivative time is printed as 1e-9 s.
-BOUND_DISTANCE = 1e-6
-# Rounded points around a design that are simulated, at most: 5^4, all that differ by two last places or less in four
-# gains. Fewer miss roundings that keep the limits; each more costs a simulation.
-MAX_ROUNDING_POINTS = 625
+from pneuopt.tuning.tolerances import (
+    BOUND_DISTANCE,
+    INTEGRAL_OUTPUT,
+    MAX_LOOP_SUBSTEPS,
+    MAX_ROUNDING_POINTS,
+    RUNAWAY_LEVEL,
+    SEARCH_TOLERANCE,
+    WORST_MERIT,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,13 +295,6 @@ def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> 
 
 # Indices of the outputs that are run: the measured signal, the command, then the meter's channels one after another.
 SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT = range(3)
-INTEGRAL_OUTPUT = -1  # index of the signal's integral, under dither the last output and the last state
-# Size of an output [its unit] from which a response counts as running away. A lower level may be reached by sound
-# signals in small units (pressures in Pa); beyond a higher one the metrics of a diverging response lose their digits.
-RUNAWAY_LEVEL = 1e12
-# The largest objective that a search tells apart, in place of infinity. Below what objectives reach (seconds, percent,
-# volts) good designs would tie; far above it the grading of broken limits, which is multiplied by it, loses digits.
-WORST_MERIT = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -546,11 +537,6 @@ def meter_values(y: Array, channels: Sequence[str]) -> dict[str, Array]:
 def penalty_settling_time(scale: float, excess: Array) -> Array:
     """The settling time that a search assigns to a response that never settles [s], larger for a larger error."""
     return np.asarray(scale * (2 + np.minimum(excess, WORST_MERIT)))
-
-
-# Multiple of the tolerances of a certificate's readings that a search's samples keep. A smaller one searches on more
-# samples than a ranking of designs needs; a larger one claims figures that the certificate refuses.
-SEARCH_TOLERANCE = 5.0
 
 
 def reference_grids(

@@ -17,7 +17,7 @@ from types import MappingProxyType
 from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import check_smooth
-from pneuopt.dynamics.simulate import MAX_STEPS
+from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.dither import describe_swing
 from pneuopt.evaluation.evaluate import metric_limits, relevant_units
@@ -38,13 +38,11 @@ from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
+from pneuopt.tuning.tolerances import MIN_AGREEING
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuning.validation import validate_design
 
 __all__ = ["TuningResult", "certify", "prepare_search", "prepare_task", "tune"]
-# Starts that must end in the same optimum for a search to be believed alone: a single one may be the nearest of many;
-# more search twice where two have confirmed each other.
-MIN_AGREEING = 2
 # Endings of a search whose limits perhaps no design keeps: `tune` then seeks how far they have to give way.
 INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)
 

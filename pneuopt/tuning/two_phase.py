@@ -20,10 +20,10 @@ import numpy as np
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, Step, disturbance_input
-from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.margins import frequency_grid, margins, sensitivity_terms
-from pneuopt.evaluation.metric import TAIL_SHARE, Tolerance, band_number
+from pneuopt.evaluation.metric import Tolerance, band_number
 from pneuopt.evaluation.requirements import (
     METRICS,
     REQUIREMENT_KINDS,
@@ -36,6 +36,7 @@ from pneuopt.evaluation.requirements import (
     upper_limit,
 )
 from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.tolerances import TAIL_SHARE
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, as_tuple, check_argument, check_number
@@ -53,24 +54,10 @@ from pneuopt.tuning.method import Agreement, SearchResult, TuningTask, check_met
 from pneuopt.tuning.racing import WIDEN_BOUNDS, Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue, rk4_substeps
+from pneuopt.tuning.tolerances import EXACT_PEAK_MARGIN, MAX_STEPS_A_SEGMENT, MIN_STARTS, OPTIMA_TOLERANCE
 
-# RK4 steps between two nodes up to which the method is chosen. A lower number leaves loops to the race that are solved
-# exactly (the published one takes 3 steps). With a higher one a response leaves its band between two nodes, unseen, and
-# a start takes long: of six lags of second order with 4 to 16 steps none was certified in 6 to 20 s, all by the race in
-# 1.5 s; of an oscillator with dead time and 10 steps 36 s gave 0.67 s to settle, 2 s of the race 0.30 s.
-MAX_STEPS_A_SEGMENT = 3.5
-# Share of the margin that limits on peaks of command and sensitivity are tightened by. With less, rounding the gains
-# breaks them; more gives performance away, for the exact problem misses no peak.
-EXACT_PEAK_MARGIN = 1 / 300
 # Parameters on which the average of a linear loop does not depend.
 PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
-# Relative difference of two objectives below which starts agree. A smaller one counts the solver's tolerance as another
-# optimum; a larger one hides local optima.
-OPTIMA_TOLERANCE = 1e-3
-# Starts after which the search ends if most of them have failed. One that fails takes longer than one that succeeds,
-# and where most fail the exact problem is hard (of an oscillator with dead time 9 of 10 starts): a lower number gives
-# up after a bad draw, a higher one delays the search by simulation that `tune` then makes.
-MIN_STARTS = 3
 
 
 @dataclass(frozen=True)

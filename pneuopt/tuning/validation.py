@@ -28,14 +28,10 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, 
 from pneuopt.quantities.results import Result
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
+from pneuopt.tuning.tolerances import MAX_ADVISED_AXES, RELAXED_DIGITS, SUMMARY_PERCENTILE
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-# Percentile of the plants that the figures show [%]. A lower one says little of bad plants; near 100 a few plants
-# decide it, as they decide the worst.
-SUMMARY_PERCENTILE = 95.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -340,10 +336,6 @@ def _quantile(values: Array, metric: str, percent: float) -> float:
 LANE_DEFECTS = {"SettlingTime": Defect.NEVER_SETTLES, "MaxSensitivity": Defect.UNSTABLE}
 NO_REST = "has no rest"  # of a plant on which the loop cannot wait for its step
 DEFECT_WORDS = frozenset({NO_REST, *(defect.value for defect in Defect)})
-# Digits to which a relaxed limit is rounded, away from what is asked; fewer give away more than is needed.
-RELAXED_DIGITS = 3
-# Parameters that an advice names, at most: more are no longer a hint where the trouble comes from.
-MAX_ADVISED_AXES = 3
 
 
 def find_breaks(row: Mapping[str, float], spec: Specification, accept: Collection[Defect] = ()) -> tuple[str, ...]:

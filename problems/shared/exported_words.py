@@ -4,7 +4,8 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 
-from pneuopt.export.identifiers import MAX_IDENTIFIER, reserved_as
+from pneuopt.export.identifiers import reserved_as
+from pneuopt.export.tolerances import MAX_IDENTIFIER
 
 _USED = """
     function_block end_function_block var_input var_output var constant end_var bool int dint lreal if then

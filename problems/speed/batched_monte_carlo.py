@@ -28,9 +28,9 @@ from scipy.integrate import solve_ivp
 import pneuopt as po
 from pneuopt.dynamics.compiled.functions import compile_rate
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
-from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
-from pneuopt.studies.batch import RATE_MARGIN
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
+from pneuopt.evaluation.tolerances import SAMPLES_A_DITHER_PERIOD
+from pneuopt.studies.tolerances import RATE_MARGIN
 from pneuopt.tuning.space import fastest_eigenvalue, loop_pieces, rk4_substeps
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pneuopt.cli.run import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import Outputs, finish, warn_of_status
+from pneuopt.cli.tolerances import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.files.drive import read_fit
 from pneuopt.quantities.status import Code, Status
 

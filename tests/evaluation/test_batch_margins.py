@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pneuopt.evaluation.batch_margins import LOOPS_AT_A_TIME, sensitivity_peaks
+from pneuopt.evaluation.batch_margins import sensitivity_peaks
+from pneuopt.evaluation.tolerances import LOOPS_AT_A_TIME
 
 
 @pytest.mark.parametrize("damping", [0.003, 0.05, 0.5])

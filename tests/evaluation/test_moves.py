@@ -18,18 +18,10 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.evaluate import evaluate, respond
-from pneuopt.evaluation.moves import (
-    GUESSED_SENSITIVITY,
-    LEAST_DWELL,
-    LEAST_FAST_SPEED,
-    ExcitationRun,
-    check_move,
-    excitation_run,
-    scale_move,
-    shortest_move,
-)
+from pneuopt.evaluation.moves import ExcitationRun, check_move, excitation_run, scale_move, shortest_move
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor, record
+from pneuopt.evaluation.tolerances import GUESSED_SENSITIVITY, LEAST_DWELL, LEAST_FAST_SPEED
 from pneuopt.identification.identify import identify
 from pneuopt.models.catalog import s25, t32
 from pneuopt.models.drives import ForceDrive

@@ -9,8 +9,9 @@ from scipy import stats
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.evaluation.plants import GAIN_TOLERANCE, PLANT_COUNT, TOLERANCES, expected_plants, monte_carlo
+from pneuopt.evaluation.plants import TOLERANCES, expected_plants, monte_carlo
 from pneuopt.evaluation.scenarios import Normal, Sampling, apply_scenario, corners
+from pneuopt.evaluation.tolerances import GAIN_TOLERANCE, PLANT_COUNT
 from pneuopt.models.drives import ForceDrive, RotaryDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder

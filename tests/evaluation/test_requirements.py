@@ -17,7 +17,6 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.metrics import meter_record
 from pneuopt.evaluation.requirements import (
-    ANR_DENSITY,
     IAE,
     METRICS,
     REQUIREMENT_KINDS,
@@ -40,6 +39,7 @@ from pneuopt.evaluation.requirements import (
     upper_limit,
 )
 from pneuopt.evaluation.specification import specify
+from pneuopt.evaluation.tolerances import ANR_DENSITY
 from pneuopt.models.catalog import t32
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder

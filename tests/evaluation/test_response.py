@@ -14,13 +14,11 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.simulate import MAX_STEPS, simulate
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.response import (
-    MAX_READINGS_A_SAMPLE,
-    MIN_READINGS_A_SAMPLE,
-    SAMPLES_A_DITHER_PERIOD,
     check_steps,
     command_range,
     highest_dither_frequency,
@@ -29,6 +27,7 @@ from pneuopt.evaluation.response import (
     sample_spacing,
     simulation_steps,
 )
+from pneuopt.evaluation.tolerances import MAX_READINGS_A_SAMPLE, MIN_READINGS_A_SAMPLE, SAMPLES_A_DITHER_PERIOD
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder

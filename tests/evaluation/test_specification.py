@@ -14,7 +14,8 @@ from pneuopt.evaluation.requirements import (
     SettlingTime,
     StepEnvelope,
 )
-from pneuopt.evaluation.specification import STABILITY_SENSITIVITY, specify, specify_limits
+from pneuopt.evaluation.specification import specify, specify_limits
+from pneuopt.evaluation.tolerances import STABILITY_SENSITIVITY
 from pneuopt.quantities.errors import InputError
 
 TUBE, OTHER = ((0.0, -0.1, 1.1), (0.5, 0.9, 1.1)), ((0.0, -0.2, 1.2),)

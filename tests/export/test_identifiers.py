@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.export.identifiers import MAX_IDENTIFIER, RESERVED, Identifiers, reserved_as
+from pneuopt.export.identifiers import RESERVED, Identifiers, reserved_as
+from pneuopt.export.tolerances import MAX_IDENTIFIER
 from problems.shared.exported_words import PLAIN
 
 BECKHOFF = """

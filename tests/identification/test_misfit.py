@@ -25,7 +25,6 @@ from pneuopt.identification import identify as identification
 from pneuopt.identification import misfit as width_bias
 from pneuopt.identification.identify import identify
 from pneuopt.identification.misfit import (
-    TIME_BLOCKS,
     Clusters,
     Misfit,
     RejectedWidth,
@@ -43,6 +42,7 @@ from pneuopt.identification.misfit import (
 from pneuopt.identification.problem import EstimationProblem, check_logs, input_behaviour
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
+from pneuopt.identification.tolerances import TIME_BLOCKS
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Viscous

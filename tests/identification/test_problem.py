@@ -23,8 +23,6 @@ from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.losses import Huber
 from pneuopt.identification.problem import (
-    MAX_BRIDGE,
-    MIN_RUN,
     NEEDED,
     EstimationProblem,
     check_logs,
@@ -35,6 +33,7 @@ from pneuopt.identification.problem import (
 )
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.select_model import select_model
+from pneuopt.identification.tolerances import MAX_BRIDGE, MIN_RUN
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drives import ForceDrive, MotionDrive

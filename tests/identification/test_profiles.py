@@ -17,6 +17,7 @@ from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.problem import EstimationProblem, check_logs
 from pneuopt.identification.profiles import ParameterValues, Profile, profile, propagate_error, propagate_intervals
 from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.tolerances import END_TOLERANCE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
@@ -189,7 +190,7 @@ def test_a_profile_that_jumps_over_its_level_is_not_followed_into_the_jump() -> 
 
     profiles._locate_crossing(Jump(), SimpleNamespace(z=0.0), SimpleNamespace(z=1.0), 2.0)  # type: ignore[arg-type]
     assert len(tried) <= 8
-    assert abs(tried[-1] - math.pi / 4) < 2 * profiles.END_TOLERANCE
+    assert abs(tried[-1] - math.pi / 4) < 2 * END_TOLERANCE
 
 
 class LinearRefits:

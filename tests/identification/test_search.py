@@ -46,7 +46,6 @@ from pneuopt.identification.profiles import Profile
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.review import review_fit
 from pneuopt.identification.search import (
-    EXCERPT_SEGMENTS,
     cut_excerpts,
     filter_states,
     fit_from_predictions,
@@ -59,6 +58,7 @@ from pneuopt.identification.search import (
     liveliest_part,
     mark_order,
 )
+from pneuopt.identification.tolerances import BEST, EXCERPT_SEGMENTS, GUESS_STAGES, LEVELS, PART_SEGMENTS
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.catalog import b32
 from pneuopt.models.drives import ForceDrive
@@ -68,16 +68,9 @@ from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.equations import ParameterScaling
-from pneuopt.shooting.least_squares import (
-    MAX_GAP_SHARE,
-    CpuBudget,
-    Fit,
-    LeastSquares,
-    SearchEnd,
-    Stage,
-    solve_least_squares,
-)
+from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, SearchEnd, Stage, solve_least_squares
 from pneuopt.shooting.segments import segment
+from pneuopt.shooting.tolerances import MAX_GAP_SHARE
 from pneuopt.shooting.transcription import Transcription
 from problems.shared.b32 import GAINS, run_loop
 
@@ -151,10 +144,10 @@ def test_a_start_that_explains_the_log_as_it_settles_comes_before_the_others_set
 @pytest.mark.parametrize(
     ("candidate", "stages", "accepted", "explains"),
     [
-        (-1, starting.GUESS_STAGES, 1.5, True),  # 1.13 squares a sample
-        (-1, starting.GUESS_STAGES, 1.05, False),
+        (-1, GUESS_STAGES, 1.5, True),  # 1.13 squares a sample
+        (-1, GUESS_STAGES, 1.05, False),
         (-1, 1, 1.5, False),  # with wide gaps all starts explain the log
-        (1, starting.GUESS_STAGES, 1.05, True),  # 1.006; noise of the states would have left .92 by wide gaps
+        (1, GUESS_STAGES, 1.05, True),  # 1.006; noise of the states would have left .92 by wide gaps
     ],
 )
 def test_a_start_explains_the_log_by_tight_gaps_only(
@@ -282,7 +275,7 @@ def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatc
     assert labels == [c.label for c in problem.candidates()[:2]]
 
 
-@pytest.mark.parametrize(("window", "segment", "stages"), [(math.inf, 0.01, starting.GUESS_STAGES), (0.1, 0.1, 1)])
+@pytest.mark.parametrize(("window", "segment", "stages"), [(math.inf, 0.01, GUESS_STAGES), (0.1, 0.1, 1)])
 def test_guesses_are_settled_once_where_no_gap_tightens(
     window: float, segment: float, stages: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -422,7 +415,7 @@ def test_no_more_guesses_settle_where_another_one_costs_the_same(
 ) -> None:
     """A log with sensor lag lost 14 of 25 CPU s to six guesses, of which none was what is wrong."""
     problem, settled = posed(Stribeck()), list[str]()
-    gap = problem.method.stages[starting.GUESS_STAGES - 1].gap
+    gap = problem.method.stages[GUESS_STAGES - 1].gap
 
     def settle(problem: EstimationProblem, start: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
         settled.append(start.label)
@@ -439,7 +432,7 @@ def test_the_cost_that_others_are_held_to_is_that_after_as_many_stages() -> None
     fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
     costs = tuple((stage.gap, float(i)) for i, stage in enumerate(problem.method.stages))
     found = [starting._cost_after_guesses(problem, [(problem, replace(fit, stage_costs=c), "")]) for c in (costs, ())]
-    assert found[0] == starting.GUESS_STAGES - 1
+    assert found[0] == GUESS_STAGES - 1
     assert math.isnan(found[1])
 
 
@@ -812,7 +805,7 @@ def test_it_finds_what_the_starts_miss(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = replace(posed_of_predicted_fit(Stribeck()), method=LeastSquares(progress=lines.append))
     spoil(problem)
     fit = fit_from_predictions(problem, 3.0)
-    assert len([line for line in lines if line.startswith("prediction errors")]) == len(predicted_fit.LEVELS)
+    assert len([line for line in lines if line.startswith("prediction errors")]) == len(LEVELS)
     assert fit is not None
     assert fit.status.converged
     assert deviations == [problem.method.stages[-1].gap]  # with ten times that, a slip was lost, and the search with it
@@ -867,13 +860,13 @@ def test_each_guess_is_tried_with_each_ratio_and_no_two_neighbours_descend() -> 
     best = predicted_fit._best_sets(errors, list(found.items()), problem)  # type: ignore[arg-type]
     own = [ParameterScaling(problem.transcription(start)).start.tolist() for start in found.values()]
     chosen = [places[own.index(z.tolist())] for z in best]
-    assert len(chosen) == predicted_fit.BEST
+    assert len(chosen) == BEST
     assert chosen[0] == target
     assert all(max(abs(i - k), abs(j - m)) > 1 for (i, j), (k, m) in combinations(chosen, 2))
 
 
 def test_the_part_is_the_liveliest() -> None:
-    problem, before = posed_of_predicted_fit(Stribeck()), predicted_fit.PART_SEGMENTS
+    problem, before = posed_of_predicted_fit(Stribeck()), PART_SEGMENTS
     (log,) = problem.experiments
     position = log.trajectory["position"].copy()
     position[:600] = position[600]

@@ -9,7 +9,8 @@ import pneuopt as po
 from pneuopt.dynamics.hooks import Width
 from pneuopt.identification import widths
 from pneuopt.identification.problem import EstimationProblem, check_logs
-from pneuopt.identification.widths import CHOSEN_WIDTH, MAX_TRIAL_SAMPLES, advise_widths, choose_widths, excerpts
+from pneuopt.identification.tolerances import CONFIRMING_STAGES, MAX_TRIAL_SAMPLES
+from pneuopt.identification.widths import CHOSEN_WIDTH, advise_widths, choose_widths, excerpts
 from pneuopt.shooting import segments
 from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.transcription import Transcription
@@ -102,7 +103,7 @@ def test_a_narrower_width_that_is_foreseen_is_not_searched_with_tight_gaps(monke
     assert set(searched) == {2}  # a trial's stage, and an empty one
     monkeypatch.setattr(widths, "_is_foreseen", lambda *_: False)
     assert [w.value for w in choose_widths(posed)[1]] == [w.value for w in chosen]
-    assert searched.count(1 + widths.CONFIRMING_STAGES) == 2
+    assert searched.count(1 + CONFIRMING_STAGES) == 2
 
 
 @pytest.mark.parametrize(("width", "chosen"), [(1e-3, 1e-3), (1e-2, 1e-2)])
@@ -201,7 +202,7 @@ def test_widths_are_confirmed_at_the_same_gaps(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(widths, "solve_least_squares", record)
     monkeypatch.setattr(widths, "_is_foreseen", lambda *_: False)
     choose_widths(posed)
-    assert gaps == [LeastSquares().stages[widths.CONFIRMING_STAGES - 1].gap] * 2
+    assert gaps == [LeastSquares().stages[CONFIRMING_STAGES - 1].gap] * 2
 
 
 @pytest.mark.parametrize(("tight_cost", "is_taken"), [(900.0, False), (100.0, True)])

@@ -7,12 +7,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pneuopt.quantities.arrays import Array
-from pneuopt.shooting.arrow import (
-    STATE_REGULARISATION,
-    ArrowEquations,
-    indistinguishable_parameters,
-    positive_definite_inverse,
-)
+from pneuopt.shooting.arrow import ArrowEquations, indistinguishable_parameters, positive_definite_inverse
+from pneuopt.shooting.tolerances import STATE_REGULARISATION
 
 
 def random_problem(m: int, n: int, k: int, seed: int, spread: float = 1.0) -> tuple[ArrowEquations, Array, Array]:

@@ -3,20 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import discretise, names
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.arrays import Array
-from pneuopt.shooting.segments import (
-    MIN_IMPLICIT_SUBSTEPS,
-    Segments,
-    choose_integration,
-    fine_steps,
-    segment,
-    stable_substeps,
-    start_nodes,
-)
+from pneuopt.shooting.segments import Segments, choose_integration, fine_steps, segment, stable_substeps, start_nodes
+from pneuopt.shooting.tolerances import MIN_IMPLICIT_SUBSTEPS
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 

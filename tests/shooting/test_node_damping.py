@@ -17,7 +17,6 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.shooting import least_squares as lifted
 from pneuopt.shooting.equations import ParameterScaling, missed_curvature, normal_equations
 from pneuopt.shooting.least_squares import (
-    MAX_CHI_SQUARE_RATIO,
     BudgetSpentError,
     CpuBudget,
     Descent,
@@ -32,6 +31,7 @@ from pneuopt.shooting.least_squares import (
     start_search,
 )
 from pneuopt.shooting.segments import segment, start_nodes
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO, MAX_REPEATS, REPEAT_ITERATIONS, TRAPPING_DAMPING
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 N, H, NOISE, GAP = 60, 0.1, 0.1, 0.5
@@ -153,7 +153,7 @@ def right_squares() -> Transcription:
     return replace(problem, residuals=(replace(problem.residuals[0], measured=measured, noise=np.array([NOISE, 0.5])),))
 
 
-@pytest.mark.parametrize("repeats", [0, lifted.MAX_REPEATS])
+@pytest.mark.parametrize("repeats", [0, MAX_REPEATS])
 def test_a_search_that_explains_the_log_is_not_left_short_of_its_optimum(
     repeats: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,7 +173,7 @@ def test_a_trapped_node_is_put_to_the_end_of_the_segment_before_it(helps: bool) 
     state = lifted.run_search(start_search(segment(right_squares()), method))
     nodes, damping = np.ones((N // 2, 1)) + 0.01, np.zeros(N // 2)
     nodes[9 if helps else slice(0, 9)] += 0.5  # where all nodes before are wrong, this one would be, too
-    damping[9] = 2 * lifted.TRAPPING_DAMPING
+    damping[9] = 2 * TRAPPING_DAMPING
     state = replace(state.at(nodes, 0.0 * state.iterate.z), node_damping=damping)
     trapped = lifted.trapped_nodes(state)
     assert trapped.tolist() == [9]
@@ -183,7 +183,7 @@ def test_a_trapped_node_is_put_to_the_end_of_the_segment_before_it(helps: bool) 
         assert not freed.node_damping.any()
     else:
         assert freed.iterate is state.iterate
-        assert freed.node_damping[9] > lifted.TRAPPING_DAMPING
+        assert freed.node_damping[9] > TRAPPING_DAMPING
 
 
 def iterate(cost: float) -> Iterate:
@@ -362,7 +362,7 @@ def test_a_search_with_noise_of_the_states_that_moves_is_repeated_once(monkeypat
 
     monkeypatch.setattr(lifted, "iterate", count)
     assert lifted.repeat_last_stage(replace(state, noisy_gaps=True)).end is SearchEnd.UNSETTLED
-    assert taken == [lifted.REPEAT_ITERATIONS]
+    assert taken == [REPEAT_ITERATIONS]
 
 
 @pytest.mark.parametrize("iterations", [4, 10, 30])
@@ -379,8 +379,8 @@ def test_a_last_stage_is_repeated_three_times_in_all(iterations: int, monkeypatc
     monkeypatch.setattr(lifted, "iterate", count)
     monkeypatch.setattr(SearchState, "is_at_noise", True)
     lifted.repeat_last_stage(replace(state, setup=setup, stage=stage))
-    assert sum(taken) == lifted.MAX_REPEATS * iterations
-    assert max(taken) == min(iterations, lifted.REPEAT_ITERATIONS)
+    assert sum(taken) == MAX_REPEATS * iterations
+    assert max(taken) == min(iterations, REPEAT_ITERATIONS)
 
 
 @pytest.mark.parametrize("move", ["step", "undamped_steps"])

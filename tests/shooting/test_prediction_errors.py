@@ -7,8 +7,9 @@ from numpy.testing import assert_allclose
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.shooting import filters
 from pneuopt.shooting.equations import ParameterScaling
-from pneuopt.shooting.filters import ROBUST_SQUARES, START_DEVIATION, PredictionErrors
+from pneuopt.shooting.filters import PredictionErrors
 from pneuopt.shooting.segments import Segments, start_nodes
+from pneuopt.shooting.tolerances import ROBUST_SQUARES, START_DEVIATION
 from tests.shooting.first_order import GAIN, NOISE, ROUGH, SAMPLE, SAMPLES, TIME_CONSTANT, first_order_log, forced
 
 N = 120  # samples

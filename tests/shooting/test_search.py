@@ -15,8 +15,6 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.equations import ParameterScaling, correct_residuals, normal_equations, weigh_gaps
 from pneuopt.shooting.least_squares import (
-    FINE_TOLERANCE,
-    MAX_CHI_SQUARE_RATIO,
     ConvergenceTest,
     CpuBudget,
     Fit,
@@ -48,6 +46,7 @@ from pneuopt.shooting.least_squares import (
     start_search,
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, segment, start_nodes
+from pneuopt.shooting.tolerances import FINE_TOLERANCE, MAX_CHI_SQUARE_RATIO
 from tests.shooting.test_least_squares import TRUTH, found, shaken, two_logs
 
 FIRST, *OTHERS = LeastSquares().stages

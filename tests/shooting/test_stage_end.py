@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from pneuopt.shooting import least_squares as lifted
-from pneuopt.shooting.least_squares import PATIENT_ITERATIONS, LeastSquares, is_negligible_step
+from pneuopt.shooting.least_squares import LeastSquares, is_negligible_step
+from pneuopt.shooting.tolerances import PATIENT_ITERATIONS
 
 
 def negligible(

@@ -7,6 +7,7 @@ from pneuopt.dynamics.compiled.rollout import Gram, Rollout
 from pneuopt.quantities.arrays import Array
 from pneuopt.shooting import filters
 from pneuopt.shooting.segments import Segments, start_nodes
+from pneuopt.shooting.tolerances import GATHERED_DEVIATION, START_DEVIATION
 from tests.shooting.first_order import GAIN, NOISE, ROUGH, SAMPLE, SAMPLES, TIME_CONSTANT, first_order_log, forced
 
 N = 60  # samples
@@ -29,13 +30,13 @@ def test_pieces_side_by_side_give_the_filter_of_the_whole(monkeypatch: pytest.Mo
     assert np.abs(filters.filter_nodes(segments, rough, q) - whole).max() > 1e-3
 
 
-@pytest.mark.parametrize("gathered", [filters.GATHERED_DEVIATION, 1e-2])
+@pytest.mark.parametrize("gathered", [GATHERED_DEVIATION, 1e-2])
 def test_the_filter_of_a_linear_plant_is_the_kalman_filter(gathered: float) -> None:
     """By hand: sample by sample through each segment, the state's own deviation added from segment to segment."""
     (segments, u, y, scale), a = first_order_log(N), np.exp(-SAMPLE / TIME_CONSTANT)
     found = filters.filter_nodes(segments, start_nodes(segments), values(segments), gathered)
 
-    mean, variance, expected = ROUGH, (filters.START_DEVIATION * scale) ** 2, []
+    mean, variance, expected = ROUGH, (START_DEVIATION * scale) ** 2, []
     for begin in range(0, N, SAMPLES):
         decay, own = a ** np.arange(SAMPLES), u[begin : begin + SAMPLES]
         driven = np.array([forced(own, GAIN, k) for k in range(SAMPLES)])

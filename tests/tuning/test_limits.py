@@ -16,7 +16,7 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.specification import specify
 from pneuopt.tuning.racing import compute_merits
 from pneuopt.tuning.relaxation import limit_excess
-from pneuopt.tuning.space import WORST_MERIT
+from pneuopt.tuning.tolerances import WORST_MERIT
 from pneuopt.tuning.validation import find_breaks
 
 SPEC = specify(SettlingTime(max=0.5), [Overshoot(0.1), MaxSensitivity(1.6), GainMargin(2.0), PhaseMargin(40.0)])

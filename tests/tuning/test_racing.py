@@ -38,7 +38,6 @@ from pneuopt.quantities.status import Code
 from pneuopt.tuning.gradients import Polish
 from pneuopt.tuning.method import TuningTask
 from pneuopt.tuning.racing import (
-    PATIENCE,
     Race,
     Racing,
     RacingResult,
@@ -52,6 +51,7 @@ from pneuopt.tuning.racing import (
 )
 from pneuopt.tuning.simulator import Responses, Simulator
 from pneuopt.tuning.space import loop_pieces, search_space
+from pneuopt.tuning.tolerances import PATIENCE
 
 BOUNDS = {"pid.Kp": (50.0, 600.0), "pid.Ki": (100.0, 8000.0)}
 STEP, SPEC = Step(0.1, horizon=0.2), specify(SettlingTime(), [Overshoot(0.1)])

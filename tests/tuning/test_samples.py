@@ -17,7 +17,8 @@ from pneuopt.tuning.method import SearchResult
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, search_space
+from pneuopt.tuning.space import search_space
+from pneuopt.tuning.tolerances import MAX_LOOP_SUBSTEPS
 from pneuopt.tuning.tune import prepare_task, tune
 
 STEP = Step(1.0, horizon=20.0)

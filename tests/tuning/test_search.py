@@ -21,18 +21,10 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.method import SearchResult
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
-from pneuopt.tuning.search import (
-    CANDIDATE_DISTANCE,
-    MAX_CANDIDATES,
-    Search,
-    _excess,
-    confirm_infeasible,
-    confirm_refusal,
-    find_candidates,
-    relax,
-)
+from pneuopt.tuning.search import Search, _excess, confirm_infeasible, confirm_refusal, find_candidates, relax
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, search_space
+from pneuopt.tuning.tolerances import CANDIDATE_DISTANCE, MAX_CANDIDATES
 from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
 SMALL = Racing(members=10, trials=10, polish=0)

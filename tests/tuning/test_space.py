@@ -15,8 +15,8 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metrics import BandCentre, step_metrics
 from pneuopt.evaluation.requirements import Ripple, SettlingTime
-from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
 from pneuopt.evaluation.specification import specify
+from pneuopt.evaluation.tolerances import SAMPLES_A_DITHER_PERIOD
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.pneumatic.drive import PneumaticDrive

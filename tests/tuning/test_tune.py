@@ -13,7 +13,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.integrators import RK4_MAX_H_LAMBDA
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import (
     MaxSensitivity,

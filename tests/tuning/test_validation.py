@@ -10,7 +10,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import Defect
-from pneuopt.evaluation.plants import PLANT_COUNT, expected_plants
+from pneuopt.evaluation.plants import expected_plants
 from pneuopt.evaluation.requirements import (
     IAE,
     MaxSensitivity,
@@ -21,6 +21,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.response import TuningCase
 from pneuopt.evaluation.scenarios import apply_scenario, corners, samples, tolerances
+from pneuopt.evaluation.tolerances import PLANT_COUNT
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.models.pneumatic.drive import PneumaticDrive

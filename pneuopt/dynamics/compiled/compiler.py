@@ -29,6 +29,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pneuopt.dynamics.tolerances import COMPILE_TIMEOUT, LARGEST_AGE, LARGEST_SIZE, NOTICE_TIME
+
 COMPILERS = ("gcc", "clang", "cc")
 # Apple's and other ARM compilers know the machine by another name.
 _NATIVE = "-mcpu=native" if platform.machine().lower() in ("arm64", "aarch64") else "-march=native"
@@ -144,7 +146,6 @@ def _read_version(command: tuple[str, ...]) -> str:
     return done.stdout
 
 
-COMPILE_TIMEOUT = 300  # [s]; below, large models on slow machines fall back to the VM; above, a hung compiler blocks
 logger = logging.getLogger("pneuopt")
 
 
@@ -257,15 +258,6 @@ def _cpu_identity() -> str:
     return "".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
 
 
-# Age [s] since its last use at which a library is deleted, half a year. Below, models of last month are compiled anew;
-# above, those of old versions stay for nothing.
-LARGEST_AGE = 180 * 24 * 3600.0
-# Size [bytes] of all libraries above which those that were not used for longest are deleted, some thousand models.
-# Below, studies of many models compile them again and again; above, it is much for a cache folder.
-LARGEST_SIZE = 200 * 2**20
-# Time [s] after which a use is noted again, and a folder in which nothing is compiled any more is deleted, a day.
-# Below, libraries are written to at each use; above, the order of their use is lost.
-NOTICE_TIME = 24 * 3600.0
 COMPILE_FOLDER_PREFIX = "compile-"
 
 

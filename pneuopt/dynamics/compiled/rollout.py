@@ -27,18 +27,10 @@ from pneuopt.dynamics.compiled.c_writer import CFunction, write_c
 from pneuopt.dynamics.compiled.compiler import compile_library, warn_once
 from pneuopt.dynamics.compiled.vm import run_in_vm
 from pneuopt.dynamics.integrators import OwnRate, partitioned_step, rk4
+from pneuopt.dynamics.tolerances import BRIEF_STEPS, CHECK_SECONDS, MAX_SUBSTEPS, UNSHARED_STEPS, VM_BATCH
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 
-BRIEF_STEPS = 20_000
-"""Steps of a lane that run to their end in the main thread [1]: more delay Ctrl-C (at 10 us a step by .2 s); fewer make
-short runs wait for a thread (30 us)."""
-# integration steps of all segments [1] up to which a run is not shared out to threads: lower waits for threads (.3 ms)
-# that save less, higher leaves cores idle
-UNSHARED_STEPS = 1000
-MAX_SUBSTEPS = 2**31 - 1  # integration steps a sample [1]: more do not fit the C int that counts them
-VM_BATCH = 1000  # segments of a batch in the CasADi VM; more take memory for their derivatives, fewer time
-CHECK_SECONDS = 0.1  # between two checks of a long run [s]: longer overruns a CPU budget, shorter takes time itself
 _check: ContextVar[Callable[[], None]] = ContextVar("check", default=lambda: None)
 
 

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, RolloutResult
+from pneuopt.dynamics.tolerances import (
+    DIFFERENCE,
+    LARGEST_DERIVATIVE_ERROR,
+    LARGEST_DISTANCE,
+    SAMPLES,
+    SEGMENTS,
+    SUBSTEPS,
+)
 from pneuopt.quantities.arrays import Array
 
 WAYS = {"vm": 0, "scalar": 1, "lanes": None}  # the lanes of a Rollout
-SEGMENTS, SAMPLES, SUBSTEPS = 40, 25, 10
-DIFFERENCE = 1e-6  # step of a central difference, relative; more bends with friction, less is lost to roundings
-# Largest relative distance of machine code from the VM, and of derivatives from differences. Below, roundings count as
-# errors (1e-13, and 1e-8 of differences); above, a wrong term of a model may hide.
-LARGEST_DISTANCE, LARGEST_DERIVATIVE_ERROR = 1e-9, 1e-5
 
 
 @dataclass(frozen=True)

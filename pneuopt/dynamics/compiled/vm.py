@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.c_writer import Instruction, read_instructions
+from pneuopt.dynamics.tolerances import ARRAY_SEGMENTS, BLOCK_SEGMENTS, FOLDED_STEPS, LATER_STAGES, OPERATIONS_A_THREAD
 from pneuopt.quantities.arrays import Array
 
 Operation = Callable[..., Any]
@@ -179,18 +180,6 @@ class ArrayProgram:
     def _is_reusable(self, value: int) -> bool:
         place = self._places[value]
         return place.owner == "own" and place.row not in self._constants
-
-
-# Operations, segments times those of the model, that a thread is started for, half a millisecond. Fewer, and starting
-# it (50 us) takes the time that it saves; more leave cores idle.
-OPERATIONS_A_THREAD = 100_000
-# Segments for each thread of CasADi's machine from which arrays are faster. Fewer, and NumPy's calls take longer than
-# the arithmetic in them; more leave half of the speed.
-ARRAY_SEGMENTS = 120
-# Steps of a sample that are written as one Function. More take longer to write; a call of each takes 4 us.
-FOLDED_STEPS = 100
-# Segments of a block of arrays. Fewer waste time in NumPy's calls; more do not fit the processor's cache.
-BLOCK_SEGMENTS = 1000
 
 
 class VmRun(NamedTuple):
@@ -411,10 +400,6 @@ def _find_program(function: ca.Function) -> ArrayProgram | None:
 def _count_parts(operations: int, m: int, threads: int) -> int:
     """Threads that pay for so many operations of m segments in CasADi's machine."""
     return max(1, min(threads, m * operations // OPERATIONS_A_THREAD))
-
-
-LATER_STAGES = ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0))
-"""Where a step's later stages stand, a fraction of it, and their weights."""
 
 
 def bind_array_step(

@@ -29,7 +29,6 @@ from pneuopt.dynamics.compiled import compiler
 from pneuopt.dynamics.compiled import compiler as library_cache
 from pneuopt.dynamics.compiled import compiler as toolchain
 from pneuopt.dynamics.compiled.compiler import (
-    NOTICE_TIME,
     Compiler,
     explain_missing_compiler,
     find_compiler,
@@ -40,6 +39,7 @@ from pneuopt.dynamics.compiled.compiler import (
 from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import discretise, parameter_vector
+from pneuopt.dynamics.tolerances import NOTICE_TIME
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 

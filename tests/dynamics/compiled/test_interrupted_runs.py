@@ -8,7 +8,8 @@ from unittest.mock import Mock
 import pytest
 from numpy.testing import assert_array_equal
 
-from pneuopt.dynamics.compiled.rollout import MAX_SUBSTEPS, Rollout, check_during_runs
+from pneuopt.dynamics.compiled.rollout import Rollout, check_during_runs
+from pneuopt.dynamics.tolerances import MAX_SUBSTEPS
 from tests.dynamics.compiled.test_rollout import Case, needs_compiler
 
 

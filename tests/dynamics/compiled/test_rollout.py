@@ -17,6 +17,7 @@ from pneuopt.dynamics.compiled import rollout as codegen
 from pneuopt.dynamics.compiled.compiler import find_compiler
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import DiscreteSystem, discretise, parameter_vector
+from pneuopt.dynamics.tolerances import ARRAY_SEGMENTS
 from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
 from pneuopt.quantities.arrays import Array
@@ -276,7 +277,7 @@ def test_arrays_and_folded_steps_are_for_what_they_suit(monkeypatch: pytest.Monk
         return counted
 
     monkeypatch.setattr(vm, "bind_function", count)
-    few, many = Case("stribeck", m=5, n=6), Case("stribeck", m=vm.ARRAY_SEGMENTS, n=6)
+    few, many = Case("stribeck", m=5, n=6), Case("stribeck", m=ARRAY_SEGMENTS, n=6)
     few.run(Rollout(few.system.pieces, lanes=0))
     assert calls == [2 * 6]  # the output and the step
     many.run(Rollout(many.system.pieces, threads=1, lanes=0))
