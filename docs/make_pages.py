@@ -40,6 +40,7 @@ ROOMS = {  # whose public names have a page, in the order in which data go throu
     "logs": "Logs",
     "models": "Plants and friction",
     "identification": "Identification",
+    "experiments": "The next experiment",
     "control": "The loop",
     "evaluation": "Requirements and certificates",
     "tuning": "Tuning",

@@ -138,5 +138,5 @@ def test_what_is_wrong_is_said_in_a_line(words: tuple[str, ...], message: str) -
 def test_each_run_has_a_file_that_is_named(tmp_path: Path) -> None:
     words = ("--noise", "position=20um", "--budget", "1", "-q", "--runs", "2", "-o", str(tmp_path / "run.csv"))
     result = run_of_next_experiment(*USUAL, *words)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["run_1.csv", "run_2.csv"]
+    assert sorted(p.name for p in tmp_path.glob("*.csv")) == ["run_1.csv", "run_2.csv"]
     assert "run_2.csv" in result.output.replace("\n", "")

@@ -352,7 +352,7 @@ def test_certificate_and_verdict_say_how_it_ends_alike(shares: Array, defect: De
     run = Trajectory(T_BAND, {LOOP.feedback.name: y, "control": np.zeros_like(T_BAND)})
     metrics = measure_of_band(LOOP, parameters(None), STEP, run, BAND)
     found = CaseEvaluation(LOOP, TuningCase(STEP), parameters(None), metrics, run)
-    for module in ("dithered_ending", "certificate"):
+    for module in ("dither", "certificate"):
         monkeypatch.setattr(f"pneuopt.evaluation.{module}.continue_response", lambda *_: continued(y, None))
     (proof, verdict) = judge_evaluations([found], BAND), dithered_ending.read_ending(found, BAND)
     assert [f.defect for f in proof.findings] == ([] if defect is None else [defect])
