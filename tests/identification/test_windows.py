@@ -166,9 +166,7 @@ def test_a_prediction_starts_anew_in_each_window() -> None:
     assert run["position"][n : 2 * n] == pytest.approx(inside["position"], abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("window", "said"), [(1e-3, "hold 0 samples of run"), (11.0, "hold 5500")]
-)
+@pytest.mark.parametrize(("window", "said"), [(1e-3, "hold 0 samples of run"), (11.0, "hold 5500")])
 def test_windows_that_no_log_can_be_cut_into_are_refused(window: float, said: str) -> None:
     with pytest.raises(InputError, match=f"windows of {window:g} s {said}.*choose between 0.004 and 5 s"):
         identify(DRIVE.system(), pushed(), DRIVE.parameters.freed(*FREE), window=window)
