@@ -258,8 +258,8 @@ class PlannedRun:
         return self.plant.inputs[0]
 
     @cached_property
-    def excitation(self) -> Quantity:
-        """What the excitation is: the loop's reference as logs name it, or the plant's command."""
+    def excited_quantity(self) -> Quantity:
+        """What is excited: the loop's reference as logs name it, or the plant's command."""
         if self.loop is None:
             return self.command
         seen = self.loop.feedback
@@ -269,7 +269,7 @@ class PlannedRun:
     @property
     def channels(self) -> tuple[Quantity, ...]:
         """What a run shows: the excitation, the command, the plant's outputs, then states that are no outputs."""
-        shown = [self.excitation, self.command, *self.plant.outputs, *self.plant.states]
+        shown = [self.excited_quantity, self.command, *self.plant.outputs, *self.plant.states]
         return tuple({q.name: q for q in reversed(shown)}[n] for n in dict.fromkeys(names(shown)))
 
     def rest_excitation(self, parameters: ParameterSet) -> float:
@@ -281,7 +281,7 @@ class PlannedRun:
 
     def excited_limits(self) -> tuple[float, float]:
         """The range of the excitation; a reference has that of its output if none of its own."""
-        name = self.excitation.name
+        name = self.excited_quantity.name
         given = [n for n in (name, self.loop.feedback.name if self.loop else name) if n in self.limits]
         ends = self.limits[given[0]] if given else (-math.inf, math.inf)
         finite = math.isfinite(ends[0]) and math.isfinite(ends[1])
@@ -311,7 +311,7 @@ class PlannedRun:
     def _gather(self, u: Array, y: Array, x: Array) -> Array:
         """The channels of a run, in their order."""
         held = y[:, :, -1:] if self.loop is not None else u
-        columns = {self.excitation.name: u[..., 0], self.command.name: held[..., 0]}
+        columns = {self.excited_quantity.name: u[..., 0], self.command.name: held[..., 0]}
         columns |= {n: x[:, :, i] for i, n in enumerate(names(self.plant.states))}
         columns |= {n: y[:, :, i] for i, n in enumerate(names(self.plant.outputs))}
         return np.stack([columns[q.name] for q in self.channels], axis=2)
@@ -478,13 +478,13 @@ class DesignSearch:
         runs = tuple(Trajectory(self._grid, dict(zip(channels, r.T, strict=True))) for r in shown)
         table = tabulate_design(nominal, self.run.free, self.judge.targets, self.known, gained)
         origin = self.run.origin
-        steps = tuple(tuple(b.describe(self.run.excitation.unit) for b in blocks) for blocks in chosen)
+        steps = tuple(tuple(b.describe(self.run.excited_quantity.unit) for b in blocks) for blocks in chosen)
         units, tried = {q.name: q.unit for q in self.run.channels}, sum(s.tried for s in (self, *self._parts.values()))
         before, after = (float(self.judge.deviation(f[None])) for f in (self.known, self.known + gained))
         figures = {"before": before, "after": after, "tried": float(tried), "origin": origin}
         figures |= {"plants": float(len(self.plants)), "cpu_seconds": self.budget.seconds}
         return ExperimentDesign(
-            self.run.excitation.name,
+            self.run.excited_quantity.name,
             runs,
             steps,
             table,

@@ -145,10 +145,11 @@ def foresee_unidentifiable(problem: EstimationProblem) -> tuple[str, ...]:
     """
     if not problem.system.states:  # a static map is fitted as soon
         return ()
-    start, free, excitation = problem.candidates()[0], problem.unknowns().free_names, problem.system.plant.excitation
+    start, free = problem.candidates()[0], problem.unknowns().free_names
+    hints = problem.system.plant.identification_hints
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
-    lacking = [n for n in free if missing_excitation(excitation, n, free, seen) is not None]
+    lacking = [n for n in free if missing_excitation(hints, n, free, seen) is not None]
     if not lacking:
         return ()
     part = replace(problem, experiments=excerpts(problem.experiments))
@@ -170,7 +171,7 @@ def add_profiles(verdict: Verdict, profiles: Mapping[str, Profile]) -> Verdict:
         identifiable[name] = bool(identifiable[name]) and not is_unidentifiable
         reasons.pop(name, None)
         if not found.high - found.low < MAX_RELATIVE_INTERVAL * abs(found.estimate):
-            reasons[name] = f"{found.sentence}; {remedy(verdict.excitation, [name])}"
+            reasons[name] = f"{found.sentence}; {remedy(verdict.identification_hints, [name])}"
     return replace(verdict, table=verdict.table.assign(identifiable=identifiable), reasons=reasons)
 
 
@@ -182,10 +183,10 @@ def add_unidentifiable(verdict: Verdict, names: Sequence[str], local: Verdict, u
     groups = tuple(group for group in local.indistinguishable if {*group} & {*names})
     grouped = {n for group in groups for n in group}
     reasons = {n: reason for n, reason in verdict.reasons.items() if n not in names}
-    vague = {n: f"{VAGUER_THAN_PRIOR}; {remedy(verdict.excitation, [n])}" for n in names if n not in grouped}
+    vague = {n: f"{VAGUER_THAN_PRIOR}; {remedy(verdict.identification_hints, [n])}" for n in names if n not in grouped}
     reasons |= {**vague, **{n: local.reasons[n] for n in names if n in local.reasons}}
     ordered = tuple(str(n) for n in table.index if n in unchanged)
-    return Verdict(table, (*verdict.indistinguishable, *groups), reasons, ordered, verdict.excitation)
+    return Verdict(table, (*verdict.indistinguishable, *groups), reasons, ordered, verdict.identification_hints)
 
 
 def rejects_held_values(fit: Fit, first: Fit, held: int) -> bool:
@@ -234,7 +235,7 @@ def _make_verdict(
     names, (spread, alone, weak) = list(free), _standard_deviations(root)
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
-    rows, reasons, excitation = {}, {}, with_values_in_words(problem.system.plant.excitation, values)
+    rows, reasons, hints = {}, {}, with_values_in_words(problem.system.plant.identification_hints, values)
     for i, (name, p) in enumerate(free.items()):
         if inside_bounds is not None and not inside_bounds[i]:
             rows[name] = [p.value, *[math.nan] * 4, True]
@@ -242,20 +243,20 @@ def _make_verdict(
             continue
         unit, size = p.value if p.log else 1.0, 1.0 if p.log else _comparison_size(name, p, problem)
         relative = spread[i] / size if size > 0 else math.nan
-        lack = None if trusted else missing_excitation(excitation, name, names, seen)
+        lack = None if trusted else missing_excitation(hints, name, names, seen)
         is_unidentifiable = (
             lack is not None
             or math.isinf(spread[i])
             or relative > (MAX_EXPECTED_DEVIATION if inside_bounds is None else UNIDENTIFIABLE_DEVIATION)
         )
         if is_unidentifiable or relative > MAX_RELATIVE_DEVIATION:
-            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(excitation, [name]))
+            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(hints, [name]))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=list(IdentifiableRow.__annotations__))
     groups = (tuple(names[i] for i in np.flatnonzero(row)) for row in weak)
     harmful = tuple(group for group in groups if _is_harmful(table.loc[list(group)]))
-    return Verdict(table, harmful, reasons, excitation=excitation)
+    return Verdict(table, harmful, reasons, identification_hints=hints)
 
 
 def _is_harmful(members: "pd.DataFrame") -> bool:

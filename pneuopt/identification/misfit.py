@@ -670,7 +670,7 @@ def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth
 
 def fixed_widths(problem: EstimationProblem) -> list[str]:
     """The widths of the model that are not free; a free one is an estimate itself."""
-    names = dict.fromkeys(n for w in problem.system.plant.excitation.widths for n in (w.name, *w.follows))
+    names = dict.fromkeys(n for w in problem.system.plant.identification_hints.widths for n in (w.name, *w.follows))
     return [n for n in names if n in problem.parameters and not problem.parameters[n].free]
 
 

@@ -4,7 +4,7 @@
 
 The motion that a set of logs shows, what it lacks to identify a parameter, and the run that would identify it.
 
-Which motion a parameter needs is declared by the model (`System.excitation`).
+Which motion a parameter needs is declared by the model (`System.identification_hints`).
 """
 
 import math
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from pneuopt.dynamics.hooks import Excitation, Lack, LoggedMotion
+from pneuopt.dynamics.hooks import IdentificationHints, Lack, LoggedMotion
 from pneuopt.identification.tolerances import INFINITE_INFLATION, MAX_FIT_ROWS, MOVING_SPEED_SHARE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
@@ -45,7 +45,7 @@ class Verdict(Shown):
         By parameter: why the logs do not identify it, or only roughly, and which run would.
     unchanged : tuple of str
         Parameters that a fit left at their given values.
-    excitation : Excitation
+    identification_hints : IdentificationHints
         The model's: which runs would show or separate its parameters.
     """
 
@@ -53,7 +53,7 @@ class Verdict(Shown):
     indistinguishable: tuple[tuple[str, ...], ...]
     reasons: Mapping[str, str]
     unchanged: tuple[str, ...] = ()
-    excitation: Excitation = field(default_factory=Excitation)
+    identification_hints: IdentificationHints = field(default_factory=IdentificationHints)
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -70,7 +70,8 @@ class Verdict(Shown):
             f"the logs {'do not identify' if is_unknown else 'identify only roughly'} {join_names(names)}: {reason}"
             for (is_unknown, reason), names in by_reason.items()
         ]
-        groups = [_describe_group(group, self.table["inflation"], self.excitation) for group in self.indistinguishable]
+        hints, inflation = self.identification_hints, self.table["inflation"]
+        groups = [_describe_group(group, inflation, hints) for group in self.indistinguishable]
         return (*single, *groups, *([self._describe_unchanged()] if self.unchanged else []))
 
     def _describe_unchanged(self) -> str:
@@ -345,14 +346,14 @@ def report_agreement(fit: "pd.DataFrame") -> Report:
     return Report((Table((*text_columns("log", "channel"), *figures_heads, *text_columns("unit")), tuple(rows)),))
 
 
-def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:
+def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", hints: IdentificationHints) -> str:
     times = float(inflation[list(group)].max())
     message = (
         f"each {times:.0f} times better known if the others are fixed"
         if times < INFINITE_INFLATION
         else "nothing separates them"
     )
-    return f"{join_names(group)} act only together ({message}): {remedy(excitation, group)}"
+    return f"{join_names(group)} act only together ({message}): {remedy(hints, group)}"
 
 
 def join_names(names: Sequence[str]) -> str:
@@ -478,13 +479,13 @@ def summarise_motion(
 
 
 def missing_excitation(
-    excitation: Excitation, name: str, free: Sequence[str], seen: LoggedMotion | None
+    hints: IdentificationHints, name: str, free: Sequence[str], seen: LoggedMotion | None
 ) -> Lack | None:
     """The motion that the logs lack to identify a parameter, and the run to log; None if nothing known is lacking.
 
     Parameters
     ----------
-    excitation : Excitation
+    hints : IdentificationHints
         The model's.
     name : str
         Of the parameter, "name[log]" for one of a log.
@@ -492,34 +493,34 @@ def missing_excitation(
         All parameters that are to be identified at once.
     seen : LoggedMotion or None
     """
-    need = excitation.needs.get(_base_name(name))
+    need = hints.needs.get(_base_name(name))
     if need is None or seen is None:
         return None
     others = {_base_name(n) for n in free} - {_base_name(name)}
     return need.lack(seen) if need.confused_with & others or not need.confused_with else None
 
 
-def remedy(excitation: Excitation, names: Sequence[str]) -> str:
+def remedy(hints: IdentificationHints, names: Sequence[str]) -> str:
     """The run that would separate these parameters, in words."""
     bases = {_base_name(n) for n in names}
-    for run in excitation.runs:
+    for run in hints.runs:
         if bases & run.some and (len(bases) == 1 or bases & run.others):
             return _write_values(run.words, ParameterSet())
     return f"fix {'it' if len(bases) == 1 else 'one of them'}, or log a run that moves differently"
 
 
-def with_values_in_words(excitation: Excitation, values: ParameterSet) -> Excitation:
-    """The excitation, with the values in use in the words of its runs.
+def with_values_in_words(hints: IdentificationHints, values: ParameterSet) -> IdentificationHints:
+    """The hints, with the values in use in the words of its runs.
 
     Parameters
     ----------
-    excitation : Excitation
+    hints : IdentificationHints
         In whose words "<stribeck_velocity>" stands for the value of the parameter that ends so, "<5 stribeck_velocity>"
         for five times it.
     values : ParameterSet
     """
-    runs = tuple(replace(run, words=_write_values(run.words, values)) for run in excitation.runs)
-    return replace(excitation, runs=runs)
+    runs = tuple(replace(run, words=_write_values(run.words, values)) for run in hints.runs)
+    return replace(hints, runs=runs)
 
 
 def _write_values(words: str, values: ParameterSet) -> str:

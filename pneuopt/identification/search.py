@@ -444,7 +444,7 @@ def is_in_order(problem: EstimationProblem, fit: Fit) -> bool:
     Where it is not, a search may have lost it: it has ended so at the noise, with a Stribeck velocity 13 times too
     high, while the logs showed static friction of nearly twice Coulomb's.
     """
-    order, found = problem.system.plant.excitation.at_least, fit.parameters
+    order, found = problem.system.plant.identification_hints.at_least, fit.parameters
     bounded = [n for n in found.free_names if n not in problem.held and order.get(n) in found]
     return all(found.value(n) >= (1 + MIN_EXCESS) * found.value(order[n]) for n in bounded)
 
@@ -734,7 +734,8 @@ def _is_plain(problem: EstimationProblem) -> bool:
 
 def _bounded_parameters(problem: EstimationProblem) -> dict[str, str]:
     """The free parameters that another one bounds, and that one."""
-    free, order = set(problem.parameters.free_names) - set(problem.held), problem.system.plant.excitation.at_least
+    free = set(problem.parameters.free_names) - set(problem.held)
+    order = problem.system.plant.identification_hints.at_least
     return {n: m for n, m in order.items() if n in free and m in free}
 
 
@@ -851,7 +852,7 @@ def hold_order(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
         The given one, where there are none, or where the logs reject the other one's value.
     """
     found, bound = fit.parameters, dict(zip(fit.parameters.free_names, fit.at_bound, strict=True))
-    order = problem.system.plant.excitation.at_least
+    order = problem.system.plant.identification_hints.at_least
     below = {n: m for n, m in order.items() if bound.get(n) or n in problem.held}
     given = problem.unknowns()
     known = {n: m for n, m in below.items() if m in found and found.value(n) < found.value(m) <= given[n].upper}
@@ -883,7 +884,7 @@ def mark_order(problem: EstimationProblem, result: IdentificationResult) -> Iden
         Both are marked "bias possible", and the status names them.
     """
     estimates, status = result.estimates.copy(), result.status
-    for low, high in problem.system.plant.excitation.at_least.items():
+    for low, high in problem.system.plant.identification_hints.at_least.items():
         if low in estimates.index and _is_below(result, low, high):
             estimates.loc[[n for n in (low, high) if n in estimates.index], "mark"] = Mark.BIAS_POSSIBLE
             words = f"{low} is below {high}, which no drive has: model error, both may be biased"

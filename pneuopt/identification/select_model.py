@@ -398,7 +398,7 @@ def _has_jumps(fit: IdentificationResult, method: LeastSquares) -> bool:
 
 def _with_widths(candidate: Candidate, widths: Mapping[str, float]) -> Candidate:
     """The candidate with the common widths, where the user has stated none."""
-    own, known = candidate.parameters, candidate.system.excitation.widths
+    own, known = candidate.parameters, candidate.system.identification_hints.widths
     every = {name for width in known for name in (width.name, *width.follows)} & own.keys() & widths.keys()
     edits = {n: replace(own[n], value=widths[n], source=COMMON_WIDTH) for n in every}
     return replace(candidate, parameters=own | ParameterSet(edits))
@@ -415,7 +415,7 @@ class ModelSelection(Result):
         estimates), deviance, bic, bic_above (the best's; all three estimated for a refuted one, as is p_value),
         contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
         unidentifiable and at_bound (names of parameters), unphysical (which order of
-        `Excitation.at_least` it breaks), message.
+        `IdentificationHints.at_least` it breaks), message.
     recommended : str
         A candidate's name.
     reason : str
@@ -494,9 +494,9 @@ def select_model(
     those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
     with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
     parameters count among the k, so that a candidate with such parameters gives way to a simpler one that fits as well.
-    A candidate that did not converge, ends at a bound or breaks its model's `Excitation.at_least` is not recommended
-    while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without any the
-    fewer parameters.
+    A candidate that did not converge, ends at a bound or breaks its model's `IdentificationHints.at_least` is not
+    recommended while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without
+    any the fewer parameters.
     """
     check_options(method=method, window=window)
     free = as_tuple("free", free, str, 'names or patterns of parameters, as ["friction.*"]')
@@ -623,7 +623,7 @@ def _said(system: System, fit: IdentificationResult | Refutation) -> tuple[str, 
     if isinstance(fit, Refutation):
         return "", "", "", fit.reason
     notes = ", ".join(_names_noted(fit, UNIDENTIFIABLE_NOTE)), ", ".join(_names_noted(fit, AT_BOUND_NOTE))
-    return *notes, _unphysical(fit, system.excitation.at_least), fit.status.message
+    return *notes, _unphysical(fit, system.identification_hints.at_least), fit.status.message
 
 
 def _free_names(fit: IdentificationResult | Refutation) -> set[str]:
@@ -716,7 +716,7 @@ def _separate(
     terms = sorted(set(fits[other].estimates.index) ^ set(fits[chosen].estimates.index))
     if not terms:
         return ""
-    run = remedy(systems[max(other, chosen, key=lambda n: rows[n].free)].excitation, terms)
+    run = remedy(systems[max(other, chosen, key=lambda n: rows[n].free)].identification_hints, terms)
     if fall <= 2 * max(1, extra):
         return f"these logs do not tell it from {other}, nor would more of the same: {run}"
     times = max(2.0, (TIE + extra * math.log(_residual_count(fits[chosen]))) / fall)

@@ -148,7 +148,7 @@ def _names(width: Width) -> tuple[str, ...]:
 
 def _present(problem: EstimationProblem) -> list[Width]:
     """The widths of the model, of which each is a parameter."""
-    return [w for w in problem.system.plant.excitation.widths if w.name in problem.parameters]
+    return [w for w in problem.system.plant.identification_hints.widths if w.name in problem.parameters]
 
 
 def _is_open(problem: EstimationProblem, name: str) -> bool:
