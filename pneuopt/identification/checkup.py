@@ -19,10 +19,10 @@ from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.identification.examination import (
     QUIET_CHECKS,
     accept_remedy,
+    axis_from_model,
     find_exchange,
     is_accepted,
     is_refused,
-    stated_axis,
 )
 from pneuopt.identification.identifiability import verdict_from_sensitivities
 from pneuopt.identification.problem import (
@@ -290,7 +290,7 @@ def check(
     logs = check_logs(model, given, parameters)
     assumptions = list_assumptions(model, given, logs, parameters)
     parameters, found = _find_centre(model, logs, parameters)
-    found += [f for log in logs for f in examine(log, stated_axis(model.plant, log, parameters))]
+    found += [f for log in logs for f in examine(log, axis_from_model(model.plant, log, parameters))]
     found += [f for log in logs for f in _exchange_findings(model, log, parameters, found)]
     found += [*_model_findings(model, logs, parameters), *_log_findings(model, given, logs), *_free(logs, parameters)]
     ranked = sorted(

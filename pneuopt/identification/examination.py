@@ -2,7 +2,7 @@
 
 `pose_problem` makes the estimation problem of logs that pass.
 
-`stated_axis`: what a plant and its parameters say of the axis that a log is of, for the log doctor.
+`axis_from_model`: what a plant and its parameters say of the axis that a log is of, for the log doctor.
 
 `find_exchange`: two channels of a log whose columns are exchanged, by trying.
 """
@@ -128,10 +128,10 @@ def accept_remedy(finding: LogFinding) -> str:
 
 def _find(system: Fittable, experiments: Iterable[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:
     for experiment in experiments:
-        yield from examine(experiment, stated_axis(system.plant, experiment, parameters))
+        yield from examine(experiment, axis_from_model(system.plant, experiment, parameters))
 
 
-def stated_axis(plant: System, experiment: Experiment, parameters: ParameterSet) -> StatedAxis:
+def axis_from_model(plant: System, experiment: Experiment, parameters: ParameterSet) -> StatedAxis:
     """The channels of the plant's axis, and the forces on it; a piston's channels if the plant declares none.
 
     Parameters
@@ -274,4 +274,4 @@ def _is_right(model: Fittable, log: Experiment, parameters: ParameterSet) -> boo
         (full,) = check_logs(model, log, parameters)
     except InputError:
         return False
-    return not any(f.fault for f in examine(full, stated_axis(model.plant, full, parameters)))
+    return not any(f.fault for f in examine(full, axis_from_model(model.plant, full, parameters)))

@@ -189,7 +189,7 @@ def add_unidentifiable(verdict: Verdict, names: Sequence[str], local: Verdict, u
     return Verdict(table, (*verdict.indistinguishable, *groups), reasons, ordered, verdict.identification_hints)
 
 
-def rejects_held_values(fit: Fit, first: Fit, held: int) -> bool:
+def rejects_fixed_values(fit: Fit, first: Fit, held: int) -> bool:
     """Whether a likelihood-ratio test rejects the values at which `held` parameters are.
 
     Parameters
@@ -209,19 +209,19 @@ def rejects_held_values(fit: Fit, first: Fit, held: int) -> bool:
     return not rise <= noise * chi2.ppf(REJECTION_CONFIDENCE, held)
 
 
-def leans_on_prior(covariance: Array, prior_covariance: Array) -> Mask:
+def prior_influenced(covariance: Array, prior_covariance: Array) -> Mask:
     """The mask of estimates whose variance the priors of held parameters dominate; covariances of shape (k, k)."""
     return np.asarray(np.diag(prior_covariance) > MAX_PRIOR_VARIANCE_SHARE * np.diag(covariance))
 
 
-def rests_on_prior(covariance: Array, prior_covariance: Array, values: Array, held: Iterable[float]) -> Mask:
+def prior_dominated(covariance: Array, prior_covariance: Array, values: Array, held: Iterable[float]) -> Mask:
     """The mask of estimates that the logs do not identify: they lean on priors, and are not known well even so.
 
     A factor of ten says nothing of what is held at zero, so nothing that leans on it is known.
     """
     is_close = np.sqrt(np.diag(covariance)) <= MAX_PRIOR_DEVIATION * np.abs(values)
     is_close &= all(held)
-    return leans_on_prior(covariance, prior_covariance) & ~is_close
+    return prior_influenced(covariance, prior_covariance) & ~is_close
 
 
 def _make_verdict(

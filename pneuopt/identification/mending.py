@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pneuopt.dynamics.runnable import Fittable
-from pneuopt.identification.examination import exchange, find_exchange, is_accepted, stated_axis
+from pneuopt.identification.examination import axis_from_model, exchange, find_exchange, is_accepted
 from pneuopt.identification.problem import check_logs
 from pneuopt.logs.doctor import LogFinding, examine
 from pneuopt.logs.experiment import Experiment
@@ -62,7 +62,7 @@ def _name(finding: LogFinding) -> tuple[str, str]:
 
 def _faults(model: Fittable, log: Experiment, parameters: ParameterSet) -> list[LogFinding]:
     (full,) = check_logs(model, log, parameters)
-    found = examine(full, stated_axis(model.plant, full, parameters))
+    found = examine(full, axis_from_model(model.plant, full, parameters))
     return [f for f in found if f.fault and not is_accepted(f, [full])]
 
 

@@ -66,8 +66,8 @@ class EstimationProblem:
     method : LeastSquares
     weights : mapping of str to ndarray, each of shape (n, n_measured_outputs)
         By log, the weight of each sample's squared residual; 1 for logs that are absent.
-    held : mapping of str to float
-        Values of free parameters that are held, for the logs cannot identify them.
+    fixed : mapping of str to float
+        Values of free parameters that stay fixed, for the logs cannot identify them.
     noise_is_stated : bool
         Whether the logs state the noise of all outputs; otherwise it is estimated from them.
     window : float
@@ -81,7 +81,7 @@ class EstimationProblem:
     parameters: ParameterSet
     method: LeastSquares
     weights: Mapping[str, Array] = field(default_factory=dict)
-    held: Mapping[str, float] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)
     noise_is_stated: bool = False
     window: float = math.inf
     is_whole: bool = False
@@ -138,7 +138,7 @@ class EstimationProblem:
         phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
         residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
         parameters = self.unknowns().with_values(candidate.parameters)
-        held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.held.items()}
+        held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.fixed.items()}
         parameters = parameters | ParameterSet(held)
         return Transcription(self._discrete, parameters, phases, residuals)
 

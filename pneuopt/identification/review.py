@@ -140,7 +140,7 @@ def _blank_intervals(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.Dat
 def _names_at_given_value(problem: EstimationProblem) -> tuple[str, ...]:
     """The parameters that are held at their given values."""
     given = problem.unknowns()
-    return tuple(n for n, v in problem.held.items() if v == given.value(n))
+    return tuple(n for n, v in problem.fixed.items() if v == given.value(n))
 
 
 def _verdict_at(problem: EstimationProblem, start: Start, result: IdentificationResult) -> Verdict:
@@ -252,7 +252,7 @@ def _locate_failure(problem: EstimationProblem, start: Start, status: Status, ve
 def _name_part(problem: EstimationProblem, status: Status, verdict: Verdict) -> Status:
     """The status of a fit with what its logs do not identify, and where that is held; first where it is good."""
     unknowns = problem.unknowns()
-    held = [f"{n} at {write_value(problem.held[n], p.unit, 3)}" for n, p in unknowns.items() if n in problem.held]
+    held = [f"{n} at {write_value(problem.fixed[n], p.unit, 3)}" for n, p in unknowns.items() if n in problem.fixed]
     words = f"held: {join_names(held)}; the intervals of the others allow for a factor of ten" if held else ""
     said = tuple(filter(None, (_name_unidentifiable(verdict), words)))
     if not said or status.code is not Code.CONVERGED:

@@ -28,7 +28,7 @@ parameter bounds (static friction, which filtered speeds show too low); the best
 (`shooting.prediction_errors`), and the search with tight gaps begins with the states that a filter finds by what they
 lead to. Six of nine logs that stick and slip, and that no other start explained in 60 CPU s, are explained so.
 
-`fit_with_closed_gaps`: the optimum of a model that misses its logs, with gaps so tight that they carry no misfit.
+`tighten_gaps`: the optimum of a model that misses its logs, with gaps so tight that they carry no misfit.
 
 A search ends with gaps that a right model closes. A wrong model leaves them open at its optimum, where they take a part
 of the misfit, and the estimates depend on their weight. Gaps that are weighed more, from there on, close: what is left
@@ -39,7 +39,7 @@ is the least squares of the whole logs' simulation, of which the estimates are a
 A profile fits all other parameters again at each value of one. Where it finds less cost than the fit, its interval lies
 elsewhere: an estimate outside of its own interval is no optimum.
 
-`hold_order`: what no plant has below another parameter, but a search has left there, is held at that one's value.
+`enforce_ordering`: what no plant has below another parameter, but a search has left there, is held at that one's value.
 
 `mark_order` is for logs that reject this, and put one parameter below the other beyond chance: the model then lacks
 something, as friction that builds up over a displacement.
@@ -57,7 +57,7 @@ import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.identifiability import rejects_held_values, rests_on_prior, verdict_from_sensitivities
+from pneuopt.identification.identifiability import prior_dominated, rejects_fixed_values, verdict_from_sensitivities
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.profiles import Profile
@@ -143,15 +143,15 @@ def fit_from_starts(
             limit = HOPELESS_MISFIT if may_wait else math.inf
             known = _joinable_costs(fits) if is_plain else ()
             tried = replace(problem, method=_method_after(problem, fits)) if known else problem
-            held, fit = fit_holding_unidentifiable(tried, start, limit, known)
+            held, fit = fit_fixing_unidentifiable(tried, start, limit, known)
             held = replace(held, method=problem.method)
             if fit.end is SearchEnd.DUPLICATE:
                 break
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
-            if explains_to_noise(held, fit) and not held.held and is_in_order(held, fit):
+            if explains_to_noise(held, fit) and not held.fixed and is_in_order(held, fit):
                 return held, fit, start.label
             if fit.status.code is not Code.INTERRUPTED and is_at_noise(held, fit):
-                held, fit = fit_a_part(held, fit, start.label)
+                held, fit = fit_without_unsettled(held, fit, start.label)
             interrupted = fit.status.code is Code.INTERRUPTED
             fits.append((held, fit, start.label))
             fits.sort(key=lambda each: rank(each[1], tightest))
@@ -166,7 +166,7 @@ def fit_from_starts(
         interrupted = True
     held, fit, label = fits[0]
     if not interrupted:
-        held, fit = fit_a_part(held, fit, label)
+        held, fit = fit_without_unsettled(held, fit, label)
         interrupted = fit.status.code is Code.INTERRUPTED
     return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
 
@@ -286,7 +286,7 @@ def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> 
     return (gap, cost), replace(start, parameters={**start.parameters, **guesses}), explains
 
 
-def fit_holding_unidentifiable(
+def fit_fixing_unidentifiable(
     problem: EstimationProblem,
     start: Start,
     max_misfit: float = math.inf,
@@ -315,7 +315,9 @@ def fit_holding_unidentifiable(
     for is_given in (True, False) if not first.status.converged else (True,):
         held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
         is_settled = fit.status.converged and not fit.unidentifiable
-        if fit.status.code is Code.INTERRUPTED or (is_settled and not rejects_held_values(fit, first, len(held.held))):
+        if fit.status.code is Code.INTERRUPTED or (
+            is_settled and not rejects_fixed_values(fit, first, len(held.fixed))
+        ):
             return held, fit
     return problem, first
 
@@ -327,8 +329,8 @@ def _hold_unidentifiable(
     held, fit, given = problem, first, problem.unknowns()
     warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
     source = given if is_given else first.parameters
-    while fit.unidentifiable and len(held.held) + len(fit.unidentifiable) < len(given.free_names):
-        held = replace(held, held={**held.held, **{n: source.value(n) for n in fit.unidentifiable}})
+    while fit.unidentifiable and len(held.fixed) + len(fit.unidentifiable) < len(given.free_names):
+        held = replace(held, fixed={**held.fixed, **{n: source.value(n) for n in fit.unidentifiable}})
         before, fit = fit, solve_least_squares(held.transcription(held.start_from(fit, label)), warm)
         fit = fit.with_effort_of(before)
         if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):
@@ -336,7 +338,7 @@ def _hold_unidentifiable(
     return held, fit
 
 
-def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
+def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
     """Where a search did not settle in a parameter, the fit of the others with that one held where it had come to.
 
     Parameters
@@ -361,9 +363,9 @@ def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
     )
     while not part.status.converged:
         names = part.unidentifiable or part.unsettled
-        if not names or len(held.held) + len(names) >= len(part.parameters.free_names):
+        if not names or len(held.fixed) + len(names) >= len(part.parameters.free_names):
             return problem, fit
-        held = replace(held, held={**held.held, **{n: part.parameters.value(n) for n in names}})
+        held = replace(held, fixed={**held.fixed, **{n: part.parameters.value(n) for n in names}})
         before, part = part, solve_least_squares(held.transcription(held.start_from(part, label)), warm)
         part = part.with_effort_of(before)
         if part.status.code is Code.INTERRUPTED:
@@ -378,9 +380,9 @@ def _rests_on_held(problem: EstimationProblem, fit: Fit) -> bool:
     if fit.covariance is None or fit.prior_covariance is None:
         return False
     names = fit.parameters.free_names
-    values, free = np.array([fit.parameters.value(n) for n in names]), [n not in problem.held for n in names]
+    values, free = np.array([fit.parameters.value(n) for n in names]), [n not in problem.fixed for n in names]
     covariance = fit.covariance + fit.prior_covariance
-    return bool(rests_on_prior(covariance, fit.prior_covariance, values, problem.held.values())[free].all())
+    return bool(prior_dominated(covariance, fit.prior_covariance, values, problem.fixed.values())[free].all())
 
 
 def explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
@@ -411,7 +413,7 @@ def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
 
 def _joinable_costs(fits: Sequence[Candidate]) -> tuple[tuple[float, float], ...]:
     """The costs at the end of the best search's stages, at which another one that joins it only confirms it."""
-    return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].held else ()
+    return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].fixed else ()
 
 
 def _method_after(problem: EstimationProblem, fits: Sequence[Candidate]) -> LeastSquares:
@@ -445,7 +447,7 @@ def is_in_order(problem: EstimationProblem, fit: Fit) -> bool:
     high, while the logs showed static friction of nearly twice Coulomb's.
     """
     order, found = problem.system.plant.identification_hints.at_least, fit.parameters
-    bounded = [n for n in found.free_names if n not in problem.held and order.get(n) in found]
+    bounded = [n for n in found.free_names if n not in problem.fixed and order.get(n) in found]
     return all(found.value(n) >= (1 + MIN_EXCESS) * found.value(order[n]) for n in bounded)
 
 
@@ -511,7 +513,7 @@ def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candid
     """
     for found in _tries_of_long_logs(problem):
         held, fit, label = _settle(*found) if tried else found
-        is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.held or bool(tried))
+        is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.fixed or bool(tried))
         is_sure = is_in_order(held, fit) or any(_is_confirmed(fit, other) for _, other, _ in tried)
         tried.append((held, fit, label))
         if (is_answer and is_sure) or fit.status.code is Code.INTERRUPTED:
@@ -527,7 +529,7 @@ def _is_confirmed(fit: Fit, other: Fit) -> bool:
 def _settle(problem: EstimationProblem, fit: Fit, label: str) -> Candidate:
     """The fit; where it is at the noise but for a parameter that did not settle, that of the others."""
     is_unsettled = fit.status.code is Code.NOT_CONVERGED and is_at_noise(problem, fit)
-    return (*(fit_a_part(problem, fit, label) if is_unsettled else (problem, fit)), label)
+    return (*(fit_without_unsettled(problem, fit, label) if is_unsettled else (problem, fit)), label)
 
 
 def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
@@ -559,7 +561,7 @@ def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
         return
     warm = replace(problem, method=replace(problem.method, stages=stages[-1:]))
     start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters), stages[-1].gap)
-    whole, fit = fit_holding_unidentifiable(warm, start, HOPELESS_MISFIT)
+    whole, fit = fit_fixing_unidentifiable(warm, start, HOPELESS_MISFIT)
     yield replace(whole, method=problem.method), fit, f"{label}, of a part"
 
 
@@ -580,7 +582,7 @@ def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> 
         return None
     tight = replace(problem, method=replace(problem.method, stages=stages[-1:], allows_state_noise=False))
     start = filter_states(tight, replace(rough, parameters=problem.start_from(settled).parameters))
-    held, fit = fit_holding_unidentifiable(tight, start, HOPELESS_MISFIT)
+    held, fit = fit_fixing_unidentifiable(tight, start, HOPELESS_MISFIT)
     return replace(held, method=problem.method), fit.with_effort_of(settled), rough.label
 
 
@@ -734,7 +736,7 @@ def _is_plain(problem: EstimationProblem) -> bool:
 
 def _bounded_parameters(problem: EstimationProblem) -> dict[str, str]:
     """The free parameters that another one bounds, and that one."""
-    free = set(problem.parameters.free_names) - set(problem.held)
+    free = set(problem.parameters.free_names) - set(problem.fixed)
     order = problem.system.plant.identification_hints.at_least
     return {n: m for n, m in order.items() if n in free and m in free}
 
@@ -770,7 +772,7 @@ def _liveliest(segments: Segments, problem: EstimationProblem) -> Indices:
     return np.concatenate(parts)
 
 
-def fit_with_closed_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:
+def tighten_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:
     """The fit with tighter gaps, where a search has ended at an optimum whose gaps absorb the misfit.
 
     Parameters
@@ -833,7 +835,7 @@ def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[P
     return replace(fit, status=Status(Code.NOT_CONVERGED, (verdict, "try other start values, or fix a parameter")))
 
 
-def hold_order(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
+def enforce_ordering(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
     """Hold parameters that no plant has below another one at that one's value, where the logs do not show them.
 
     Parameters
@@ -853,7 +855,7 @@ def hold_order(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
     """
     found, bound = fit.parameters, dict(zip(fit.parameters.free_names, fit.at_bound, strict=True))
     order = problem.system.plant.identification_hints.at_least
-    below = {n: m for n, m in order.items() if bound.get(n) or n in problem.held}
+    below = {n: m for n, m in order.items() if bound.get(n) or n in problem.fixed}
     given = problem.unknowns()
     known = {n: m for n, m in below.items() if m in found and found.value(n) < found.value(m) <= given[n].upper}
     values = {n: found.value(m) for n, m in known.items()}
@@ -861,12 +863,12 @@ def hold_order(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
         return problem, fit
     start = problem.start_from(fit, label)
     start = replace(start, parameters={**start.parameters, **values})
-    ordered = replace(problem, held={**problem.held, **_without_effect(problem, start), **values})
-    if len(ordered.held) >= len(found.free_names):
+    ordered = replace(problem, fixed={**problem.fixed, **_without_effect(problem, start), **values})
+    if len(ordered.fixed) >= len(found.free_names):
         return problem, fit
-    held, other = fit_holding_unidentifiable(ordered, start)
+    held, other = fit_fixing_unidentifiable(ordered, start)
     settled = other.status.converged and not other.unidentifiable and (other.jumps is None or fit.jumps is not None)
-    rejected = not settled or rejects_held_values(other, fit, len(held.held))
+    rejected = not settled or rejects_fixed_values(other, fit, len(held.fixed))
     return (problem, fit) if rejected else (held, other.with_effort_of(fit))
 
 

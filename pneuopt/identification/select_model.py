@@ -613,12 +613,12 @@ def _candidate_rows(
             inside,
             p,
             predicted.get(name, math.nan),
-            *_said(candidates[name], fit),
+            *_notes(candidates[name], fit),
         )
     return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
 
 
-def _said(system: System, fit: IdentificationResult | Refutation) -> tuple[str, str, str, str]:
+def _notes(system: System, fit: IdentificationResult | Refutation) -> tuple[str, str, str, str]:
     """What is unidentifiable, what is at a bound, what is unphysical, and the message."""
     if isinstance(fit, Refutation):
         return "", "", "", fit.reason

@@ -205,15 +205,15 @@ def _is_foreseen(width: Width, given: _Trial, best: _Trial) -> bool:
     if not (best.widths[width.name] < given.widths[width.name] and 0 < best.foreseen < inf):
         return False
     tight, other = (replace(t, cost=t.foreseen) for t in (best, given))
-    return tight.cost < FORESEEN_RATIO * other.cost or _shows_more(width, tight, other)
+    return tight.cost < FORESEEN_RATIO * other.cost or _is_too_wide(width, tight, other)
 
 
 def _is_better(width: Width, trial: _Trial, other: _Trial) -> bool:
     """Whether a trial follows the logs better than another, or as well while it shows what the other hides."""
-    return trial.is_better_than(other) or _shows_more(width, trial, other)
+    return trial.is_better_than(other) or _is_too_wide(width, trial, other)
 
 
-def _shows_more(width: Width, trial: _Trial, best: _Trial) -> bool:
+def _is_too_wide(width: Width, trial: _Trial, best: _Trial) -> bool:
     """Whether a width is too wide for what it hides, and a narrower one follows the logs as well."""
     is_narrower = trial.widths[width.name] < best.widths[width.name]
     if width.hides not in best.parameters or not (is_narrower and trial.cost <= best.cost + best.significant_fall):

@@ -18,7 +18,7 @@ from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, t_quantile
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.result import ChosenWindow
-from pneuopt.identification.search import fit_holding_unidentifiable
+from pneuopt.identification.search import fit_fixing_unidentifiable
 from pneuopt.identification.tolerances import (
     FIRST_ITERATIONS,
     MIN_KNOWN_SHARE,
@@ -185,7 +185,7 @@ def _try_length(problem: EstimationProblem, start: Start, length: float, iterati
     # without gaps all stages are alike; steps are refined where the search has converged
     last = replace(problem.method.stages[-1], iterations=iterations, refine=1)
     cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=(last,)))
-    held, found = fit_holding_unidentifiable(cut, start)
+    held, found = fit_fixing_unidentifiable(cut, start)
     held = replace(held, method=replace(held.method, stages=problem.method.stages))
     freedom = degrees_of_freedom(held, found)
     return _Trial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))

@@ -79,7 +79,7 @@ def test_a_result_without_a_value_starts_at_the_given_one() -> None:
     result = IdentificationResult(fit.parameters, estimates, table, table, runs, fit.status, fit.stats, {})
     given = posed.parameters.value("friction.viscous")
     assert posed.start_from(result).parameters == {"load.mass": 4.5, "friction.viscous": given}
-    held = replace(posed, held={"friction.viscous": 7.0})
+    held = replace(posed, fixed={"friction.viscous": 7.0})
     assert held.transcription(held.start_from(result)).parameters.value("friction.viscous") == 7.0
 
 

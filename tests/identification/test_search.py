@@ -47,16 +47,16 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.review import review_fit
 from pneuopt.identification.search import (
     cut_excerpts,
+    enforce_ordering,
     filter_states,
+    fit_fixing_unidentifiable,
     fit_from_predictions,
     fit_from_profiles,
     fit_from_starts,
-    fit_holding_unidentifiable,
-    fit_with_closed_gaps,
-    hold_order,
     is_in_order,
     liveliest_part,
     mark_order,
+    tighten_gaps,
 )
 from pneuopt.identification.tolerances import BEST, EXCERPT_SEGMENTS, GUESS_STAGES, LEVELS, PART_SEGMENTS
 from pneuopt.logs.experiment import Experiment
@@ -225,17 +225,17 @@ def test_a_refit_is_taken_only_where_the_logs_do_not_reject_its_held_values(monk
     refits = {True: worse, False: good}
 
     def hold(problem: EstimationProblem, label: str, first: Fit, *, is_given: bool) -> tuple[EstimationProblem, Fit]:
-        return replace(problem, held={"friction.viscous": float(is_given)}), refits[is_given]
+        return replace(problem, fixed={"friction.viscous": float(is_given)}), refits[is_given]
 
     status = Status(Code.NOT_CONVERGED, ("the data do not determine friction.viscous",))
     monkeypatch.setattr(starting, "solve_least_squares", lambda *_: replace(first, status=status))
     monkeypatch.setattr(starting, "_hold_unidentifiable", hold)
-    held, fit = starting.fit_holding_unidentifiable(problem, start)
+    held, fit = starting.fit_fixing_unidentifiable(problem, start)
     assert fit is good
-    assert held.held == {"friction.viscous": 0.0}
+    assert held.fixed == {"friction.viscous": 0.0}
     refits[False] = worse
-    held, fit = starting.fit_holding_unidentifiable(problem, start)
-    assert held.held == {}
+    held, fit = starting.fit_fixing_unidentifiable(problem, start)
+    assert held.fixed == {}
     assert fit.status == status
 
 
@@ -253,9 +253,9 @@ def test_a_start_that_is_too_stiff_to_be_searched_holds_nothing(monkeypatch: pyt
     problem = posed(Stribeck())
     start = problem.candidates()[0]
     stiff = replace(start, parameters={**start.parameters, "friction.static": 5e4, VELOCITY: 0.004})
-    held, fit = starting.fit_holding_unidentifiable(problem, stiff)
+    held, fit = starting.fit_fixing_unidentifiable(problem, stiff)
     assert "so stiff that a sample takes" in fit.status.verdict
-    assert (dict(held.held), fit.unidentifiable, calls) == ({}, (), 1)
+    assert (dict(held.fixed), fit.unidentifiable, calls) == ({}, (), 1)
 
 
 def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,10 +266,10 @@ def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatc
         problem: EstimationProblem, start: Start, most: float, known: tuple[tuple[float, float], ...]
     ) -> tuple[EstimationProblem, Fit]:
         labels.append(start.label)
-        return fit_holding_unidentifiable(problem, start, most, known)
+        return fit_fixing_unidentifiable(problem, start, most, known)
 
     monkeypatch.setattr(starting, "explains_to_noise", lambda *_: False)
-    monkeypatch.setattr(starting, "fit_holding_unidentifiable", noted)
+    monkeypatch.setattr(starting, "fit_fixing_unidentifiable", noted)
     monkeypatch.setattr(starting, "_settle_start", lambda *_: pytest.fail("settled"))
     assert starting.fit_from_starts(problem)[1].status.converged
     assert labels == [c.label for c in problem.candidates()[:2]]
@@ -344,12 +344,12 @@ def test_a_fit_at_the_noise_that_leaves_one_parameter_unsettled_takes_one_more_s
         status = Status(Code.NOT_CONVERGED, (f"{VELOCITY} would still move by 14 standard deviations",))
         return problem, replace(fit, status=status, unsettled=(VELOCITY,))
 
-    monkeypatch.setattr(starting, "fit_holding_unidentifiable", unsettled)
+    monkeypatch.setattr(starting, "fit_fixing_unidentifiable", unsettled)
     monkeypatch.setattr(starting, "ACCEPTED_CHI_SQUARE_RATIO", 2.0)  # this log has 1.6
     monkeypatch.setattr(starting, "_settle_start", lambda *_: pytest.fail("settled"))
     held, fit, _ = starting.fit_from_starts(problem)
     assert fit.status.converged
-    assert set(held.held) == {VELOCITY}
+    assert set(held.fixed) == {VELOCITY}
     assert labels == [c.label for c in problem.candidates()[:2]]
 
 
@@ -360,11 +360,11 @@ def test_a_start_that_joins_the_best_confirms_it(monkeypatch: pytest.MonkeyPatch
         problem: EstimationProblem, start: Start, most: float, costs: tuple[tuple[float, float], ...]
     ) -> tuple[EstimationProblem, Fit]:
         known.append(costs)
-        held, fit = fit_holding_unidentifiable(problem, start, most)
+        held, fit = fit_fixing_unidentifiable(problem, start, most)
         return held, replace(fit, end=SearchEnd.DUPLICATE) if costs else fit
 
     monkeypatch.setattr(starting, "explains_to_noise", lambda *_: False)
-    monkeypatch.setattr(starting, "fit_holding_unidentifiable", joined)
+    monkeypatch.setattr(starting, "fit_fixing_unidentifiable", joined)
     monkeypatch.setattr(starting, "_settle_start", lambda *_: pytest.fail("settled"))
     _, fit, label = starting.fit_from_starts(problem)
     assert fit.status.converged
@@ -382,12 +382,12 @@ def test_a_confirming_start_looks_for_no_noise_of_the_states_where_the_best_foun
 
     def fitted(problem: EstimationProblem, start: Start, *given: object) -> tuple[EstimationProblem, Fit]:
         allowed.append(problem.method.allows_state_noise)
-        held, fit = fit_holding_unidentifiable(problem, start)
+        held, fit = fit_fixing_unidentifiable(problem, start)
         return held, fit if settled else replace(fit, status=missed, stats={**fit.stats, "gap_share": 0.12})
 
     monkeypatch.setattr(starting, "explains_to_noise", lambda *_: False)
     monkeypatch.setattr(starting, "is_at_noise", lambda *_: False)
-    monkeypatch.setattr(starting, "fit_holding_unidentifiable", fitted)
+    monkeypatch.setattr(starting, "fit_fixing_unidentifiable", fitted)
     held, *_ = starting.fit_from_starts(problem)
     assert allowed == [True, settled]
     assert held.method == problem.method
@@ -448,7 +448,7 @@ def test_a_fit_that_has_lost_static_friction_takes_one_more_start(
         values = {"friction.coulomb": 30.0, "friction.static": 30.0 * (1 + excess)}
         return problem, replace(fit, parameters=fit.parameters.with_values(values))
 
-    monkeypatch.setattr(multistart, "fit_holding_unidentifiable", found)
+    monkeypatch.setattr(multistart, "fit_fixing_unidentifiable", found)
     monkeypatch.setattr(multistart, "ACCEPTED_CHI_SQUARE_RATIO", 2.0)  # this log has 1.6
     assert multistart.fit_from_starts(problem)[1].status.converged
     assert labels == [c.label for c in problem.candidates()[:starts]]
@@ -611,7 +611,7 @@ def test_what_a_second_try_of_a_long_log_holds_needs_no_third(
     tries: int, ended: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, _ = posed_of_excerpts()
-    held = replace(problem, held={FREE[0]: 30.0})
+    held = replace(problem, fixed={FREE[0]: 30.0})
     fit: Fit = Mock(unidentifiable=(), status=Status(Code.CONVERGED, ("",)), parameters=problem.parameters)
     explain_all(monkeypatch)
     monkeypatch.setattr(long_logs, "_tries_of_long_logs", lambda _: iter([(held, fit, str(k)) for k in range(tries)]))
@@ -626,9 +626,9 @@ def test_a_whole_log_at_the_noise_that_leaves_one_parameter_unsettled_holds_that
     problem, _ = posed_of_excerpts()
     unsettled: Fit = Mock(status=Status(Code.NOT_CONVERGED, ("",)), parameters=problem.parameters)
     settled: Fit = Mock(unidentifiable=(), status=Status(Code.CONVERGED, ("",)), parameters=problem.parameters)
-    held = replace(problem, held={FREE[0]: 30.0})
+    held = replace(problem, fixed={FREE[0]: 30.0})
     explain_all(monkeypatch)
-    monkeypatch.setattr(long_logs, "fit_a_part", lambda *_: (held, settled))
+    monkeypatch.setattr(long_logs, "fit_without_unsettled", lambda *_: (held, settled))
     monkeypatch.setattr(long_logs, "_tries_of_long_logs", lambda _: iter(2 * [(problem, unsettled, "")]))
     assert long_logs._fit_long_logs(problem, []) == (held, settled, "")
 
@@ -652,7 +652,7 @@ def test_an_answer_that_has_lost_static_friction_is_no_answer(static: float, mon
     )
     monkeypatch.setattr(long_logs, "_tries_of_long_logs", lambda _: iter(3 * [(problem, same, "")]))
     assert long_logs._fit_long_logs(problem, []) is not None  # what two starts lead to is what the logs show
-    known = replace(problem, held={"friction.static": static})
+    known = replace(problem, fixed={"friction.static": static})
     assert is_in_order(known, fit)
     assert not is_in_order(problem, fit)
 
@@ -716,7 +716,7 @@ def test_ctrl_c_in_the_short_search_ends_all() -> None:
     problem, _ = posed_of_excerpts(method=LeastSquares(progress=interrupt))
     held, fit, _ = long_logs.fit_logs(problem, multistart.fit_from_starts)
     assert fit.status.code is Code.INTERRUPTED
-    assert not held.held
+    assert not held.fixed
     assert math.isfinite(fit.stats["cost"])
 
 
@@ -885,7 +885,7 @@ def test_the_part_is_the_liveliest() -> None:
 @pytest.mark.parametrize("fault", ["residuals", "order", "status"])
 def test_a_fit_that_is_no_answer_is_left_for_the_other_starts(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It ended at the noise with static friction next to Coulomb's, which the logs showed to be far above."""
-    problem, search = posed_of_predicted_fit(Stribeck()), multistart.fit_holding_unidentifiable
+    problem, search = posed_of_predicted_fit(Stribeck()), multistart.fit_fixing_unidentifiable
     _, fit = search(problem, problem.candidates()[0])
     wrong = {
         "residuals": replace(fit, chi_square=2.0 * fit.count),
@@ -903,13 +903,13 @@ def test_a_fit_that_is_no_answer_is_left_for_the_other_starts(fault: str, monkey
 
 
 def test_ctrl_c_ends_all_with_the_first_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, search = posed_of_predicted_fit(Stribeck()), multistart.fit_holding_unidentifiable
+    problem, search = posed_of_predicted_fit(Stribeck()), multistart.fit_fixing_unidentifiable
     _, fit = search(problem, problem.candidates()[0])
     left, cut = (
         replace(fit, end=END, status=END.status),
         replace(fit, status=Status(Code.INTERRUPTED)),
     )
-    monkeypatch.setattr(multistart, "fit_holding_unidentifiable", lambda *_: (problem, left))
+    monkeypatch.setattr(multistart, "fit_fixing_unidentifiable", lambda *_: (problem, left))
     monkeypatch.setattr(multistart, "fit_from_predictions", lambda *_: cut)
     _, best, label = fit_from_starts(problem)
     assert best.status.code is Code.INTERRUPTED
@@ -922,7 +922,7 @@ def test_it_is_tried_where_the_first_start_is_left(
     left: bool, robust: bool, tried: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before the other starts settle, of which none explains a log that sticks and slips."""
-    problem, calls, search = posed_of_predicted_fit(Stribeck()), list[float](), multistart.fit_holding_unidentifiable
+    problem, calls, search = posed_of_predicted_fit(Stribeck()), list[float](), multistart.fit_fixing_unidentifiable
 
     def first(posed_of_predicted_fit: EstimationProblem, start: Start, *given: float) -> tuple[EstimationProblem, Fit]:
         held, fit = search(posed_of_predicted_fit, start)
@@ -933,14 +933,14 @@ def test_it_is_tried_where_the_first_start_is_left(
         calls.append(max_misfit)
         return search(posed_of_predicted_fit, posed_of_predicted_fit.candidates()[0])[1]
 
-    monkeypatch.setattr(multistart, "fit_holding_unidentifiable", first)
+    monkeypatch.setattr(multistart, "fit_fixing_unidentifiable", first)
     monkeypatch.setattr(multistart, "fit_from_predictions", predicted)
     held, fit, label = fit_from_starts(problem, Huber() if robust else None)
     assert bool(calls) == tried
     assert ("by prediction errors" in label) == tried
     if tried:
         assert fit.status.code is Code.CONVERGED
-        assert not held.held
+        assert not held.fixed
 
 
 STEP, LAG, NOISE_CLOSED_GAPS = 2e-3, 1e-3, 3e-5  # [s], [s] of the position's sensor, [m]
@@ -981,10 +981,10 @@ def values(fit: Fit) -> Array:
     return np.array([fit.parameters.value(n) for n in FREE_CLOSED_GAPS])
 
 
-def test_closed_gaps_lead_to_the_optimum_of_single_shooting() -> None:
+def test_tightened_gaps_lead_to_the_optimum_of_single_shooting() -> None:
     problem, fit = open_fit()
     assert fit.status.code is Code.NOT_CONVERGED
-    closed = fit_with_closed_gaps(problem, fit)
+    closed = tighten_gaps(problem, fit)
     assert closed is not None
     assert closed.status.converged
     assert closed.stats["gap_share"] < MAX_GAP_SHARE < fit.stats["gap_share"]
@@ -1011,7 +1011,7 @@ def test_gaps_of_a_model_that_runs_away_are_not_closed(
 ) -> None:
     problem, fit = open_fit()
     monkeypatch.setattr("pneuopt.identification.search.solve_least_squares", lambda *_: pytest.fail("another search"))
-    assert fit_with_closed_gaps(problem, replace(fit, stats={**fit.stats, **change})) is None
+    assert tighten_gaps(problem, replace(fit, stats={**fit.stats, **change})) is None
 
 
 def optimum() -> tuple[EstimationProblem, Fit]:
@@ -1124,8 +1124,8 @@ def test_what_was_held_below_coulomb_friction_is_held_at_it() -> None:
     given = SYSTEM.parameters.freed(*TRUTH_ORDER, STATIC_ORDER, VELOCITY_ORDER)
     problem, fit = problem_and_fit(30.0, 0.02, given, {}, {STATIC_ORDER: 0.01, VELOCITY_ORDER: 2e-4})
     assert fit.status.converged
-    held, found = hold_order(problem, fit, "again")
-    assert held.held == {STATIC_ORDER: fit.parameters.value(COULOMB), VELOCITY_ORDER: 2e-4}
+    held, found = enforce_ordering(problem, fit, "again")
+    assert held.fixed == {STATIC_ORDER: fit.parameters.value(COULOMB), VELOCITY_ORDER: 2e-4}
     assert found.parameters.value(STATIC_ORDER) == pytest.approx(found.parameters.value(COULOMB), rel=1e-3)
     for name, true in TRUTH_ORDER.items():
         assert found.parameters.value(name) == pytest.approx(true, rel=1e-3)
@@ -1140,8 +1140,8 @@ def test_what_ended_at_a_bound_below_coulomb_friction_is_held_at_it() -> None:
     problem, fit = problem_and_fit(20.0, 3e-4, given.freed(*TRUTH_ORDER, STATIC_ORDER), {STATIC_ORDER: 29.0}, {})
     at_bound = dict(zip(fit.parameters.free_names, fit.at_bound, strict=True))
     assert at_bound[STATIC_ORDER]
-    held, found = hold_order(problem, fit, "again")
-    assert held.held == {STATIC_ORDER: fit.parameters.value(COULOMB)}
+    held, found = enforce_ordering(problem, fit, "again")
+    assert held.fixed == {STATIC_ORDER: fit.parameters.value(COULOMB)}
     assert found.parameters.value(COULOMB) == pytest.approx(30.0, rel=1e-3)
 
 
@@ -1151,14 +1151,14 @@ def test_a_log_that_shows_less_static_friction_keeps_its_answer() -> None:
     )
     problem, fit = problem_and_fit(10.0, 0.05, given.freed(*TRUTH_ORDER, STATIC_ORDER), {STATIC_ORDER: 15.0}, {})
     assert fit.parameters.value(STATIC_ORDER) == pytest.approx(15.0, rel=1e-6)
-    assert hold_order(problem, fit, "again") == (problem, fit)
+    assert enforce_ordering(problem, fit, "again") == (problem, fit)
 
 
 def test_a_fit_in_order_is_not_fitted_again() -> None:
     given = SYSTEM.parameters.freed(*TRUTH_ORDER, STATIC_ORDER, VELOCITY_ORDER)
     problem, fit = problem_and_fit(45.0, 0.02, given, {STATIC_ORDER: 40.0, VELOCITY_ORDER: 0.02}, {})
     assert fit.parameters.value(STATIC_ORDER) == pytest.approx(45.0, abs=1.0)
-    assert hold_order(problem, fit, "again") == (problem, fit)
+    assert enforce_ordering(problem, fit, "again") == (problem, fit)
 
 
 def test_friction_that_no_drive_has_is_named_and_marked() -> None:

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.files.toml import read_toml
-from pneuopt.identification.identifiability import leans_on_prior, rests_on_prior
+from pneuopt.identification.identifiability import prior_dominated, prior_influenced
 from pneuopt.identification.identify import identify
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult
@@ -150,9 +150,9 @@ def test_what_leans_on_a_held_parameter_and_is_known_well_even_so_is_handed_out(
     """A true stick-slip log whose Stribeck velocity did not settle: Coulomb within .6 %, static within 200 %."""
     values, deviations = np.array([30.0, 97.0, 80.0]), np.array([0.17, 209.0, 0.01])
     prior = np.diag(np.array([0.99, 0.99, 0.05]) * deviations**2)
-    assert leans_on_prior(np.diag(deviations**2), prior).tolist() == [True, True, False]
-    assert rests_on_prior(np.diag(deviations**2), prior, values, [0.01]).tolist() == [False, True, False]
-    assert rests_on_prior(np.diag(deviations**2), prior, values, [0.0]).tolist() == [True, True, False]
+    assert prior_influenced(np.diag(deviations**2), prior).tolist() == [True, True, False]
+    assert prior_dominated(np.diag(deviations**2), prior, values, [0.01]).tolist() == [False, True, False]
+    assert prior_dominated(np.diag(deviations**2), prior, values, [0.0]).tolist() == [True, True, False]
 
 
 def test_a_log_that_identifies_nothing_does_not_converge() -> None:

@@ -1,4 +1,4 @@
-"""`fit_a_part`: a parameter that did not settle is held, and the others are fitted, if that tells anything of them."""
+"""`fit_without_unsettled`: an unsettled parameter is held, and the others are fitted, if that tells anything of them."""
 
 from dataclasses import replace
 
@@ -27,11 +27,11 @@ def unsettled(done: Fit, name: str, off: float) -> Fit:
 def test_a_parameter_that_did_not_settle_is_held_and_the_others_are_fitted() -> None:
     problem, done = optimum()
     assert done.status.converged
-    assert multistart.fit_a_part(problem, done, "start") == (problem, done)
+    assert multistart.fit_without_unsettled(problem, done, "start") == (problem, done)
     off = 1.05 * done.parameters.value(VELOCITY)
-    held, part = multistart.fit_a_part(problem, unsettled(done, VELOCITY, off), "start")
+    held, part = multistart.fit_without_unsettled(problem, unsettled(done, VELOCITY, off), "start")
     assert part.status.converged
-    assert held.held == {VELOCITY: off}
+    assert held.fixed == {VELOCITY: off}
     assert part.parameters.value(VELOCITY) == off
     assert part.parameters.value("friction.coulomb") == pytest.approx(30, rel=0.1)
 
@@ -40,7 +40,7 @@ def test_a_part_that_is_known_by_what_is_held_alone_is_none() -> None:
     """Of a loop that saturates the leak ended on a kink; held within a decade, it made all other estimates vague."""
     problem, done = optimum()
     given = unsettled(done, "friction.static", 1.05 * done.parameters.value("friction.static"))
-    held, part = multistart.fit_a_part(problem, given, "start")
+    held, part = multistart.fit_without_unsettled(problem, given, "start")
     assert part is given
     assert held is problem
 
@@ -52,7 +52,7 @@ def test_ctrl_c_in_the_fit_of_a_part_is_no_answer(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(
         multistart, "solve_least_squares", lambda *_: replace(done, status=Status(Code.INTERRUPTED, ("cut",)))
     )
-    held, part = multistart.fit_a_part(problem, given, "start")
+    held, part = multistart.fit_without_unsettled(problem, given, "start")
     assert held is problem
     assert part.status.code is Code.INTERRUPTED
     assert part.parameters == given.parameters
@@ -62,7 +62,7 @@ def test_ctrl_c_in_the_fit_of_a_part_is_no_answer(monkeypatch: pytest.MonkeyPatc
         starts.append(start.label)
         return problem, given
 
-    monkeypatch.setattr(multistart, "fit_holding_unidentifiable", search)
+    monkeypatch.setattr(multistart, "fit_fixing_unidentifiable", search)
     monkeypatch.setattr(multistart, "is_at_noise", lambda *_: True)
     assert multistart.fit_from_starts(problem)[1].status.code is Code.INTERRUPTED
     assert len(starts) == 1
