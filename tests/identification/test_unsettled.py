@@ -1,4 +1,4 @@
-"""`fit_without_unsettled`: an unsettled parameter is held, and the others are fitted, if that tells anything of them."""
+"""`fit_without_unsettled`: what did not settle is held, and the others are fitted, if that tells anything of them."""
 
 from dataclasses import replace
 
