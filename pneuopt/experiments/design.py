@@ -1,12 +1,10 @@
 """`ExperimentDesign`: a planned experiment: what to play, what its log will tell, and what its log has told.
 
-`DOptimal`, `AOptimal`, `Precision`, `WantedPrecision`: what judges a planned experiment, by one number.
-
-A newcomer adds a class like these: the parameters that it is about, and its figure of their covariance. Source:
-Atkinson, Donev, Tobias, Optimum Experimental Designs, with SAS, 2007, chapter 10.
+`DOptimal`, `AOptimal`, `Precision`, `WantedPrecision` judge a plan by one number (Atkinson, Donev, Tobias, Optimum
+Experimental Designs, with SAS, 2007, chapter 10). A newcomer adds a class like these: the parameters that it is about,
+and its figure of their covariance.
 
 `linked_information`: what a log that is cut into linked segments tells about parameters, once it is identified.
-
 `identify` weighs the gaps between segments as if the states jumped there a little, and its covariance is the sandwich
 B^-1 M B^-1 (`Equations.covariance`): B is the Gram matrix of data and gaps with the nodes eliminated, M that of the
 data alone with the nodes where B puts them, since true gaps carry no noise. Its inverse B M^-1 B is the information
@@ -403,18 +401,11 @@ class WantedPrecision:
 
 
 def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int = 0) -> Array:
-    """The information of linked segments about parameters, as the estimates of `identify` have it; shape (m, k, k).
+    """The information (m, k, k) of m logs' linked segments about parameters, as the estimates of `identify` have it.
 
-    Parameters
-    ----------
-    grams : ndarray, shape (m, count, n + w, n + w)
-        Of m logs and their segments: the data's Gram matrices about start state and parameters, in unit noise.
-    ends : ndarray, shape (m, count, n, n + w)
-        Derivatives of each segment's end state by the same.
-    jumps : ndarray, shape (n,)
-        Standard deviations that the gaps are weighed with. States and jumps are in nominal sizes.
-    eliminated : int
-        So many parameters, the first ones, are each log's own; k are the others.
+    By the Gram matrices of each segment about its start state and w parameters, in unit noise, the derivatives of its
+    end state by the same, and the standard deviations of the gaps; the first `eliminated` parameters are each log's
+    own.
     """
     m, count, n, width = ends.shape
     gaps, follows = _gap_information(ends[:, :-1], 1 / jumps**2), list[Array]()

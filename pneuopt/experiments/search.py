@@ -3,13 +3,10 @@
 A short run is simulated in a fraction of the time: the search also begins with a quarter of the duration, whose
 information counts four times. Where that does better, it is refined, played twice in a row, and refined again.
 
-`Block`: a stretch of a planned excitation, a wave about a level; excitations are blocks one behind the other.
-
-`PlannedRun`: candidates of an experiment, simulated many at once in SIMD lanes; their limits and their information.
-
-The information about the parameters is that of the log that the run would leave: the plant's command and its measured
-outputs. So a loop only makes the run; it is the plant that is identified, along short segments whose sensitivities are
-chained, the start state eliminated, as `identify` does.
+A `Block` is a stretch of a planned excitation, a wave about a level. A `PlannedRun` simulates many candidates at once
+in SIMD lanes, with their limits and their information: that of the log that the run would leave, the plant's command
+and its measured outputs. So a loop only makes the run; it is the plant that is identified, along short segments whose
+sensitivities are chained, the start state eliminated, as `identify` does.
 """
 
 import itertools
@@ -130,17 +127,7 @@ def join_blocks(blocks: Sequence[Block], t: Array) -> Array:
 
 
 def library(amplitude: float, duration: float, sample_time: float) -> list[Block]:
-    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps.
-
-    Parameters
-    ----------
-    amplitude : float
-        The largest [unit of the excitation].
-    duration : float
-        Of a block [s].
-    sample_time : float
-        [s]
-    """
+    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps."""
     fastest = max(CYCLES_A_SAMPLE / sample_time, 2 / duration)
     sizes = amplitude * np.geomspace(LEAST_AMPLITUDE, 1.0, AMPLITUDES)
     paces = np.geomspace(1 / duration, fastest, FREQUENCIES)
@@ -149,18 +136,7 @@ def library(amplitude: float, duration: float, sample_time: float) -> list[Block
 
 
 def vary(block: Block, rng: np.random.Generator, spread: float, amplitude: float, ends: tuple[float, float]) -> Block:
-    """A block near another one, its numbers moved by about `spread` of themselves, its level by that of the range.
-
-    Parameters
-    ----------
-    block : Block
-    rng : numpy.random.Generator
-    spread : float
-    amplitude : float
-        The largest [unit of the excitation].
-    ends : (float, float)
-        Lowest and highest frequency [Hz].
-    """
+    """A block near another one, its numbers moved by about `spread` of themselves, its level by that of the range."""
     size, pace, shift = rng.standard_normal(3) * spread
     level = block.level + shift * amplitude * 0.3 if rng.random() < 0.5 else block.level
     wave = list(Wave)[rng.integers(len(Wave))] if rng.random() < 0.15 else block.wave
@@ -183,19 +159,6 @@ def vary_run(
     """A run near another one: mostly with one block changed, else with all, with one exchanged, copied or moved.
 
     Small changes alone stay where the exchange of separate blocks began: what a block tells depends on its neighbours.
-
-    Parameters
-    ----------
-    run : sequence of Block
-    rng : numpy.random.Generator
-    spread : float
-        As for `vary`.
-    reach : (float, float)
-        How far the excitation may go down and up from the start [its unit].
-    ends : (float, float)
-        Lowest and highest frequency [Hz].
-    fresh : sequence of Block
-        Blocks that one may be exchanged for, at any level.
     """
     changed, amplitude = list(run), max(abs(v) for v in reach)
     k, j = (int(n) for n in rng.integers(len(run), size=2))
@@ -219,37 +182,17 @@ Limits = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """The plant, or the loop that moves it, as a planned experiment runs it.
-
-    Attributes
-    ----------
-    plant : System
-    loop : ClosedLoop or None
-    free : tuple of str
-        Parameters of the plant whose information counts.
-    per_log : tuple of str
-        Free ones that each log has for itself, which are eliminated.
-    noise : mapping of str to float
-        Of the outputs that will be logged [unit].
-    limits : mapping of str to (float, float)
-        Of outputs, states, the command or the reference.
-    sample_time : float
-        [s]
-    start : mapping of str to float
-        Outputs at the rest from which each run begins.
-    origin : float
-        The excitation there [its unit].
-    """
+    """The plant, or the loop that moves it, as a planned experiment runs it."""
 
     plant: System
     loop: ClosedLoop | None
-    free: tuple[str, ...]
-    per_log: tuple[str, ...]
-    noise: Mapping[str, float]
-    limits: Limits
-    sample_time: float
-    start: Mapping[str, float]
-    origin: float = 0.0
+    free: tuple[str, ...]  # parameters of the plant whose information counts
+    per_log: tuple[str, ...]  # free ones that each log has for itself, which are eliminated
+    noise: Mapping[str, float]  # of the outputs that will be logged [unit]
+    limits: Limits  # of outputs, states, the command or the reference
+    sample_time: float  # [s]
+    start: Mapping[str, float]  # outputs at the rest from which each run begins
+    origin: float = 0.0  # the excitation there [its unit]
 
     @cached_property
     def command(self) -> Quantity:

@@ -91,21 +91,7 @@ class Assumption:
 def list_assumptions(
     system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
 ) -> tuple[Assumption, ...]:
-    """The noise, the behaviour between samples and the fixed parameters that nobody has stated.
-
-    Parameters
-    ----------
-    system : Fittable
-    given, checked : sequence of Experiment
-        The logs as read, and as `check_logs` returns them, with all noise levels.
-    parameters : ParameterSet
-        As the user gives them; what is free is no assumption.
-
-    Returns
-    -------
-    tuple of Assumption
-        The logs' first.
-    """
+    """The noise, the behaviour between samples and the fixed parameters that nobody has stated."""
     logs = (*_noise_levels(system, given, checked), *_behaviour(system, given), *_gauge_zero(system, given))
     return (*logs, *_defaults(system.parameters, parameters))
 

@@ -94,31 +94,16 @@ def identifiability(
 
 
 def verdict_from_sensitivities(problem: EstimationProblem, start: Start, variance: float = 1.0) -> Verdict:
-    """The verdict from the sensitivities of the outputs at a start, or at a fit.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    start : Start
-    variance : float
-        Variance of the residuals, in noise variances.
-    """
+    """The verdict from the sensitivities at a start or fit; `variance` of the residuals in noise variances."""
     return _make_verdict(problem, start, _root_information(problem, start) / math.sqrt(variance))
 
 
 def verdict_from_covariance(
     problem: EstimationProblem, fit: Start, covariance: "pd.DataFrame", *, trusted: bool
 ) -> Verdict:
-    """The verdict from the covariance of a fit.
+    """The verdict from the covariance of a fit, NaN at a bound.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Start
-    covariance : DataFrame
-        Of the estimates in their own units; NaN at a bound.
-    trusted : bool
-        Whether the model explains the logs to their noise; its deviations then count whatever motion the logs lack.
+    Where the model explains the logs to their noise (`trusted`) its deviations count whatever motion the logs lack.
     """
     unknowns = problem.unknowns().with_values(fit.parameters)
     chain = np.array([unknowns[str(n)].value if unknowns[str(n)].log else 1.0 for n in covariance.index])
@@ -131,18 +116,7 @@ def verdict_from_covariance(
 
 
 def foresee_unidentifiable(problem: EstimationProblem) -> tuple[str, ...]:
-    """Find what logs cannot identify, before the search: the motion does not show it, and no output depends on it.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-
-    Returns
-    -------
-    tuple of str
-        A sentence with the remedy for the parameters of each reason; empty where the motion shows all, or the outputs
-        of stretches of the logs, at the noise alone, tell what the motion shows too little of.
-    """
+    """Sentences on what logs cannot identify, before the search: motion and outputs show it too little."""
     if not problem.system.states:  # a static map is fitted as soon
         return ()
     start, free = problem.candidates()[0], problem.unknowns().free_names
@@ -190,18 +164,9 @@ def add_unidentifiable(verdict: Verdict, names: Sequence[str], local: Verdict, u
 
 
 def rejects_fixed_values(fit: Fit, first: Fit, held: int) -> bool:
-    """Whether a likelihood-ratio test rejects the values at which `held` parameters are.
+    """Whether a likelihood-ratio test rejects the values of `held` parameters that `first` was free in.
 
-    Parameters
-    ----------
-    fit, first : Fit
-        The fits with the parameters held, and before that.
-    held : int
-
-    Returns
-    -------
-    bool
-        A rise of the gaps' cost alone does not count: finer integration steps show gaps that the first fit missed.
+    A rise of the gaps' cost alone does not count: finer integration steps show gaps that the first fit missed.
     """
     before, after = first.stats["cost"], fit.stats["cost"]
     rise = min(2 * (after - before), fit.chi_square - first.chi_square)

@@ -1,8 +1,7 @@
-"""`identify`: parameters with confidence intervals, from logs, by lifted multiple shooting; `validate`: held-out runs.
+"""`identify`: parameters with confidence intervals from logs, by lifted multiple shooting; `validate`, `predict`.
 
-The system is any ODE with named signals that proposes its own starts (`System.starts`).
-
-`fit_table`, `agreement_rows`, `residual_diagnosis`: how well runs agree with logs, and what is left of these.
+The system is any ODE with named signals that proposes its own starts (`System.starts`). Below: the fit and its review,
+the predictions of logs, and the tables of results.
 """
 
 import math

@@ -42,16 +42,6 @@ class LoggedLoop:
     The rates of the reference that a cascade or a feedforward uses are those of the log's "speed_reference" beside its
     "position_reference", where it holds both, and else differences of the reference from one sample of the controller
     to the next; a reference that is logged in coarse steps needs its speed beside it.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-
-    Raises
-    ------
-    ModelError
-        If the controller is continuous, reads an encoder, whose steps leave a fit without derivatives, or resets its
-        integral, whose jumps do so too.
     """
 
     loop: ClosedLoop

@@ -105,23 +105,9 @@ def fit_robustly(
 ) -> tuple[EstimationProblem, Fit]:
     """Repeat a fit with new weights and noise levels until neither they nor the estimates move.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-        A fit of that problem.
-    loss : Loss, optional
-    estimate_noise : bool
-        Each channel's noise becomes the white part of its residuals (`noise_level`): the error of a wrong model varies
-        slowly, does not count as noise, and so stays visible.
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With the weights and noise levels that the last fit was made with.
-    fit : Fit
-        With neither loss nor noise to estimate the same as before. Its `variance_inflation` is Huber's sandwich
-        ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for all.
+    Each channel's noise becomes the white part of its residuals: a wrong model's slow error stays visible. The
+    variances are inflated by Huber's sandwich ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for
+    all.
     """
     if loss is None and not estimate_noise:
         return problem, fit

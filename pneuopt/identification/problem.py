@@ -1,13 +1,8 @@
-"""`EstimationProblem`: logs, conditions and parameters of an identification, as a multiple-shooting `Transcription`.
+"""`EstimationProblem`: logs, conditions and parameters, as a multiple-shooting `Transcription`.
 
-Checks that logs, a system and parameters fit together, before anything is solved; each refusal names the remedy.
-
-Holes of a log's inputs: a short one is bridged, at a long one the log is cut; `repair_log` says which and where.
-
-`find_centre`: the centre of a valve whose command was logged from 0 to 10 V, to be estimated with the rest.
-
-A command that stays between 0 and twice the valve's span, and rests near the span, is that of a valve which is closed
-there. Taken as a command about 0 V, it would show a valve that is fully open while the drive rests.
+Below it the checks that logs, system and parameters fit together, each with its remedy; the repair of holes in a log's
+inputs (a short one is bridged, at a long one the log is cut); and `find_centre`, for a valve whose command was logged
+from 0 to 10 V: read as a command about 0 V it would show a valve that is fully open while the drive rests.
 """
 
 import itertools
@@ -56,35 +51,21 @@ from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regu
 
 @dataclass(frozen=True, eq=False)
 class EstimationProblem:
-    """An estimation problem: a system, logs and parameters; its transcription, and starts from its fits.
-
-    Parameters
-    ----------
-    system : Fittable
-    experiments : tuple of Experiment
-    parameters : ParameterSet
-    method : LeastSquares
-    weights : mapping of str to ndarray, each of shape (n, n_measured_outputs)
-        By log, the weight of each sample's squared residual; 1 for logs that are absent.
-    fixed : mapping of str to float
-        Values of free parameters that stay fixed, for the logs cannot identify them.
-    noise_is_stated : bool
-        Whether the logs state the noise of all outputs; otherwise it is estimated from them.
-    window : float
-        Time after which a log starts anew with a state of its own [s]; math.inf where it never does.
-    is_whole : bool
-        Whether logs stay whole also where the model does not follow them.
-    """
+    """An estimation problem: a system, logs and parameters; its transcription, and starts from its fits."""
 
     system: Fittable
     experiments: tuple[Experiment, ...]
     parameters: ParameterSet
     method: LeastSquares
+    # by log, the weight of each sample's squared residual; 1 for logs that are absent
     weights: Mapping[str, Array] = field(default_factory=dict)
+    # values of free parameters that stay fixed, for the logs cannot identify them
     fixed: Mapping[str, float] = field(default_factory=dict)
+    # whether the logs state the noise of all outputs; otherwise it is estimated from them
     noise_is_stated: bool = False
+    # time after which a log starts anew with a state of its own [s]; math.inf where it never does
     window: float = math.inf
-    is_whole: bool = False
+    is_whole: bool = False  # whether logs stay whole also where the model does not follow them
 
     @property
     def has_gaps(self) -> bool:
@@ -380,26 +361,10 @@ def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Inter
 
 
 def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tuple[str, ...]]:
-    """Bridge the short holes of a log's inputs and cut it at the long ones, for want of rows or of single samples.
+    """Bridge the short holes of a log's inputs and cut it at the long ones; returns the log and what was done in words.
 
-    Parameters
-    ----------
-    system : Fittable
-    experiment : Experiment
-        With a name, and with every input of the system.
-
-    Returns
-    -------
-    experiment : Experiment
-        With every sample of every input. Where it is cut, `holes` names the samples whose inputs nobody knows; what was
-        measured there is left out.
-    sentences : tuple of str
-        What was done, with figures.
-
-    Raises
-    ------
-    LogError
-        If a long hole cuts the log of a sampled loop, whose controller goes on meanwhile, or leaves nothing of a log.
+    `holes` of a cut log names the samples whose inputs nobody knows; a sampled loop is refused there, for its
+    controller goes on.
     """
     log, inputs = experiment.trajectory, names(system.inputs)
     known: Mask = np.asarray(np.isfinite(log.matrix(inputs)).all(axis=1))
@@ -493,22 +458,7 @@ def _longest_run(mask: Mask) -> int:
 def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> ParameterSet:
     """Free the centre of a plant's valve, with a warning, where logs count its command from 0 and nobody has stated it.
 
-    Parameters
-    ----------
-    system : Fittable
-    experiments : sequence of Experiment
-        Each with a name.
-    parameters : ParameterSet
-
-    Returns
-    -------
-    ParameterSet
-        The same where a centre is stated, where no log shows one, or where the plant has none.
-
-    Raises
-    ------
-    LogError
-        If the logs, or a log and a stated centre, count the command from different voltages.
+    Logs that count it from different voltages are refused, and so is a log that contradicts a stated centre.
     """
     name, element = centre_name(system.plant), system.plant.axis.final_element if system.plant.axis else None
     if name is None or element is None:

@@ -1,7 +1,4 @@
-"""`profile`: the profile-likelihood interval of a parameter, with the others fitted again at each of its values.
-
-`propagate_error`: a figure computed from estimates, with the confidence interval that theirs imply.
-"""
+"""`profile`: a parameter's profile-likelihood interval; `propagate_error`: a figure of estimates, with its interval."""
 
 import itertools
 import math
@@ -382,20 +379,7 @@ def propagate_error(result: IdentificationResult, function: Callable[[ParameterV
 def propagate_intervals(
     result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]
 ) -> tuple[Array, Array]:
-    """Compute several figures at once with their 95 % confidence intervals, as a curve over a grid.
-
-    Parameters
-    ----------
-    result : IdentificationResult
-    function : callable
-        As for `propagate_error`; returns n numbers.
-
-    Returns
-    -------
-    values : ndarray, shape (n,)
-    intervals : ndarray, shape (n, 2)
-        NaN where a figure depends on a parameter without an interval.
-    """
+    """Figures (n,) with their 95 % intervals (n, 2), NaN where a parameter of theirs has none; as `propagate_error`."""
     values, slopes = _linearise(result, function)
     dof = result.estimates["dof"][result.covariance.index].to_numpy(dtype=float)
     spreads, degrees = _deviations(result, slopes), [min(dof[row != 0], default=math.inf) for row in slopes]

@@ -1,10 +1,7 @@
-"""`IdentificationResult`: estimates with intervals; `Verdict`: which parameters the logs identify, and how well.
+"""`IdentificationResult`: estimates with intervals and marks; `Verdict`: which parameters the logs identify, how well.
 
-`Mark`: how far an estimate can be trusted, and the notes that stand beside one.
-
-The motion that a set of logs shows, what it lacks to identify a parameter, and the run that would identify it.
-
-Which motion a parameter needs is declared by the model (`System.identification_hints`).
+Below: their tables and words, the motion that a set of logs shows, what it lacks to identify a parameter
+(`System.identification_hints`), and the run that would identify it.
 """
 
 import math
@@ -310,14 +307,7 @@ class IdentificationResult(Result):
 
 
 def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> Report:
-    """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen.
-
-    Parameters
-    ----------
-    estimates : DataFrame
-        Of an `IdentificationResult`.
-    widths : sequence of ChosenWidth
-    """
+    """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen."""
     rows = [_estimate_row(str(n), row) for n, row in estimates.to_dict(orient="index").items()]
     rows += [(w.name, format_number(w.value, 3), "-", w.unit, "chosen") for w in widths]
     columns = *text_columns("parameter"), *number_columns("value", f"95{TIED}% interval"), *text_columns("unit", "mark")
@@ -326,13 +316,7 @@ def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = 
 
 
 def report_agreement(fit: "pd.DataFrame") -> Report:
-    """Agreement of each log and channel; of many logs the median and the worst.
-
-    Parameters
-    ----------
-    fit : DataFrame
-        Of an `IdentificationResult`, or from `validate`.
-    """
+    """Agreement of each log and channel; of many logs the median and the worst."""
     if fit.empty:  # no channel was compared
         return Report()
     if len(fit) > MAX_FIT_ROWS:
@@ -444,21 +428,7 @@ _VALUE_IN_WORDS = re.compile(r"<(?:([\d.]+) )?(\w+)>")
 def summarise_motion(
     experiments: Sequence[Experiment], states: Mapping[str, Trajectory], values: ParameterSet, given: ParameterSet
 ) -> LoggedMotion | None:
-    """Summarise the speeds and accelerations of all logs.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    states : mapping of str to Trajectory
-        Estimated states of each log, whose speed counts where none is logged.
-    values, given : ParameterSet
-        As estimated from the logs, and as the user gives them.
-
-    Returns
-    -------
-    LoggedMotion or None
-        None where no log has a speed, or nothing moves.
-    """
+    """The speeds and accelerations of all logs, of estimated states where none is logged; None where nothing moves."""
     runs = [r for e in experiments if (r := _speed(e, states.get(e.name))) is not None]
     v = np.concatenate([speed for _, speed in runs]) if runs else np.zeros(0)
     if not np.any(v):
@@ -481,18 +451,7 @@ def summarise_motion(
 def missing_excitation(
     hints: IdentificationHints, name: str, free: Sequence[str], seen: LoggedMotion | None
 ) -> Lack | None:
-    """The motion that the logs lack to identify a parameter, and the run to log; None if nothing known is lacking.
-
-    Parameters
-    ----------
-    hints : IdentificationHints
-        The model's.
-    name : str
-        Of the parameter, "name[log]" for one of a log.
-    free : sequence of str
-        All parameters that are to be identified at once.
-    seen : LoggedMotion or None
-    """
+    """The motion that the logs lack to identify a parameter, and the run to log; None if nothing known is lacking."""
     need = hints.needs.get(_base_name(name))
     if need is None or seen is None:
         return None
@@ -510,15 +469,7 @@ def remedy(hints: IdentificationHints, names: Sequence[str]) -> str:
 
 
 def with_values_in_words(hints: IdentificationHints, values: ParameterSet) -> IdentificationHints:
-    """The hints, with the values in use in the words of its runs.
-
-    Parameters
-    ----------
-    hints : IdentificationHints
-        In whose words "<stribeck_velocity>" stands for the value of the parameter that ends so, "<5 stribeck_velocity>"
-        for five times it.
-    values : ParameterSet
-    """
+    """The hints with values in their runs' words: "<5 stribeck_velocity>" becomes five times that parameter's value."""
     runs = tuple(replace(run, words=_write_values(run.words, values)) for run in hints.runs)
     return replace(hints, runs=runs)
 

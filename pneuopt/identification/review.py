@@ -1,11 +1,9 @@
-"""`review_fit`: corrected intervals of a fit, its unidentifiable parameters, and the worst place of a failed fit.
+"""`review_fit`: corrected intervals of a fit, what its logs do not identify, and the worst place of a failed fit.
 
-`FixedValueTest`: whether a fixed value that is wrong explains why a model misses its logs, and which one.
-
-Each fixed parameter counts as one more unknown where a search has ended, and the gradient of the cost by it tells how
-much of the misfit its freeing would take away (Rao's score test, Proc. Cambridge Philos. Soc. 44, 1948): one run with
-more sensitivities for all of them. The promise is linear, and a wrong model promises much; so the best are tried, each
-by a fit with it freed, and one is named by what that fit has found.
+`FixedValueTest`: whether a wrong fixed value explains why a model misses its logs, and which one. Each fixed parameter
+counts as one more unknown where a search has ended, and the gradient of the cost by it tells how much of the misfit its
+freeing would take away (Rao's score test, Proc. Cambridge Philos. Soc. 44, 1948). The promise is linear, and a wrong
+model promises much; so the best are tried, each by a fit with it freed, and named by what that fit finds.
 """
 
 import math
@@ -66,25 +64,10 @@ if TYPE_CHECKING:
 def review_fit(
     problem: EstimationProblem, result: IdentificationResult, unidentifiable: Sequence[str] = ()
 ) -> tuple[IdentificationResult, tuple[Profile, ...]]:
-    """Review the intervals of a fit, and mark what its logs do not identify.
+    """Review the intervals of a fit, mark what its logs do not identify, and return the profiles traced on the way.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    result : IdentificationResult
-        The result of the search, with linear intervals.
-    unidentifiable : sequence of str
-        Free parameters that rest on a prior: those held, and those whose variance the priors dominate.
-
-    Returns
-    -------
-    result : IdentificationResult
-        The result with its verdict; where the search did not converge, without any interval, and with the worst place
-        in its status. Doubtful intervals are replaced by those of the profile likelihood; a parameter with an open
-        interval, or one that the logged motion does not excite, has no standard deviation. Ctrl-C leaves the other
-        intervals as they are, and the status says so.
-    profiles : tuple of Profile
-        Those that were traced.
+    Doubtful linear intervals become those of the profile likelihood. Without convergence no interval stays, and the
+    status names the worst place. Ctrl-C leaves the other intervals as they are.
     """
     start = problem.start_from(result)
     if not result.status.converged:
@@ -305,31 +288,16 @@ NATURE = ("ambient.", "gas.")
 
 @dataclass(frozen=True)
 class WrongValue:
-    """A fixed value that is wrong by the logs.
-
-    Attributes
-    ----------
-    name : str
-    given, found : float
-        The fixed value, and that of a fit with it freed [unit].
-    unit : str
-    share : float
-        Of the squared residuals beyond the noise that this fit explains [1].
-    squares : float
-        And gaps that this fit leaves, in noise variances.
-    alike : tuple of str
-        Other fixed values of which each would explain as much.
-    lag : float
-        The dead time in place of which the value may stand [s]; 0 where it is no bandwidth, or not a lower one.
-    """
+    """A fixed value that is wrong by the logs."""
 
     name: str
-    given: float
-    found: float
+    given: float  # the fixed value [unit]
+    found: float  # that of a fit with it freed [unit]
     unit: str
-    share: float
-    squares: float
-    alike: tuple[str, ...] = ()
+    share: float  # of the squared residuals beyond the noise that this fit explains [1]
+    squares: float  # residuals and gaps that this fit leaves, in noise variances
+    alike: tuple[str, ...] = ()  # other fixed values of which each would explain as much
+    # the dead time in place of which the value may stand [s]; 0 where it is no bandwidth, or not a lower one
     lag: float = 0.0
 
     @property
@@ -349,32 +317,13 @@ class WrongValue:
 
 @dataclass
 class FixedValueTest:
-    """The test of the fixed values of one problem, after the searches that have missed its logs.
+    """The test of the fixed values of one problem, after the searches that have missed its logs."""
 
-    Attributes
-    ----------
-    found : WrongValue or None
-        The value that explains most of the misfit.
-    tests : int
-        How many fits have been tested.
-    """
-
-    found: WrongValue | None = None
-    tests: int = field(default=0)
+    found: WrongValue | None = None  # the value that explains most of the misfit
+    tests: int = field(default=0)  # how many fits have been tested
 
     def explains(self, problem: EstimationProblem, fit: Fit) -> bool:
-        """Whether a fixed value explains most of what a fit misses; `found` then names it.
-
-        Parameters
-        ----------
-        problem : EstimationProblem
-        fit : Fit
-            Any, of that problem.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a fixed value explains most of what a fit misses; `found` then names it."""
         is_cut = fit.status.code in (Code.INTERRUPTED, Code.DIVERGED)
         if (
             is_cut
@@ -390,23 +339,7 @@ class FixedValueTest:
 
 
 def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
-    """The fixed value whose freeing explains most of the misfit of a fit; None where none explains enough.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-        With residuals beyond the noise.
-
-    Returns
-    -------
-    WrongValue or None
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If a trial is interrupted, by Ctrl-C or at the end of a CPU budget.
-    """
+    """The fixed value whose freeing explains most of the misfit of a fit; None where none explains enough."""
     without, freed = _promised_squares(problem, fit)
     excess = (without if fit.jumps is not None else 2 * fit.stats["cost"]) - fit.count
     promised = [((without - squares) / max(excess, without - fit.count), name) for name, squares in freed.items()]

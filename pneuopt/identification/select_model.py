@@ -1,22 +1,12 @@
 """`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs.
 
-`fit_candidates`: fits of several models to the same logs, made alike so that their residuals can be compared.
+`fit_candidates` fits all alike, for residuals compare only where the models run alike: whole logs, or windows of one
+length, without gaps that take a misfit in their place; and at common widths, for a width that each candidate has chosen
+for itself would be a hidden parameter, by which Coulomb friction can imitate presliding or the Stribeck curve. Windows
+and widths are those of the leader, the simplest of the candidates that follow the logs best in short searches.
 
-Residuals compare where the models run alike: whole logs, or windows of one length, without gaps that take a misfit in
-their place. And they compare at common widths: a width is a means of integration, and one that each candidate has
-chosen for itself would be a hidden parameter, which Coulomb friction can use to imitate presliding or the Stribeck
-curve. A width that is a property of the friction is freed, in a candidate of its own.
-
-Windows and widths are those of the leader, the simplest of the candidates that follow the logs best in short searches
-with loose gaps; a model that is too simple would cut the logs into windows so short that nothing tells the others
-apart. Candidates that such searches show to be hopeless beside the leader's are not searched any longer. In windows the
-others begin where the leader has ended, if they have its states.
-
-`try_candidate`: a short search of a model with loose gaps, which ranks it, or shows that no search can save it.
-
-Gaps between segments only relax a fit: with any gaps allowed the squares are less than without. So where short searches
-with loose gaps have ended, and their squares exceed those of another model's whole fit many times, the model
-cannot explain the logs, and minutes of search would show only that.
+`try_candidate` is such a search, with loose gaps. Gaps only relax a fit: where it has ended with many times the squares
+of another model's whole fit, the model cannot explain the logs, and minutes of search would show only that.
 """
 
 import fnmatch
@@ -67,24 +57,13 @@ TRIAL_STAGES = (Stage(3e-3, 12), Stage(1e-3, 8), Stage(1e-4, 12))
 
 @dataclass(frozen=True)
 class Trial:
-    """The best short search of a model.
+    """The best short search of a model."""
 
-    Parameters
-    ----------
-    squares : float
-        Squared residuals and gaps, in noise variances; infinite where no start is finite, or none was searched to the
-        end.
-    least : float
-        What these would still fall to, by the linearised equations; zero where these say nothing.
-    by_stage : tuple of float
-        The squares after each stage, at least the noise's.
-    ratio : float
-        The least squares over those that were allowed after the same stage, where no start kept within these; else 0.
-    """
-
+    # squared residuals and gaps, in noise variances; infinite where no start is finite, or none was searched to the end
     squares: float = math.inf
-    least: float = math.inf
-    by_stage: tuple[float, ...] = ()
+    least: float = math.inf  # what these would still fall to, by the linearised equations; zero where these say nothing
+    by_stage: tuple[float, ...] = ()  # the squares after each stage, at least the noise's
+    # the least squares over those that were allowed after the same stage, where no start kept within these; else 0
     ratio: float = 0.0
 
     @property
@@ -108,33 +87,9 @@ def try_candidate(
     known: Trial | None = None,
     allowed: Sequence[float] = (),
 ) -> Trial:
-    """Search shortly from a model's first starts.
+    """Search shortly from a model's first starts, and from `near`, a fit with another model of the same states.
 
-    Parameters
-    ----------
-    system : System
-    experiments : sequence of Experiment
-    parameters : ParameterSet
-    method : LeastSquares
-    window : float
-        Time after which a log starts anew [s].
-    near : IdentificationResult, optional
-        A fit with another model of the same states, from which a search begins, too, where the model's starts guess.
-    known : Trial, optional
-        Of the first start, which is not tried again; the other starts are tried where it is hopeless.
-    allowed : sequence of float
-        Squares after each stage beyond which a start is left, by default none; one that keeps within them is the last.
-
-    Returns
-    -------
-    Trial
-
-    Raises
-    ------
-    InputError
-        If logs, system and parameters do not fit together.
-    KeyboardInterrupt
-        If a search is interrupted.
+    A start is left where its squares exceed those `allowed` after a stage; `known` is the first start's trial.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # a fit says them
@@ -188,20 +143,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Refutation:
-    """Why a candidate was not fitted: its squares over the leader's in short searches, and a few words.
-
-    Parameters
-    ----------
-    leader : str
-    ratio : float
-    free : tuple of str
-        The parameters that it would estimate.
-    reason : str
-    """
+    """Why a candidate was not fitted: its squares over the leader's in short searches, and a few words."""
 
     leader: str
     ratio: float
-    free: tuple[str, ...]
+    free: tuple[str, ...]  # the parameters that it would estimate
     reason: str
 
 
@@ -215,22 +161,7 @@ def fit_candidates(
     method: LeastSquares | None,
     window: float | None,
 ) -> Fits:
-    """Fit every candidate alike, or refute it.
-
-    Parameters
-    ----------
-    candidates : mapping of str to Candidate
-    experiments : tuple of Experiment
-    method : LeastSquares or None
-    window : float or None
-        As of `identify`; None: whole logs, or the windows of the leader if it needs some.
-
-    Returns
-    -------
-    dict of str to IdentificationResult or Refutation
-        The results whatever their status. One that did not converge by itself has begun again at the richest one
-        within it.
-    """
+    """Fit every candidate alike, or refute it; one that does not converge begins again at the richest one within it."""
     alike = _Alike(experiments, method or LeastSquares(), window)
     trials, out = _try_all(candidates, alike), Fits()
     for name in _by_rank(candidates, trials):

@@ -1,12 +1,11 @@
 """`track`: estimates over dated logs of one drive, and whether they drift, with alarms that chance seldom raises.
 
-A straight line through estimates that scatter from log to log, and the level at which it is watched log by log.
-
-The line is that of a random-effects meta-regression: an estimate differs from it by its own error, whose deviation its
-log states, and by a scatter from log to log, which all share. The scatter's variance is Paule and Mandel's (J. Res. NBS
-87(5), 1982): the one with which the weighted squares are as large as their degrees of freedom. The test is Student's,
-and its deviation never less than what the logs' own errors give (Knapp, Hartung, Statistics in Medicine 22, 2003, with
-the lower limit of Roever, Knapp, Friede, BMC Medical Research Methodology 15:99, 2015).
+The line through the estimates is that of a random-effects meta-regression: an estimate differs from it by its own
+error, whose deviation its log states, and by a scatter from log to log, which all share. The scatter's variance is
+Paule and Mandel's (J. Res. NBS 87(5), 1982): the one with which the weighted squares are as large as their degrees of
+freedom. The test is Student's, and its deviation never less than what the logs' own errors give (Knapp, Hartung,
+Statistics in Medicine 22, 2003, with the lower limit of Roever, Knapp, Friede, BMC Medical Research Methodology 15:99,
+2015).
 
 Whoever looks after each log would meet chance sooner or later. So each look has the same, smaller level (Pocock,
 Biometrika 64(2), 1977), with which chance raises an alarm in the asked share of whole histories. It is found by drawing
@@ -39,32 +38,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DriftLine:
-    """A weighted line through estimates.
+    """A weighted line through estimates."""
 
-    Attributes
-    ----------
-    mean, slope : float
-        At the weighted mean of the times [unit], and by time [unit/time].
-    centre : float
-        That mean [time].
-    mean_error, slope_error : float
-        Standard errors, independent of each other.
-    scatter : float
-        Standard deviation from log to log [unit].
-    dof : int
-        Degrees of freedom of Student's t.
-    p : float
-        Probability of so steep a line without a drift, two-sided.
-    """
-
-    mean: float
-    slope: float
-    centre: float
-    mean_error: float
-    slope_error: float
-    scatter: float
-    dof: int
-    p: float
+    mean: float  # at the weighted mean of the times [unit]
+    slope: float  # [unit/time]
+    centre: float  # weighted mean of the times
+    mean_error: float  # standard error, independent of the slope's
+    slope_error: float  # [unit/time]
+    scatter: float  # standard deviation from log to log [unit]
+    dof: int  # degrees of freedom of Student's t
+    p: float  # probability of so steep a line without a drift, two-sided
 
     def at(self, times: Array, level: float = 0.95) -> tuple[Array, Array]:
         """The line at given times, and the half width of its confidence band there."""
@@ -75,13 +58,6 @@ class DriftLine:
 
 def fit_line(times: Array, values: Array, errors: Array) -> DriftLine:
     """Fit the line.
-
-    Parameters
-    ----------
-    times : array_like, shape (n,)
-        At least three, not all the same.
-    values, errors : array_like, shape (n,)
-        Estimates and their standard errors [unit].
 
     Examples
     --------
@@ -116,32 +92,14 @@ def _squares(x: Array, y: Array, variance: Array) -> float:
 
 
 def look_level(times: tuple[float, ...], level: float) -> float:
-    """The p-value of a look at which an alarm is raised, so that a history of these logs has one by chance at `level`.
-
-    Parameters
-    ----------
-    times : tuple of float
-        Of all logs of the history, those to come too [any unit]; the first look is after the fourth.
-    level : float
-        Share of histories without a drift in which any look raises an alarm [1].
-    """
+    """The p-value of a look that raises an alarm, so that a history of such logs has one by chance at `level`."""
     return float(np.quantile(_smallest(times), level))
 
 
 def power(times: tuple[float, ...], drift: float, level: float) -> Array:
-    """The probability that a drift is seen with each log or an earlier one.
+    """The probability (n,) that a drift is seen with each log or an earlier one, with looks at `level`.
 
-    Parameters
-    ----------
-    times : tuple of float
-    drift : float
-        By time, in standard deviations of an estimate about its line: its error and the scatter together.
-    level : float
-        As `look_level` gives it.
-
-    Returns
-    -------
-    ndarray, shape (n,)
+    The drift is by time, in standard deviations of an estimate about its line: its error and the scatter together.
     """
     seen = np.minimum.accumulate(_p_values(times, drift, HISTORIES // 4), axis=1) <= level
     return np.asarray(np.concatenate([np.zeros(MIN_LOGS - 1), seen.mean(axis=0)]))

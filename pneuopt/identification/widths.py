@@ -77,24 +77,7 @@ class _Trial:
 
 
 def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[ChosenWidth, ...]]:
-    """Choose the widths that nobody has stated.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With these widths.
-    chosen : tuple of ChosenWidth
-        Empty where all are stated, the model has none, or the CPU budget ends before that.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If a trial is interrupted.
-    """
+    """Choose the widths that nobody has stated."""
     open_names = {n for w in _present(problem) if _is_open(problem, w.name) for n in _names(w) if _is_open(problem, n)}
     if not open_names:
         return problem, ()
@@ -160,14 +143,7 @@ def _is_open(problem: EstimationProblem, name: str) -> bool:
 
 
 def _search_width(race: "_Race", width: Width, best: _Trial) -> tuple[_Trial, bool]:
-    """Narrow a width as long as that lowers the cost, or shows what it hides; else widen it as long.
-
-    Returns
-    -------
-    best : Trial
-    too_stiff : bool
-        Whether a narrower one takes too many integration steps.
-    """
+    """Narrow a width as long as that lowers the cost, or shows what it hides; else widen it as long."""
     given, too_stiff = best, False
     for factor in (1 / width.factor, 1 / sqrt(width.factor)):
         best, too_stiff = _follow(race, width, best, factor)
@@ -272,19 +248,7 @@ def _foresee(fit: Fit, gap: float) -> float:
 
 
 def is_too_stiff(transcription: Transcription, method: LeastSquares, *, implicit: bool = True) -> bool:
-    """Whether a start takes more integration steps than a search allows.
-
-    Parameters
-    ----------
-    transcription : Transcription
-    method : LeastSquares
-    implicit : bool
-        Whether steps may be implicit in a state, as a search's may; those of simulation and tuning are Runge-Kutta's.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a start takes more integration steps than a search allows."""
     segments = segment(transcription)
     nodes, q = start_nodes(segments), np.array([p.value for p in segments.transcription.parameters.values()])
     if implicit:
