@@ -24,7 +24,6 @@ import numpy as np
 from pneuopt.experiments.tolerances import (
     LARGEST,
     REACHED_ROOM,
-    SHOWN_BLOCKS,
     SINGULAR,
     STATE_RIDGE,
     UNINFORMED,
@@ -211,13 +210,13 @@ class ExperimentDesign(Result):
         heads = number_columns("value", "95 % now", "95 % after", "narrower")
         return Table((*text_columns("parameter"), *heads, *text_columns("unit", "")), tuple(rows))
 
-    def _steps(self) -> list[Line]:
+    def _steps(self, shown: int = 8) -> list[Line]:
         start = write_value(self.stats["origin"], self.units[self.channel], 4)
         out = [Line(f"{self.channel} begins at {start}; about that, each block as long as the others:")]
         for k, blocks in enumerate(self.blocks, 1):
             lead = f"run {k}: " if len(self.blocks) > 1 else ""
-            more = f"; and {len(blocks) - SHOWN_BLOCKS} more" if len(blocks) > SHOWN_BLOCKS else ""
-            out.append(Line(lead + "; ".join(blocks[:SHOWN_BLOCKS]) + more, indent=2))
+            more = f"; and {len(blocks) - shown} more" if len(blocks) > shown else ""
+            out.append(Line(lead + "; ".join(blocks[:shown]) + more, indent=2))
         return out
 
 
@@ -415,7 +414,7 @@ def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int 
         follows.append(response)
         found = ahead + grams[:, j + 1]
     last = n + eliminated
-    response = _respond(found, last)
+    response = -_scaled_inverse(found[:, :last, :last], SINGULAR) @ found[:, :last, last:]
     bread = found[:, last:, last:] + np.swapaxes(found[:, :last, last:], 1, 2) @ response
     k = width - last
     parameters = np.concatenate([response[:, n:], np.broadcast_to(np.eye(k), (m, k, k))], axis=1)
@@ -451,11 +450,6 @@ def _advance(information: Array, gap: Array, n: int) -> tuple[Array, Array]:
     mixed[:, :, n:] += information[:, :n, n:]
     response = np.asarray(-np.linalg.solve(gap[:, :n, :n] + information[:, :n, :n], mixed), dtype=np.float64)
     return _symmetric(out + np.swapaxes(mixed, 1, 2) @ response), response
-
-
-def _respond(information: Array, count: int) -> Array:
-    """How the first `count` unknowns follow the others, shape (m, count, k - count)."""
-    return -_scaled_inverse(information[:, :count, :count], SINGULAR) @ information[:, :count, count:]
 
 
 def _scaled_inverse(information: Array, smallest: float) -> Array:

@@ -306,9 +306,11 @@ class PlannedRun:
         grams = found.grams[:, :-1, :-1].reshape(m, count, *found.grams[0, :-1, :-1].shape)
         ends = found.dx_end.reshape(m, count, *found.dx_end.shape[1:])
         good = np.isfinite(grams).all(axis=(1, 2, 3)) & np.isfinite(ends).all(axis=(1, 2, 3))
-        own = self._parameter_sizes(parameters)
+        known = self.plant.parameters | parameters  # by whose sizes numbers of all units meet in one matrix
+        own = np.array([abs(known.value(n)) or 1.0 for n in (*self.per_log, *self.free)])
         nominal = np.array([q.nominal for q in self.plant.states])
-        scale, jumps = np.concatenate([nominal, own]), method.stages[-1].gap * self._jumps(parameters)
+        scale = np.concatenate([nominal, own])
+        jumps = method.stages[-1].gap * gap_scales(self._segments_about_rest(parameters), LeastSquares().kinematic)
         out = np.zeros((m, len(self.free), len(self.free)))
         kept = own[len(self.per_log) :]
         given = grams[good] * np.outer(scale, scale), ends[good] * scale / nominal[:, None]
@@ -323,10 +325,6 @@ class PlannedRun:
         q = np.array([v.value for v in segments.transcription.parameters.values()])
         return max(MIN_SUBSTEPS, 2 * stable_substeps(segments, start_nodes(segments), q, RK4_MAX_H_LAMBDA))
 
-    def _jumps(self, parameters: ParameterSet) -> Array:
-        """The size of each state's jump at a node beside the others': smaller where kinematics give its rate."""
-        return np.asarray(gap_scales(self._segments_about_rest(parameters), LeastSquares().kinematic))
-
     def _segments_about_rest(self, parameters: ParameterSet) -> Segments:
         x = self.plant.rest_state(self.plant.parameters | parameters, self.start)
         usual = np.diag([q.nominal for q in self.plant.states])
@@ -336,11 +334,6 @@ class PlannedRun:
         phase = Phase("rest", t, h, np.zeros((n, 1)), np.arange(n), guess=guess)
         known = self.plant.parameters | parameters.select(q for q in parameters if q in self.plant.parameters)
         return segment(Transcription(self.plant.discrete(), known, (phase,)))
-
-    def _parameter_sizes(self, parameters: ParameterSet) -> Array:
-        """By which the parameters are scaled, so that numbers of all units meet in one matrix."""
-        known = self.plant.parameters | parameters
-        return np.array([abs(known.value(n)) or 1.0 for n in (*self.per_log, *self.free)])
 
     @cached_property
     def _run(self) -> Rollout:
@@ -484,16 +477,11 @@ class DesignSearch:
         origin = self.run.origin
         return low - origin, high - origin
 
-    @property
-    def _amplitude(self) -> float:
-        """The largest amplitude."""
-        return max(abs(v) for v in self._reach)
-
     @cached_property
     def _waves(self) -> list[Block]:
         """Blocks of every kind."""
         t = self._grid[: self.samples // self._blocks]
-        return library(self._amplitude, float(t[-1]) or self.run.sample_time, self.run.sample_time)
+        return library(max(abs(v) for v in self._reach), float(t[-1]) or self.run.sample_time, self.run.sample_time)
 
     def _choose_blocks(self) -> list[list[Block]]:
         """The blocks of all runs by exchange: their information adds up."""
@@ -520,14 +508,14 @@ class DesignSearch:
 
     def _fit_into_limits(self, runs: list[list[Block]]) -> list[list[Block]]:
         """The blocks of each run in a row, all made smaller until the whole run keeps the limits."""
-        return [self._shrink(blocks) for blocks in runs]
-
-    def _shrink(self, blocks: list[Block]) -> list[Block]:
-        sizes = np.geomspace(1.0, 1e-3, 25)
-        rows = [[replace(b, amplitude=b.amplitude * size) for b in blocks] for size in sizes.tolist()]
-        _, keeps = self._evaluate(np.stack([self._signal(row) for row in rows]))
-        require(bool(keeps.any()), "the blocks of a run, one behind the other, keep no limits; plan a shorter duration")
-        return rows[int(np.argmax(keeps))]
+        message, fitted = "the blocks of a run, one behind the other, keep no limits; plan a shorter duration", []
+        for blocks in runs:
+            sizes = np.geomspace(1.0, 1e-3, 25).tolist()
+            rows = [[replace(b, amplitude=b.amplitude * size) for b in blocks] for size in sizes]
+            _, keeps = self._evaluate(np.stack([self._signal(row) for row in rows]))
+            require(bool(keeps.any()), message)
+            fitted.append(rows[int(np.argmax(keeps))])
+        return fitted
 
     def _figure(self, runs: list[list[Block]]) -> float:
         """The criterion after these runs."""

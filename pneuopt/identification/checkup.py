@@ -38,7 +38,7 @@ from pneuopt.identification.problem import (
     outputs_in_log,
 )
 from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, Verdict
-from pneuopt.identification.tolerances import MAX_PERCENT, MIN_PERCENT
+from pneuopt.identification.tolerances import MIN_PERCENT
 from pneuopt.logs.doctor import LogFinding, Severity, evidence, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise
@@ -278,18 +278,15 @@ def check(
     parameters, found = _find_centre(model, logs, parameters)
     found += [f for log in logs for f in examine(log, axis_from_model(model.plant, log, parameters))]
     found += [f for log in logs for f in _exchange_findings(model, log, parameters, found)]
-    found += [*_model_findings(model, logs, parameters), *_log_findings(model, given, logs), *_free(logs, parameters)]
+    found += [_model_finding(sentence, logs) for sentence in find_log_warnings(model, logs, parameters)]
+    found += [*_log_findings(model, given, logs), *_free(logs, parameters)]
     ranked = sorted(
         (_locate(_rank(f, found, logs), logs) for f in found), key=lambda f: list(Severity).index(f.severity)
     )
     is_open = any(f.severity is Severity.FAULT for f in ranked)
-    verdict = None if is_open else _find_verdict(model, logs, parameters)
-    return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
-
-
-def _find_verdict(model: Fittable, logs: Sequence[Experiment], parameters: ParameterSet) -> Verdict:
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
-    return verdict_from_sensitivities(problem, problem.candidates()[0])
+    verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates()[0])
+    return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
 
 
 def _find_centre(
@@ -300,12 +297,6 @@ def _find_centre(
         warnings.simplefilter("always", PhysicsWarning)
         parameters = find_centre(model, logs, parameters)
     return parameters, [_model_finding(str(w.message), logs) for w in said]
-
-
-def _model_findings(model: Fittable, logs: Sequence[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:
-    """What only the equations see: a gauge pressure read as absolute, a sensor before the line."""
-    for sentence in find_log_warnings(model, logs, parameters):
-        yield _model_finding(sentence, logs)
 
 
 def _model_finding(sentence: str, logs: Sequence[Experiment]) -> LogFinding:
@@ -495,6 +486,6 @@ def _deviation(value: float, relative: float, stderr: float, unit: str) -> str:
     share = 100 * (relative if math.isfinite(relative) else stderr / abs(value) if value else math.inf)
     if share < MIN_PERCENT:
         return f"+-{MIN_PERCENT} % or better"
-    if math.isfinite(relative) and share < MAX_PERCENT:
+    if math.isfinite(relative) and share < 100:
         return f"+-{share:.2g} %"
     return f"+-{write_value(stderr, unit, 2)}" if math.isfinite(stderr) else "not computed"

@@ -30,15 +30,14 @@ from pneuopt.identification.result import (
 from pneuopt.identification.tolerances import (
     HARMLESS_DEVIATION,
     INFORMATION_ROUNDING,
+    LEVEL,
     MAX_EXPECTED_DEVIATION,
     MAX_INFLATION,
-    MAX_INVERSE_SINGULAR,
     MAX_PRIOR_DEVIATION,
     MAX_PRIOR_VARIANCE_SHARE,
     MAX_REDUCTION_SEGMENTS,
     MAX_RELATIVE_DEVIATION,
     MIN_COMBINATION_SHARE,
-    REJECTION_CONFIDENCE,
     UNIDENTIFIABLE_DEVIATION,
 )
 from pneuopt.identification.widths import excerpts
@@ -171,7 +170,7 @@ def rejects_fixed_values(fit: Fit, first: Fit, held: int) -> bool:
     before, after = first.stats["cost"], fit.stats["cost"]
     rise = min(2 * (after - before), fit.chi_square - first.chi_square)
     noise = max(1.0, 2 * before / max(1, first.count))
-    return not rise <= noise * chi2.ppf(REJECTION_CONFIDENCE, held)
+    return not rise <= noise * chi2.ppf(LEVEL, held)
 
 
 def prior_influenced(covariance: Array, prior_covariance: Array) -> Mask:
@@ -260,7 +259,7 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
     spread, weak = alone.copy(), np.zeros((0, len(size)), dtype=bool)
     if informed.any():
         _, singular, right = np.linalg.svd(root[:, informed] / size[informed])
-        inverse = 1 / np.maximum(singular, 1 / MAX_INVERSE_SINGULAR)
+        inverse = 1 / np.maximum(singular, INFORMATION_ROUNDING)
         spread[informed] = np.linalg.norm(right * inverse[:, None], axis=0) / size[informed]
         parts = np.abs(right[inverse > MAX_INFLATION])
         member = (
@@ -292,15 +291,10 @@ def _root_information(problem: EstimationProblem, start: Start) -> Array:
     assert run.dx_end is not None
     weighted = np.where(np.isfinite(segments.measured)[..., None], run.dy / segments.noise[..., None], 0.0)
     roots = [np.zeros((0, len(chain)))]
-    for first, last in _log_chains(segments):
+    ends = (np.flatnonzero(~segments.linked) + 1).tolist()  # of each chain of linked segments
+    for first, last in zip([0, *ends[:-1]], ends, strict=True):
         roots.append(_log_root_information(segments, weighted[first:last], run.dx_end[first:last], first, chain))
     return _triangularise(np.concatenate(roots))
-
-
-def _log_chains(segments: Segments) -> list[tuple[int, int]]:
-    """First and last segment (exclusive) of each chain of linked ones."""
-    ends = np.flatnonzero(~segments.linked) + 1
-    return list(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True))
 
 
 def _log_root_information(

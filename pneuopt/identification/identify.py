@@ -55,7 +55,6 @@ from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.output import one_blas_thread
 from pneuopt.quantities.parameters import (
-    Parameter,
     ParameterSet,
     as_tuple,
     check_argument,
@@ -355,6 +354,8 @@ def _result(
 
     `restarts` says that windows follow logs that the model does not follow from end to end.
     """
+    import pandas as pd
+
     free = fit.parameters.free_names
     estimates = problem.unknowns().with_values({n: fit.parameters.value(n) for n in free}).select(free)
     shared = [n for n in free if n in problem.parameters]
@@ -374,10 +375,11 @@ def _result(
         resting = prior_dominated(covariance, fit.prior_covariance, found, problem.fixed.values())
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
     status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else misfit.assess(fit.status)
+    matrix = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
     result = IdentificationResult(
         problem.parameters.with_values(values),
         _estimates(estimates, covariance, fit.at_bound, influenced, status, misfit),
-        _covariance_frame(free, covariance),
+        pd.DataFrame(matrix, index=list(free), columns=list(free)),
         fit_table(problem, fit),
         runs,
         status,
@@ -407,23 +409,14 @@ def _estimates(
     for i, (name, p) in enumerate(parameters.items()):
         deviation, dof = math.nan if at_bound[i] else float(stderr[i]), float(misfit.dof[i])
         low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
-        ends = [_move(p, change) for change in misfit.ranges[i].tolist()]
+        ends = [
+            (p.value * math.exp(change / p.value) if p.log else p.value + change)
+            for change in misfit.ranges[i].tolist()
+        ]
         mark = misfit.mark(i, is_optimum=status.converged and math.isfinite(deviation) and not influenced[i])
         shown = [p.value, low, high, p.unit, mark]
         rows[name] = [*shown, deviation, dof, *ends, p.lower, p.upper, bool(at_bound[i]), p.source]
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
-
-
-def _move(p: Parameter, change: float) -> float:
-    """A parameter's value after a change; its logarithm moves where it is searched as one."""
-    return p.value * math.exp(change / p.value) if p.log else p.value + change
-
-
-def _covariance_frame(free: Sequence[str], covariance: Array | None) -> "pd.DataFrame":
-    import pandas as pd
-
-    values = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
-    return pd.DataFrame(values, index=list(free), columns=list(free))
 
 
 def fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":

@@ -13,11 +13,11 @@ import numpy as np
 
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.tolerances import (
+    CLEAR_DEVIATIONS,
     ESTIMATE_CHANGE_TOLERANCE,
     MAX_REFITS,
     MIN_WEIGHT,
     NOISE_CHANGE_TOLERANCE,
-    OUTLIER_THRESHOLD,
     REFIT_STAGES,
 )
 from pneuopt.logs.experiment import Experiment
@@ -155,12 +155,12 @@ def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> tuple
     for e, run in zip(problem.experiments, fit.trajectories, strict=True):
         residuals = _residuals_in_noise(problem, e, run)
         scales = _channel_scales(residuals)
-        beyond += int(np.sum(np.abs(residuals) > OUTLIER_THRESHOLD * scales))
+        beyond += int(np.sum(np.abs(residuals) > CLEAR_DEVIATIONS * scales))
         count += int(np.isfinite(residuals).sum())
         if scales.max() > level:
             level, channel = float(scales.max()), outputs_in_log(problem.system, e)[int(np.argmax(scales))]
             worst = f"{channel} of {e.name}"
-    outliers = f"{beyond} of {count} samples are outliers, beyond {OUTLIER_THRESHOLD:g} standard deviations"
+    outliers = f"{beyond} of {count} samples are outliers, beyond {CLEAR_DEVIATIONS:g} standard deviations"
     verdict = f"{fits - 1} refits, {outliers}"
     if level**2 <= MAX_CHI_SQUARE_RATIO:
         return (verdict,)

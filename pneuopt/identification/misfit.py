@@ -30,7 +30,6 @@ from pneuopt.identification.result import Mark, join_names
 from pneuopt.identification.statistics import agreement
 from pneuopt.identification.tolerances import (
     ASSUMED_SHARE,
-    GATE_LEVEL,
     HARMLESS_SHIFT,
     LEAST_TIME_DOF,
     LEFT_OUT_REGULARISATION,
@@ -126,11 +125,12 @@ def robust_covariance(
     `classes` are further clusters, by a motion on which the residuals depend; with any, agreement of the blocks is no
     excuse.
     """
-    times = [c for c in _distinct([blocks, blocks.halve(), blocks.halve().halve()]) if c.count > 1]
+    halves = [blocks, blocks.halve(), blocks.halve().halve()]  # halving ends at one cluster a log
+    times = [c for i, c in enumerate(halves) if c.count > 1 and c.count not in [h.count for h in halves[:i]]]
     logs = [blocks.by_log()] if len(np.unique(blocks.logs)) > 1 else []
     levels = [*times, *logs]
     none = np.zeros(len(white), dtype=bool)
-    agree = min((disagreement_p(c, variance) for c in levels), default=1.0) * len(levels) >= GATE_LEVEL
+    agree = min((disagreement_p(c, variance) for c in levels), default=1.0) * len(levels) >= 1 - LEVEL
     if not levels or (agree and not classes):
         return RobustCovariance(white, np.full(len(white), dof), widened=False, is_slow=False, lone=none)
     within = [jackknife(c) for c in (*times, *classes) if c.count > 1]
@@ -140,7 +140,8 @@ def robust_covariance(
     spreads += [(s, s.dof >= MIN_LOG_DOF) for s in between]
     covariance, degrees = _widest(white, dof, spreads)
     lone = between[0].dof < MIN_LOG_DOF if between else none
-    slow = len(times) > 1 and _is_slow(within[len(times) - 1], within[0])
+    fine, coarse = (np.diag(spread.covariance) for spread in (within[0], within[max(len(times) - 1, 0)]))
+    slow = len(times) > 1 and bool(np.median(coarse / fine) > SLOW_RATIO)
     return RobustCovariance(covariance, degrees, widened=True, is_slow=slow, lone=lone)
 
 
@@ -237,16 +238,6 @@ def _widest(white: Array, dof: float, spreads: Sequence[tuple[Spread, Mask]]) ->
         together += spread.covariance
     stretch = np.sqrt(variance / np.diag(together))
     return together * np.outer(stretch, stretch), freedom
-
-
-def _is_slow(coarse: Spread, fine: Spread) -> bool:
-    """Whether coarser blocks see clearly more variance: the residuals vary as slowly as the blocks last."""
-    return bool(np.median(np.diag(coarse.covariance) / np.diag(fine.covariance)) > SLOW_RATIO)
-
-
-def _distinct(levels: Sequence[Clusters]) -> list[Clusters]:
-    """The levels without those of as many clusters as one before: halving ends at one cluster a log."""
-    return [c for i, c in enumerate(levels) if c.count not in [known.count for known in levels[:i]]]
 
 
 @dataclass(frozen=True, eq=False)

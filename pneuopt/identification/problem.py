@@ -238,7 +238,11 @@ def check_logs(
             read = tuple(n for n in read if n in known)
         own = replace(experiment.select(read), name=name)
         _check_channels(system, own, name, known)
-        _check_conditions(system, own, parameters, name)
+        check_names("parameter", own.conditions, system.parameters, f"{name}: condition")
+        try:
+            system.check((system.parameters | parameters).with_values(own.conditions))
+        except InputError as error:
+            raise InputError(f"{name}: condition {error}") from None
         out.append(repair_log(system, own)[0])
     return _fill_noise(system, out)
 
@@ -294,15 +298,6 @@ def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence
                 levels = f"stated as {stated:.2g} {unit}, the log itself shows {shown:.2g} {unit}"
                 out.append(f"{named.name}: the noise of {channel} is {levels}; leave it out to have it estimated")
     return tuple(out)
-
-
-def _check_conditions(system: Fittable, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
-    """Check the parameters under the conditions of a log."""
-    check_names("parameter", experiment.conditions, system.parameters, f"{name}: condition")
-    try:
-        system.check((system.parameters | parameters).with_values(experiment.conditions))
-    except InputError as error:
-        raise InputError(f"{name}: condition {error}") from None
 
 
 def _check_channels(system: Fittable, experiment: Experiment, name: str, known: set[str]) -> None:
@@ -382,7 +377,9 @@ def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tu
     short = ~known & ~lost
     sentences = [f"{experiment.name}: inputs are unknown {where}; the log is cut there"] if holes else []
     if short.any():
-        gaps = f"{experiment.name}: {int(short.sum())} samples lack an input, {_longest_run(short)} in a row at most"
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], short, [False]]).astype(int)))
+        longest = int(np.max(edges[1::2] - edges[::2]))
+        gaps = f"{experiment.name}: {int(short.sum())} samples lack an input, {longest} in a row at most"
         sentences.append(f"{gaps}; they are bridged")
     if not (sentences or lost.any()):
         return experiment, ()
@@ -450,11 +447,6 @@ def _bridge(log: Trajectory, behaviour: dict[str, Intersample], lost: Mask) -> d
     return out
 
 
-def _longest_run(mask: Mask) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return int(np.max(edges[1::2] - edges[::2]))
-
-
 def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> ParameterSet:
     """Free the centre of a plant's valve, with a warning, where logs count its command from 0 and nobody has stated it.
 
@@ -469,7 +461,10 @@ def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters:
     shown = [c for c in commands if c.is_counted_from(0.0)]
     about = [c for c in commands if c.is_counted_from(-c.half)]
     if stated.value:
-        _check_stated(name, stated.value, about)
+        for command in about:  # it has been counted from the stated centre already
+            message = f"{command}, which is no command of a valve with {name} = {stated.value:g} {command.unit}"
+            remedy = "leave that out of the drive, or of the log's sidecar (or Python) what has subtracted it"
+            require(abs(stated.value) < MAX_REST_DISTANCE * command.half, f"{message}; {remedy}", LogError)
         return parameters
     if not shown:
         return parameters
@@ -508,14 +503,6 @@ class _Command(NamedTuple):
     def __str__(self) -> str:
         run = f"runs from {self.low:.3g} to {self.high:.3g} {self.unit}"
         return f"{self.log}: {self.channel} {run} and rests at {self.rest:.3g} {self.unit}"
-
-
-def _check_stated(name: str, value: float, about: Sequence[_Command]) -> None:
-    """Refuse a centre where a log's command has been counted from it already."""
-    for command in about:
-        message = f"{command}, which is no command of a valve with {name} = {value:g} {command.unit}; leave that out"
-        remedy = "of the drive, or of the log's sidecar (or Python) what has subtracted it"
-        require(abs(value) < MAX_REST_DISTANCE * command.half, f"{message} {remedy}", LogError)
 
 
 def _commands(

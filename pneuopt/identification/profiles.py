@@ -177,7 +177,8 @@ class _Refits:
         last, steps = Stage(result.stats["gap_deviation"], REFIT_ITERATIONS, refine=4), int(result.stats["substeps"])
         method = replace(problem.method, stages=(last,), substeps=max(1, steps // 4), progress=None)
         self.method = replace(method, checks_steps=False)
-        self.spread = self._search_deviation(float(result.estimates["stderr"][name]))
+        stderr = float(result.estimates["stderr"][name])
+        self.spread = stderr / self.parameter.value if self.parameter.log else stderr
         self.points: list[_ProfilePoint] = []
         self.refit_at(self.to_search(self.parameter.value))
         inflation = result.stats["variance_inflation"]
@@ -227,9 +228,6 @@ class _Refits:
             others = {n: point.fit.parameters.value(n) for n in self.start.parameters if n != self.name}
             rows.append({"value": self.value(point.z), "deviance": self.deviance_root(point) ** 2, **others})
         return pd.DataFrame(rows)
-
-    def _search_deviation(self, stderr: float) -> float:
-        return stderr / self.parameter.value if self.parameter.log else stderr
 
     def _scale(self, noise: float, *, limited: bool) -> float:
         """The cost that counts as one variance, from the curvature: weighted gaps rise less than the likelihood.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 
 from pneuopt.dynamics.hooks import IdentificationHints, Lack, LoggedMotion
-from pneuopt.identification.tolerances import INFINITE_INFLATION, MAX_FIT_ROWS, MOVING_SPEED_SHARE
+from pneuopt.identification.tolerances import MOVING_SPEED_SHARE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
@@ -69,13 +69,11 @@ class Verdict(Shown):
         ]
         hints, inflation = self.identification_hints, self.table["inflation"]
         groups = [_describe_group(group, inflation, hints) for group in self.indistinguishable]
-        return (*single, *groups, *([self._describe_unchanged()] if self.unchanged else []))
-
-    def _describe_unchanged(self) -> str:
-        """A sentence on the values at which a fit has held parameters."""
+        if not self.unchanged:
+            return (*single, *groups)
         values = join_names([f"{n} ({self.table['value'][n]:.4g})" for n in self.unchanged])
         verb = "keep their given values" if len(self.unchanged) > 1 else "keeps its given value"
-        return f"{values} {verb}, on which the other intervals do not rest"
+        return (*single, *groups, f"{values} {verb}, on which the other intervals do not rest")
 
     def to_dict(self) -> dict[str, Any]:
         """The verdict without its table, for a file."""
@@ -315,11 +313,11 @@ def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = 
     return Report((*table, *(Line(str(width)) for width in widths)))
 
 
-def report_agreement(fit: "pd.DataFrame") -> Report:
-    """Agreement of each log and channel; of many logs the median and the worst."""
+def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:
+    """Agreement of each log and channel; of more than so many the median and the worst."""
     if fit.empty:  # no channel was compared
         return Report()
-    if len(fit) > MAX_FIT_ROWS:
+    if len(fit) > most_rows:
         return Report((_agreement_in_short(fit),))
     rows = []
     for row in fit.reset_index().to_dict(orient="records"):
@@ -332,11 +330,8 @@ def report_agreement(fit: "pd.DataFrame") -> Report:
 
 def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", hints: IdentificationHints) -> str:
     times = float(inflation[list(group)].max())
-    message = (
-        f"each {times:.0f} times better known if the others are fixed"
-        if times < INFINITE_INFLATION
-        else "nothing separates them"
-    )
+    known = f"each {times:.0f} times better known if the others are fixed"
+    message = known if times < 1e5 else "nothing separates them"  # beyond it the figure is rounding
     return f"{join_names(group)} act only together ({message}): {remedy(hints, group)}"
 
 
@@ -363,7 +358,9 @@ def _agreement_in_short(fit: "pd.DataFrame") -> Table:
 def _estimate_row(name: str, row: Mapping[Hashable, Any]) -> tuple[str, str, str, str, str]:
     value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
     if math.isnan(row["ci_low"]) and math.isfinite(row["range_low"]):
-        interval = _format_range(float(row["range_low"]), float(row["range_high"]))
+        low, high = float(row["range_low"]), float(row["range_high"])
+        spread = (high - low) / 4  # the digits then show a fiftieth of the range, which is no confidence interval
+        interval = f"range{TIED}{_join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))}"
     value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
     mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
     return name, value, interval, str(row["unit"]), str(mark)
@@ -377,12 +374,6 @@ def _format_interval(value: float, spread: float, low: float, high: float) -> tu
     if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
         return format_number(value, 4), "not determined"
     return _format_to_stderr(value, spread), _join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))
-
-
-def _format_range(low: float, high: float) -> str:
-    """A range, which is no confidence interval, with the digits that show a fiftieth of it."""
-    spread = (high - low) / 4
-    return f"range{TIED}{_join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))}"
 
 
 def _join_ends(low: str, high: str) -> str:
@@ -435,12 +426,14 @@ def summarise_motion(
         return None
     moving = v[np.abs(v) > MOVING_SPEED_SHARE * float(np.quantile(np.abs(v), 0.99))]
     low, high = np.quantile(np.abs(moving), [0.1, 0.9])
-    rates = np.concatenate([_acceleration(t, speed) for t, speed in runs])
+    strides = [(t, speed, max(1, len(t) // 200)) for t, speed in runs]
+    rates = np.concatenate([np.diff(speed[::k]) / np.diff(t[::k]) for t, speed, k in strides])
+    sides = [np.sign(speed[np.abs(speed) > MOVING_SPEED_SHARE * float(high)]) for _, speed in runs]
     return LoggedMotion(
         float(low),
         float(high),
         float(np.mean(moving > 0)),
-        sum(_count_reversals(speed, MOVING_SPEED_SHARE * float(high)) for _, speed in runs),
+        sum(int(np.count_nonzero(np.diff(side))) for side in sides),
         float(np.sqrt(np.mean(rates**2))),
         v,
         values,

@@ -33,12 +33,12 @@ from pneuopt.identification.result import (
 )
 from pneuopt.identification.tolerances import (
     ALIKE_SQUARES,
+    CLEAR_DEVIATIONS,
     GAP_SUBSTEPS,
     LAST_TRIAL_ITERATIONS,
     MAX_FREED_TRIALS,
     MAX_LINEAR_DEVIATION,
     MAX_TESTS,
-    MIN_CHANGE,
     MIN_EXPLAINED_SHARE,
     MIN_PROMISED_SHARE,
     MIN_RELATIVE_CHANGE,
@@ -84,26 +84,21 @@ def review_fit(
     profiles, waiting = _profiles(problem, result)
     result = _widen_dragged(result, profiles)
     trusted = result.stats["chi_square_ratio"] <= MAX_CHI_SQUARE_RATIO
-    verdict = verdict_from_covariance(
-        problem, start, _blank_covariance(result.covariance, unidentifiable), trusted=trusted
-    )
+    known, names = result.covariance.copy(), list(unidentifiable)
+    known.loc[names] = math.nan
+    known[names] = math.nan
+    verdict = verdict_from_covariance(problem, start, known, trusted=trusted)
     verdict = add_profiles(verdict, profiles)
     if unidentifiable:
         local = _verdict_at(problem, start, result)
-        verdict = add_unidentifiable(verdict, unidentifiable, local, _names_at_given_value(problem))
+        given = problem.unknowns()
+        unchanged = [n for n, v in problem.fixed.items() if v == given.value(n)]
+        verdict = add_unidentifiable(verdict, unidentifiable, local, unchanged)
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _widen_covariance(result.covariance, estimates["stderr"])
     status = _name_part(problem, _name_interruption(result.status, waiting), verdict)
     result = replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
     return result, tuple(profiles.values())
-
-
-def _blank_covariance(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
-    """The covariance with NaN for the named parameters."""
-    out, own = covariance.copy(), list(names)
-    out.loc[own] = math.nan
-    out[own] = math.nan
-    return out
 
 
 def _widen_covariance(covariance: "pd.DataFrame", stderr: "pd.Series[float]") -> "pd.DataFrame":
@@ -118,12 +113,6 @@ def _blank_intervals(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.Dat
     out = estimates.copy()
     out.loc[list(names), ["stderr", "ci_low", "ci_high", "range_low", "range_high"]] = math.nan
     return out
-
-
-def _names_at_given_value(problem: EstimationProblem) -> tuple[str, ...]:
-    """The parameters that are held at their given values."""
-    given = problem.unknowns()
-    return tuple(n for n, v in problem.fixed.items() if v == given.value(n))
 
 
 def _verdict_at(problem: EstimationProblem, start: Start, result: IdentificationResult) -> Verdict:
@@ -329,7 +318,7 @@ class FixedValueTest:
             is_cut
             or problem.weights
             or self.tests >= MAX_TESTS
-            or not _misses_logs(fit)
+            or not (2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count or fit.jumps is not None)
             or not math.isfinite(fit.stats["cost"])
         ):
             return False
@@ -368,14 +357,12 @@ def _dead_time(problem: EstimationProblem, value: WrongValue) -> float:
     return max(0.0, (1 / value.found - 1 / value.given) / (2 * math.pi))
 
 
-def _misses_logs(fit: Fit) -> bool:
-    """Whether residuals and gaps of a fit are beyond the noise, or gaps stand for noise of the states."""
-    return 2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count or fit.jumps is not None
-
-
 def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
     """The squares with tight gaps by the equations linearised at a fit, and those with each fixed value freed."""
-    names = _fixed_values(problem)
+    # a fixed parameter may be wrong unless it is a width, or each log has or states one of its own
+    stated = {n for e in problem.experiments for n in e.conditions} | set(fixed_widths(problem))
+    fixed = {n: p for n, p in problem.parameters.items() if not (p.free or p.per_log) and n not in stated}
+    names = [n for n, p in fixed.items() if p.lower < p.value < p.upper]
     if not names:
         return math.nan, {}
     freed = replace(problem, parameters=problem.parameters.freed(*names))
@@ -386,13 +373,6 @@ def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict
     movable = scaling.has_effect(equations) & ~scaling.fixed & ~scaling.at_bound(begun.iterate.z)
     squares = {name: equations.promised_squares(movable & (~tested | (np.array(free) == name))) for name in names}
     return equations.promised_squares(movable & ~tested), squares
-
-
-def _fixed_values(problem: EstimationProblem) -> list[str]:
-    """The fixed parameters that may be wrong: all but widths, and what each log has or states by itself."""
-    stated = {n for e in problem.experiments for n in e.conditions} | set(fixed_widths(problem))
-    fixed = {n: p for n, p in problem.parameters.items() if not (p.free or p.per_log) and n not in stated}
-    return [n for n, p in fixed.items() if p.lower < p.value < p.upper]
 
 
 def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -> WrongValue | None:
@@ -408,7 +388,7 @@ def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -
     if found.covariance is not None:
         noise = max(1.0, found.chi_square / found.count)
         deviation = math.sqrt(noise * found.covariance[place, place])
-    least = max(MIN_CHANGE * deviation, MIN_RELATIVE_CHANGE * abs(given.value))
+    least = max(CLEAR_DEVIATIONS * deviation, MIN_RELATIVE_CHANGE * abs(given.value))
     is_clear = abs(value - given.value) > least and not found.at_bound[place]
     if not (share >= MIN_EXPLAINED_SHARE and is_clear and found.jumps is None):
         return None

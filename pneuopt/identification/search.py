@@ -33,6 +33,7 @@ from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.identification.tolerances import (
     ACCEPTED_CHI_SQUARE_RATIO,
     BEST,
+    CLEAR_DEVIATIONS,
     DECIDING,
     EXCERPT_SEGMENTS,
     GAP_FACTOR,
@@ -40,7 +41,6 @@ from pneuopt.identification.tolerances import (
     GUESS_STAGES,
     HOPELESS_MISFIT,
     LEVELS,
-    MAX_BELOW_DEVIATIONS,
     MAX_CLOSED_MISFIT,
     MAX_CLOSED_SHARE,
     MAX_COST,
@@ -686,7 +686,7 @@ def _is_below(result: IdentificationResult, low: str, high: str) -> bool:
     signs = [1.0 if n == high else -1.0 for n in names]
     values = {low: float(result.estimates["value"][low]), high: result.parameters.value(high)}
     variance = float(signs @ result.covariance.loc[names, names].to_numpy() @ signs)
-    return variance >= 0 and values[high] - values[low] > MAX_BELOW_DEVIATIONS * math.sqrt(variance)
+    return variance >= 0 and values[high] - values[low] > CLEAR_DEVIATIONS * math.sqrt(variance)
 
 
 def _without_effect(problem: EstimationProblem, start: Start) -> dict[str, float]:

@@ -30,10 +30,10 @@ from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, Id
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.identification.tolerances import (
     HOPELESS_RATIO,
-    JUMPING_WINDOW_SAMPLES,
     LEADER_RATIO,
     MAX_HELD_OUT_RATIO,
     MAX_TRIALS,
+    MIN_WINDOW_SAMPLES,
     NESTED_TEST_LEVEL,
     TIE,
 )
@@ -318,7 +318,7 @@ class _Alike:
         """The same with the window that a fit has needed, or whole logs; a fit whose states jump needs one, too."""
         if _has_jumps(fit, self.method):
             step = max(float(np.median(np.diff(e.trajectory.t))) for e in self.experiments)
-            return replace(self, window=JUMPING_WINDOW_SAMPLES * step)
+            return replace(self, window=MIN_WINDOW_SAMPLES * step)
         return replace(self, window=fit.window.duration if fit.window else math.inf)
 
 
@@ -429,6 +429,8 @@ def select_model(
     recommended while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without
     any the fewer parameters.
     """
+    import pandas as pd
+
     check_options(method=method, window=window)
     free = as_tuple("free", free, str, 'names or patterns of parameters, as ["friction.*"]')
     check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
@@ -446,11 +448,16 @@ def select_model(
     if not converged:
         message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
         raise ConvergenceError(f"none of the candidates converged: {message}", fits)
-    predicted = {n: _mean_nrmse(systems[n], held_out, fits[n]) for n in converged}
+    predicted = {
+        n: float(validate(systems[n], held_out, fits[n].parameters)["nrmse"].mean()) if held_out else math.nan
+        for n in converged
+    }
     rows = _candidate_rows(systems, found, predicted)
     chosen, why = _choose(rows)
     reason = _selection_reason(rows, chosen, why, _separate(rows, chosen, fits, systems))
-    return ModelSelection(_selection_table(rows), chosen, reason, fits)
+    table = pd.DataFrame.from_dict({n: asdict(row) for n, row in rows.items()}, orient="index")
+    table.insert(4, "bic_above", table["bic"] - table["bic"].min())
+    return ModelSelection(table, chosen, reason, fits)
 
 
 @dataclass(frozen=True)
@@ -499,21 +506,6 @@ def _check_names(given: Mapping[str, ParameterSet], parameters: ParameterSet, fr
     for pattern in free:
         if not fnmatch.filter(every, pattern):
             raise UnknownNameError("parameter", pattern, every)
-
-
-def _selection_table(rows: Mapping[str, _CandidateRow]) -> "pd.DataFrame":
-    import pandas as pd
-
-    table = pd.DataFrame.from_dict({n: asdict(row) for n, row in rows.items()}, orient="index")
-    table.insert(4, "bic_above", table["bic"] - table["bic"].min())
-    return table
-
-
-def _mean_nrmse(system: System, held_out: Sequence[Experiment], fit: IdentificationResult) -> float:
-    """Mean NRMSE over the held-out runs and channels; NaN without any."""
-    if not held_out:
-        return math.nan
-    return float(validate(system, held_out, fit.parameters)["nrmse"].mean())
 
 
 def _candidate_rows(

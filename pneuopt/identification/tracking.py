@@ -15,7 +15,7 @@ histories: where errors are equally large the test's distribution depends on the
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import date, datetime, timedelta
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ from scipy.stats import t as student
 
 from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.identification.tolerances import HISTORIES, MIN_LOGS, POWERS, WEEK
+from pneuopt.identification.tolerances import HISTORIES, MIN_LOGS, POWERS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import as_tuple
@@ -233,13 +233,21 @@ def track(
     stamps = [stamps[k] for k in order]
     frames = [f.estimates if isinstance(f, IdentificationResult) else f for f in (fits[k] for k in order)]
     wanted = as_tuple("parameters", parameters, str, 'names of parameters, as ["friction.coulomb"]')
-    chosen = _choose_parameters(frames, wanted)
-    weeks = np.array([(s - stamps[0]).total_seconds() / WEEK for s in stamps])
+    known = list(dict.fromkeys(str(n) for frame in frames for n in frame.index))
+    check_names("parameter", wanted, known, "the fits")
+    counts = {n: sum(np.isfinite(_estimate(frame, n)[1]) for frame in frames) for n in wanted or known}
+    enough = [n for n, count in counts.items() if count >= MIN_LOGS]
+    missing = [n for n in wanted if n not in enough]
+    remedy = f"{MIN_LOGS} logs with an interval are needed; log longer runs, or free fewer parameters"
+    require(not missing and bool(enough), f"{', '.join(missing or counts)} cannot be tracked: {remedy}")
+    weeks = np.array([(s - stamps[0]) / timedelta(weeks=1) for s in stamps])
     require(weeks[MIN_LOGS - 2] > 0, f"the first {MIN_LOGS - 1} logs are of one moment, {stamps[0]}; give their dates")
-    planned = _plan_times(weeks, horizon)
-    look = look_level(planned, level / len(chosen))
+    usual = float(np.median(np.diff(weeks))) or float(weeks[-1]) / (len(weeks) - 1)
+    to_come = weeks[-1] + usual * np.arange(1, max(horizon - len(weeks), 0) + 1)
+    planned = tuple(float(w) for w in (*weeks, *to_come))
+    look = look_level(planned, level / len(enough))
     rows, histories = {}, {}
-    for name in chosen:
+    for name in enough:
         rows[name], histories[name] = _track_one(name, frames, stamps, weeks, planned, look, drift)
     table = WideFrame(pd.DataFrame.from_dict(rows, orient="index").astype({"alarm": "datetime64[us]"}))
     history = WideFrame(pd.concat(histories, names=["parameter", "date"]))
@@ -255,25 +263,6 @@ def _read_date(given: "str | date") -> datetime:
             raise InputError(f"{given!r} is no date; write it as 2026-03-12 or 2026-03-12T10:00") from None
     moment = given if isinstance(given, datetime) else datetime(given.year, given.month, given.day)
     return moment.replace(tzinfo=None)
-
-
-def _choose_parameters(frames: "Sequence[pd.DataFrame]", asked: Sequence[str]) -> list[str]:
-    """The parameters with enough intervals; an error where one that is asked for has not."""
-    known = list(dict.fromkeys(str(n) for frame in frames for n in frame.index))
-    check_names("parameter", asked, known, "the fits")
-    counts = {n: sum(np.isfinite(_estimate(frame, n)[1]) for frame in frames) for n in asked or known}
-    enough = [n for n, count in counts.items() if count >= MIN_LOGS]
-    missing = [n for n in asked if n not in enough]
-    remedy = f"{MIN_LOGS} logs with an interval are needed; log longer runs, or free fewer parameters"
-    require(not missing and bool(enough), f"{', '.join(missing or counts)} cannot be tracked: {remedy}")
-    return enough
-
-
-def _plan_times(weeks: Array, horizon: int) -> tuple[float, ...]:
-    """The times of the logs, and of those to come at their usual distance."""
-    usual = float(np.median(np.diff(weeks))) or float(weeks[-1]) / (len(weeks) - 1)
-    to_come = weeks[-1] + usual * np.arange(1, max(horizon - len(weeks), 0) + 1)
-    return tuple(float(w) for w in (*weeks, *to_come))
 
 
 def _estimate(frame: "pd.DataFrame", name: str) -> tuple[float, float]:

@@ -25,8 +25,8 @@ from pneuopt.identification.tolerances import (
     FORESEEN_RATIO,
     MAX_HIDING_SHARE,
     MAX_TRIAL_SAMPLES,
-    MAX_WIDENED_MISFIT,
     MIN_RELATIVE_FALL,
+    MODEL_ERROR_LEVEL,
     SIGNIFICANT_FALL,
 )
 from pneuopt.logs.experiment import Experiment
@@ -171,7 +171,7 @@ def _is_confirmed(race: "_Race", width: Width, given: _Trial, best: _Trial) -> b
         return True
     trial, other = (race.run(t.widths, confirms=True) for t in (best, given))
     is_wider = trial.widths[width.name] > other.widths[width.name]
-    if is_wider and other.cost < inf and trial.misfit > MAX_WIDENED_MISFIT:
+    if is_wider and other.cost < inf and trial.misfit > MODEL_ERROR_LEVEL**2:
         return False
     return _is_better(width, trial, other)
 
