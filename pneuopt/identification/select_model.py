@@ -55,6 +55,131 @@ if TYPE_CHECKING:
 TRIAL_STAGES = (Stage(3e-3, 12), Stage(1e-3, 8), Stage(1e-4, 12))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class ModelSelection(Result):
+    """The fits of several models to the same logs, ranked, and the recommended one; prints its `summary()`.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a candidate, the best first: converged, refuted (by short searches, without a fit), free (number of
+        estimates), deviance, bic, bic_above (the best's; all three estimated for a refuted one, as is p_value),
+        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
+        unidentifiable and at_bound (names of parameters), unphysical (which order of
+        `IdentificationHints.at_least` it breaks), message.
+    recommended : str
+        A candidate's name.
+    reason : str
+        One sentence.
+    fits : mapping of str to IdentificationResult
+        The fit of every candidate that short searches have not refuted, whatever its status.
+    """
+
+    table: "pd.DataFrame"
+    recommended: str
+    reason: str
+    fits: Mapping[str, IdentificationResult]
+
+    def summary(self) -> Report:
+        """The recommendation and its reason, then a row a candidate."""
+        rows = []
+        for row in self.table.reset_index(names="model").to_dict(orient="records"):
+            unidentifiable = row["unidentifiable"]
+            missing = f"{UNIDENTIFIABLE_NOTE}: {unidentifiable}" if unidentifiable else ""
+            why = str(row["message"]).partition(";")[0]
+            note = "" if row["converged"] else f"refuted: {why}" if row["refuted"] else f"not converged: {why}"
+            bound = f"{AT_BOUND_NOTE}: {row['at_bound']}" if row["at_bound"] else ""
+            figures = str(row["free"]), format_number(row["bic_above"], 4), str(row["contains"])
+            remark = note or row["unphysical"] or bound or missing
+            rows.append((str(row["model"]), *figures, format_number(row["p_value"], 2), str(remark)))
+        free, contains = number_columns("free", "BIC above best"), text_columns("contains")
+        columns = *text_columns("model"), *free, *contains, *number_columns("p of chance"), *text_columns("")
+        return Report((Line(self.reason, Tone.GOOD), Table(columns, tuple(rows))))
+
+
+def select_model(
+    candidates: Mapping[str, HasSystem],
+    experiments: Experiment | Sequence[Experiment],
+    parameters: ParameterSet,
+    *,
+    free: Sequence[str],
+    held_out: Experiment | Sequence[Experiment] = (),
+    method: LeastSquares | None = None,
+    window: float | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> ModelSelection:
+    """Fit every candidate alike and recommend one.
+
+    Parameters
+    ----------
+    candidates : mapping of str to drive or System
+        By name, say ``{n: ForceDrive(f) for n, f in friction_ladder().items()}``.
+    experiments : Experiment or sequence of Experiment
+    parameters : ParameterSet
+        Known values; a candidate takes those that it has. What is free among them stays so.
+    free : sequence of str
+        Names, or patterns, freed in each candidate that has them.
+    held_out : Experiment or sequence of Experiment, optional
+        Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
+    method : LeastSquares, optional
+    window : float, optional
+        As of `identify`; by default whole logs, or the windows of the candidate that follows them best.
+    progress : callable, optional
+        Receives a `Progress`, a line of text with the time, a candidate and an iteration.
+
+    Returns
+    -------
+    ModelSelection
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two candidates, or a parameter or pattern belongs to none.
+    ConvergenceError
+        If no candidate converged; `solution` maps each name to its marked result.
+
+    Notes
+    -----
+    All are fitted in the same windows and at the same widths (`fit_candidates` says why). The deviance is the squared
+    residuals over their variance in the best candidate, and over the factor by which that candidate's variances exceed
+    those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
+    with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
+    parameters count among the k, so that a candidate with such parameters gives way to a simpler one that fits as well.
+    A candidate that did not converge, ends at a bound or breaks its model's `IdentificationHints.at_least` is not
+    recommended while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without
+    any the fewer parameters.
+    """
+    import pandas as pd
+
+    check_options(method=method, window=window)
+    free = as_tuple("free", free, str, 'names or patterns of parameters, as ["friction.*"]')
+    check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
+    require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
+    systems = {name: as_system(model, f"candidates[{name!r}]") for name, model in candidates.items()}
+    experiments, held_out = as_experiments(experiments), as_experiments(held_out)
+    check_parameters(parameters)
+    given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
+    _check_names(given, parameters, free)
+    if progress is not None:
+        method = replace(method or LeastSquares(), progress=ProgressReporter(progress, "select_model"))
+    found = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
+    fits = {n: fit for n, fit in found.items() if isinstance(fit, IdentificationResult)}
+    converged = [n for n, fit in fits.items() if fit.status.converged]
+    if not converged:
+        message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
+        raise ConvergenceError(f"none of the candidates converged: {message}", fits)
+    predicted = {
+        n: float(validate(systems[n], held_out, fits[n].parameters)["nrmse"].mean()) if held_out else math.nan
+        for n in converged
+    }
+    rows = _candidate_rows(systems, found, predicted)
+    chosen, why = _choose(rows)
+    reason = _selection_reason(rows, chosen, why, _separate(rows, chosen, fits, systems))
+    table = pd.DataFrame.from_dict({n: asdict(row) for n, row in rows.items()}, orient="index")
+    table.insert(4, "bic_above", table["bic"] - table["bic"].min())
+    return ModelSelection(table, chosen, reason, fits)
+
+
 @dataclass(frozen=True)
 class Trial:
     """The best short search of a model."""
@@ -333,131 +458,6 @@ def _with_widths(candidate: Candidate, widths: Mapping[str, float]) -> Candidate
     every = {name for width in known for name in (width.name, *width.follows)} & own.keys() & widths.keys()
     edits = {n: replace(own[n], value=widths[n], source=COMMON_WIDTH) for n in every}
     return replace(candidate, parameters=own | ParameterSet(edits))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ModelSelection(Result):
-    """The fits of several models to the same logs, ranked, and the recommended one; prints its `summary()`.
-
-    Attributes
-    ----------
-    table : DataFrame
-        A row a candidate, the best first: converged, refuted (by short searches, without a fit), free (number of
-        estimates), deviance, bic, bic_above (the best's; all three estimated for a refuted one, as is p_value),
-        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
-        unidentifiable and at_bound (names of parameters), unphysical (which order of
-        `IdentificationHints.at_least` it breaks), message.
-    recommended : str
-        A candidate's name.
-    reason : str
-        One sentence.
-    fits : mapping of str to IdentificationResult
-        The fit of every candidate that short searches have not refuted, whatever its status.
-    """
-
-    table: "pd.DataFrame"
-    recommended: str
-    reason: str
-    fits: Mapping[str, IdentificationResult]
-
-    def summary(self) -> Report:
-        """The recommendation and its reason, then a row a candidate."""
-        rows = []
-        for row in self.table.reset_index(names="model").to_dict(orient="records"):
-            unidentifiable = row["unidentifiable"]
-            missing = f"{UNIDENTIFIABLE_NOTE}: {unidentifiable}" if unidentifiable else ""
-            why = str(row["message"]).partition(";")[0]
-            note = "" if row["converged"] else f"refuted: {why}" if row["refuted"] else f"not converged: {why}"
-            bound = f"{AT_BOUND_NOTE}: {row['at_bound']}" if row["at_bound"] else ""
-            figures = str(row["free"]), format_number(row["bic_above"], 4), str(row["contains"])
-            remark = note or row["unphysical"] or bound or missing
-            rows.append((str(row["model"]), *figures, format_number(row["p_value"], 2), str(remark)))
-        free, contains = number_columns("free", "BIC above best"), text_columns("contains")
-        columns = *text_columns("model"), *free, *contains, *number_columns("p of chance"), *text_columns("")
-        return Report((Line(self.reason, Tone.GOOD), Table(columns, tuple(rows))))
-
-
-def select_model(
-    candidates: Mapping[str, HasSystem],
-    experiments: Experiment | Sequence[Experiment],
-    parameters: ParameterSet,
-    *,
-    free: Sequence[str],
-    held_out: Experiment | Sequence[Experiment] = (),
-    method: LeastSquares | None = None,
-    window: float | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> ModelSelection:
-    """Fit every candidate alike and recommend one.
-
-    Parameters
-    ----------
-    candidates : mapping of str to drive or System
-        By name, say ``{n: ForceDrive(f) for n, f in friction_ladder().items()}``.
-    experiments : Experiment or sequence of Experiment
-    parameters : ParameterSet
-        Known values; a candidate takes those that it has. What is free among them stays so.
-    free : sequence of str
-        Names, or patterns, freed in each candidate that has them.
-    held_out : Experiment or sequence of Experiment, optional
-        Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
-    method : LeastSquares, optional
-    window : float, optional
-        As of `identify`; by default whole logs, or the windows of the candidate that follows them best.
-    progress : callable, optional
-        Receives a `Progress`, a line of text with the time, a candidate and an iteration.
-
-    Returns
-    -------
-    ModelSelection
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two candidates, or a parameter or pattern belongs to none.
-    ConvergenceError
-        If no candidate converged; `solution` maps each name to its marked result.
-
-    Notes
-    -----
-    All are fitted in the same windows and at the same widths (`fit_candidates` says why). The deviance is the squared
-    residuals over their variance in the best candidate, and over the factor by which that candidate's variances exceed
-    those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
-    with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
-    parameters count among the k, so that a candidate with such parameters gives way to a simpler one that fits as well.
-    A candidate that did not converge, ends at a bound or breaks its model's `IdentificationHints.at_least` is not
-    recommended while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without
-    any the fewer parameters.
-    """
-    import pandas as pd
-
-    check_options(method=method, window=window)
-    free = as_tuple("free", free, str, 'names or patterns of parameters, as ["friction.*"]')
-    check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
-    require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
-    systems = {name: as_system(model, f"candidates[{name!r}]") for name, model in candidates.items()}
-    experiments, held_out = as_experiments(experiments), as_experiments(held_out)
-    check_parameters(parameters)
-    given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
-    _check_names(given, parameters, free)
-    if progress is not None:
-        method = replace(method or LeastSquares(), progress=ProgressReporter(progress, "select_model"))
-    found = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
-    fits = {n: fit for n, fit in found.items() if isinstance(fit, IdentificationResult)}
-    converged = [n for n, fit in fits.items() if fit.status.converged]
-    if not converged:
-        message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
-        raise ConvergenceError(f"none of the candidates converged: {message}", fits)
-    predicted = {
-        n: float(validate(systems[n], held_out, fits[n].parameters)["nrmse"].mean()) if held_out else math.nan
-        for n in converged
-    }
-    rows = _candidate_rows(systems, found, predicted)
-    chosen, why = _choose(rows)
-    reason = _selection_reason(rows, chosen, why, _separate(rows, chosen, fits, systems))
-    table = pd.DataFrame.from_dict({n: asdict(row) for n, row in rows.items()}, orient="index")
-    table.insert(4, "bic_above", table["bic"] - table["bic"].min())
-    return ModelSelection(table, chosen, reason, fits)
 
 
 @dataclass(frozen=True)

@@ -36,94 +36,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True)
-class DriftLine:
-    """A weighted line through estimates."""
-
-    mean: float  # at the weighted mean of the times [unit]
-    slope: float  # [unit/time]
-    centre: float  # weighted mean of the times
-    mean_error: float  # standard error, independent of the slope's
-    slope_error: float  # [unit/time]
-    scatter: float  # standard deviation from log to log [unit]
-    dof: int  # degrees of freedom of Student's t
-    p: float  # probability of so steep a line without a drift, two-sided
-
-    def at(self, times: Array, level: float = 0.95) -> tuple[Array, Array]:
-        """The line at given times, and the half width of its confidence band there."""
-        shift = np.asarray(times, dtype=float) - self.centre
-        error = np.hypot(self.mean_error, self.slope_error * shift)
-        return self.mean + self.slope * shift, float(student.ppf(0.5 + level / 2, self.dof)) * error
-
-
-def fit_line(times: Array, values: Array, errors: Array) -> DriftLine:
-    """Fit the line.
-
-    Examples
-    --------
-    >>> line = fit_line([0, 1, 2, 3], [1.0, 2.1, 2.9, 4.0], [1e-3] * 4)  # errors far below the scatter: least squares
-    >>> round(line.slope, 3), round(line.slope_error, 4), line.dof
-    (0.98, 0.0424, 2)
-    """
-    x, y, s = (np.asarray(v, dtype=float) for v in (times, values, errors))
-    dof = len(x) - 2
-
-    def excess(variance: float) -> float:
-        return _squares(x, y, s**2 + variance) - dof
-
-    top = float(np.ptp(y)) ** 2 + 1e-300
-    while excess(top) > 0:
-        top *= 4
-    variance = float(brentq(excess, 0.0, top)) if excess(0.0) > 0 else 0.0
-    w = 1 / (s**2 + variance)
-    centre, mean = float(np.average(x, weights=w)), float(np.average(y, weights=w))
-    spread = float(w @ (x - centre) ** 2)
-    slope, error = float(w @ ((x - centre) * y)) / spread, spread**-0.5
-    p = 2 * float(student.sf(abs(slope) / error, dof))
-    return DriftLine(mean, slope, centre, float(w.sum()) ** -0.5, error, variance**0.5, dof, p)
-
-
-def _squares(x: Array, y: Array, variance: Array) -> float:
-    """Weighted squares of the residuals of a line."""
-    w = 1 / variance
-    x, y = x - np.average(x, weights=w), y - np.average(y, weights=w)
-    slope = (w @ (x * y)) / (w @ x**2)
-    return float(w @ (y - slope * x) ** 2)
-
-
-def look_level(times: tuple[float, ...], level: float) -> float:
-    """The p-value of a look that raises an alarm, so that a history of such logs has one by chance at `level`."""
-    return float(np.quantile(_smallest(times), level))
-
-
-def power(times: tuple[float, ...], drift: float, level: float) -> Array:
-    """The probability (n,) that a drift is seen with each log or an earlier one, with looks at `level`.
-
-    The drift is by time, in standard deviations of an estimate about its line: its error and the scatter together.
-    """
-    seen = np.minimum.accumulate(_p_values(times, drift, HISTORIES // 4), axis=1) <= level
-    return np.asarray(np.concatenate([np.zeros(MIN_LOGS - 1), seen.mean(axis=0)]))
-
-
-@lru_cache(maxsize=32)
-def _smallest(times: tuple[float, ...]) -> Array:
-    return np.asarray(_p_values(times, 0.0, HISTORIES).min(axis=1))
-
-
-def _p_values(times: tuple[float, ...], drift: float, count: int) -> Array:
-    """The p-values of each look of drawn histories, shape (count, n - 3), by running sums."""
-    x = np.asarray(times) - times[0]
-    y = drift * x + np.random.default_rng(0).standard_normal((count, len(x)))
-    n = np.arange(1, len(x) + 1)
-    sx, sy = np.cumsum(x), np.cumsum(y, axis=1)
-    xx = np.cumsum(x**2) - sx**2 / n
-    xy, yy = np.cumsum(x * y, axis=1) - sx * sy / n, np.cumsum(y**2, axis=1) - sy**2 / n
-    late = slice(MIN_LOGS - 1, None)
-    slope = xy[:, late] / xx[late]
-    left = np.maximum(yy[:, late] - slope * xy[:, late], 0) / (n[late] - 2)
-    return np.asarray(2 * student.sf(np.abs(slope) / np.sqrt(left / xx[late]), n[late] - 2))
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Tracking(Shown):
     """What became of a drive's parameters, log by log.
@@ -252,6 +164,94 @@ def track(
     table = WideFrame(pd.DataFrame.from_dict(rows, orient="index").astype({"alarm": "datetime64[us]"}))
     history = WideFrame(pd.concat(histories, names=["parameter", "date"]))
     return Tracking(table, history, look, level, len(planned), drift)
+
+
+@dataclass(frozen=True)
+class DriftLine:
+    """A weighted line through estimates."""
+
+    mean: float  # at the weighted mean of the times [unit]
+    slope: float  # [unit/time]
+    centre: float  # weighted mean of the times
+    mean_error: float  # standard error, independent of the slope's
+    slope_error: float  # [unit/time]
+    scatter: float  # standard deviation from log to log [unit]
+    dof: int  # degrees of freedom of Student's t
+    p: float  # probability of so steep a line without a drift, two-sided
+
+    def at(self, times: Array, level: float = 0.95) -> tuple[Array, Array]:
+        """The line at given times, and the half width of its confidence band there."""
+        shift = np.asarray(times, dtype=float) - self.centre
+        error = np.hypot(self.mean_error, self.slope_error * shift)
+        return self.mean + self.slope * shift, float(student.ppf(0.5 + level / 2, self.dof)) * error
+
+
+def fit_line(times: Array, values: Array, errors: Array) -> DriftLine:
+    """Fit the line.
+
+    Examples
+    --------
+    >>> line = fit_line([0, 1, 2, 3], [1.0, 2.1, 2.9, 4.0], [1e-3] * 4)  # errors far below the scatter: least squares
+    >>> round(line.slope, 3), round(line.slope_error, 4), line.dof
+    (0.98, 0.0424, 2)
+    """
+    x, y, s = (np.asarray(v, dtype=float) for v in (times, values, errors))
+    dof = len(x) - 2
+
+    def excess(variance: float) -> float:
+        return _squares(x, y, s**2 + variance) - dof
+
+    top = float(np.ptp(y)) ** 2 + 1e-300
+    while excess(top) > 0:
+        top *= 4
+    variance = float(brentq(excess, 0.0, top)) if excess(0.0) > 0 else 0.0
+    w = 1 / (s**2 + variance)
+    centre, mean = float(np.average(x, weights=w)), float(np.average(y, weights=w))
+    spread = float(w @ (x - centre) ** 2)
+    slope, error = float(w @ ((x - centre) * y)) / spread, spread**-0.5
+    p = 2 * float(student.sf(abs(slope) / error, dof))
+    return DriftLine(mean, slope, centre, float(w.sum()) ** -0.5, error, variance**0.5, dof, p)
+
+
+def _squares(x: Array, y: Array, variance: Array) -> float:
+    """Weighted squares of the residuals of a line."""
+    w = 1 / variance
+    x, y = x - np.average(x, weights=w), y - np.average(y, weights=w)
+    slope = (w @ (x * y)) / (w @ x**2)
+    return float(w @ (y - slope * x) ** 2)
+
+
+def look_level(times: tuple[float, ...], level: float) -> float:
+    """The p-value of a look that raises an alarm, so that a history of such logs has one by chance at `level`."""
+    return float(np.quantile(_smallest(times), level))
+
+
+def power(times: tuple[float, ...], drift: float, level: float) -> Array:
+    """The probability (n,) that a drift is seen with each log or an earlier one, with looks at `level`.
+
+    The drift is by time, in standard deviations of an estimate about its line: its error and the scatter together.
+    """
+    seen = np.minimum.accumulate(_p_values(times, drift, HISTORIES // 4), axis=1) <= level
+    return np.asarray(np.concatenate([np.zeros(MIN_LOGS - 1), seen.mean(axis=0)]))
+
+
+@lru_cache(maxsize=32)
+def _smallest(times: tuple[float, ...]) -> Array:
+    return np.asarray(_p_values(times, 0.0, HISTORIES).min(axis=1))
+
+
+def _p_values(times: tuple[float, ...], drift: float, count: int) -> Array:
+    """The p-values of each look of drawn histories, shape (count, n - 3), by running sums."""
+    x = np.asarray(times) - times[0]
+    y = drift * x + np.random.default_rng(0).standard_normal((count, len(x)))
+    n = np.arange(1, len(x) + 1)
+    sx, sy = np.cumsum(x), np.cumsum(y, axis=1)
+    xx = np.cumsum(x**2) - sx**2 / n
+    xy, yy = np.cumsum(x * y, axis=1) - sx * sy / n, np.cumsum(y**2, axis=1) - sy**2 / n
+    late = slice(MIN_LOGS - 1, None)
+    slope = xy[:, late] / xx[late]
+    left = np.maximum(yy[:, late] - slope * xy[:, late], 0) / (n[late] - 2)
+    return np.asarray(2 * student.sf(np.abs(slope) / np.sqrt(left / xx[late]), n[late] - 2))
 
 
 def _read_date(given: "str | date") -> datetime:
