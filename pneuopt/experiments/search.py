@@ -248,16 +248,12 @@ class PlannedRun:
         for u in np.split(given, range(size, m, size)):
             run = self._run.run(np.tile(x0, (len(u), 1)), u, p, t, h, substeps=substeps, states=1)
             assert run.x is not None
-            parts.append(self._gather(u, run.y, run.x))
+            held = run.y[:, :, -1:] if self.loop is not None else u
+            columns = {self.excited_quantity.name: u[..., 0], self.command.name: held[..., 0]}
+            columns |= {s: run.x[:, :, i] for i, s in enumerate(names(self.plant.states))}
+            columns |= {y: run.y[:, :, i] for i, y in enumerate(names(self.plant.outputs))}
+            parts.append(np.stack([columns[q.name] for q in self.channels], axis=2))
         return np.concatenate(parts)
-
-    def _gather(self, u: Array, y: Array, x: Array) -> Array:
-        """The channels of a run, in their order."""
-        held = y[:, :, -1:] if self.loop is not None else u
-        columns = {self.excited_quantity.name: u[..., 0], self.command.name: held[..., 0]}
-        columns |= {n: x[:, :, i] for i, n in enumerate(names(self.plant.states))}
-        columns |= {n: y[:, :, i] for i, n in enumerate(names(self.plant.outputs))}
-        return np.stack([columns[q.name] for q in self.channels], axis=2)
 
     def violations(self, runs: Array, parameters: ParameterSet) -> Mapping[str, Array]:
         """How far each run leaves each limit, as a share of its width, shape (m,); below zero: the room left."""

@@ -43,7 +43,7 @@ from pneuopt.logs.doctor import LogFinding, Severity, evidence, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise
 from pneuopt.quantities.errors import ModelError, PhysicsWarning
-from pneuopt.quantities.parameters import Parameter, ParameterSet, check_parameters
+from pneuopt.quantities.parameters import ParameterSet, check_parameters
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, text_columns
 from pneuopt.quantities.results import Shown
 from pneuopt.quantities.units import ATMOSPHERE, write_value
@@ -136,13 +136,10 @@ def _defaults(defaults: ParameterSet, given: ParameterSet) -> Iterator[Assumptio
         if used.free or used.stated or used != usual:
             continue
         section, _, key = name.partition(".")
-        yield Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, _reason(used))
-
-
-def _reason(p: Parameter) -> str:
-    if p.source == DEFAULT_WIDTH:
-        return f"{p.meaning}; identify chooses it by the logs"
-    return f"{p.meaning} ({p.source})" if p.source else p.meaning
+        reason = f"{used.meaning} ({used.source})" if used.source else used.meaning
+        if used.source == DEFAULT_WIDTH:
+            reason = f"{used.meaning}; identify chooses it by the logs"
+        yield Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason)
 
 
 MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
@@ -275,7 +272,10 @@ def check(
     check_parameters(parameters)
     logs = check_logs(model, given, parameters)
     assumptions = list_assumptions(model, given, logs, parameters)
-    parameters, found = _find_centre(model, logs, parameters)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", PhysicsWarning)
+        parameters = find_centre(model, logs, parameters)
+    found = [_model_finding(str(w.message), logs) for w in said]
     found += [f for log in logs for f in examine(log, axis_from_model(model.plant, log, parameters))]
     found += [f for log in logs for f in _exchange_findings(model, log, parameters, found)]
     found += [_model_finding(sentence, logs) for sentence in find_log_warnings(model, logs, parameters)]
@@ -287,16 +287,6 @@ def check(
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
     verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates()[0])
     return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
-
-
-def _find_centre(
-    model: Fittable, logs: Sequence[Experiment], parameters: ParameterSet
-) -> tuple[ParameterSet, list[LogFinding]]:
-    """The parameters with the valve's centre, and what is to be said of it."""
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", PhysicsWarning)
-        parameters = find_centre(model, logs, parameters)
-    return parameters, [_model_finding(str(w.message), logs) for w in said]
 
 
 def _model_finding(sentence: str, logs: Sequence[Experiment]) -> LogFinding:

@@ -110,7 +110,10 @@ def verdict_from_covariance(
     keep = np.isfinite(np.diag(searched))
     root = np.zeros_like(searched)
     if keep.any():
-        root[np.ix_(keep, keep)] = _root_of_inverse(searched[np.ix_(keep, keep)])
+        known = searched[np.ix_(keep, keep)]
+        deviation = np.sqrt(np.diag(known))  # by which covariances of any units meet in one matrix
+        values, vectors = np.linalg.eigh(known / np.outer(deviation, deviation))
+        root[np.ix_(keep, keep)] = (vectors / np.sqrt(np.maximum(values, 1e-14))).T / deviation
     return _make_verdict(problem, fit, root, inside_bounds=keep, trusted=trusted)
 
 
@@ -305,7 +308,11 @@ def _log_root_information(
     carried = np.concatenate([np.eye(n), np.zeros((n, k))], axis=1)
     carried[np.isfinite(segments.fixed_start[first])] = 0.0
     root, rows = np.zeros((0, n + k)), []
-    chosen = np.concatenate([np.zeros((len(segments.columns), n)), _column_derivatives(segments, first, chain)], axis=1)
+    index = np.full(len(segments.transcription.parameters), -1, dtype=np.intp)
+    index[segments.transcription.free] = np.arange(k)
+    unknown = index[segments.parameter_positions[first, segments.columns]]
+    by_parameter = np.where(unknown[:, None] == np.arange(k), chain, 0.0)  # of each column, alike in all segments
+    chosen = np.concatenate([np.zeros((len(segments.columns), n)), by_parameter], axis=1)
     for i, (y, x) in enumerate(zip(weighted, end_sensitivities, strict=True)):
         moved = np.concatenate([carried, chosen])
         with np.errstate(over="ignore", invalid="ignore"):
@@ -316,24 +323,9 @@ def _log_root_information(
     return np.asarray(root[n:, n:])
 
 
-def _column_derivatives(segments: Segments, first: int, chain: Array) -> Array:
-    """d(sensitivity column)/d(free parameter, as searched), the same in all segments of a log."""
-    index = np.full(len(segments.transcription.parameters), -1, dtype=np.intp)
-    index[segments.transcription.free] = np.arange(len(chain))
-    unknown = index[segments.parameter_positions[first, segments.columns]]
-    return np.where(unknown[:, None] == np.arange(len(chain)), chain, 0.0)
-
-
 def _triangularise(rows: Array) -> Array:
     """The square upper triangle (QR) that has the same Gram matrix."""
     width = rows.shape[1]
     padded = np.concatenate([rows, np.zeros((max(0, width - len(rows)), width))])
     finite = bool(np.isfinite(padded).all())
     return np.asarray(np.linalg.qr(padded, mode="r")) if finite else np.full((width, width), np.nan)
-
-
-def _root_of_inverse(covariance: Array) -> Array:
-    """R with R'R the inverse of a covariance, whatever its units."""
-    deviation = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))
-    return np.asarray((vectors / np.sqrt(np.maximum(values, 1e-14))).T / deviation)

@@ -5,7 +5,7 @@ residual over the channel's own scale (1.4826 MAD), and the next fit starts wher
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -120,8 +120,11 @@ def fit_robustly(
         fits.append(fit)
         if _is_stationary(before, (current, fit)):
             break
-    current = replace(current, method=problem.method)
-    return current, _summarise(current, fits, loss)
+    current, fit = replace(current, method=problem.method), fits[-1].with_effort_of(*fits[:-1])
+    status = fit.status
+    if loss is not None and status.converged and fit.jumps is None:
+        status = Status(status.code, _describe_outliers(current, fit, len(fits)))
+    return current, replace(fit, stats={**fit.stats, "refits": len(fits) - 1.0}, status=status)
 
 
 def white_chi_square(problem: EstimationProblem, fit: Fit) -> float:
@@ -138,15 +141,6 @@ def white_chi_square(problem: EstimationProblem, fit: Fit) -> float:
             samples = int(np.isfinite(e.trajectory[channel]).sum())
             total += samples * (levels[channel] / e.noise[channel]) ** 2
     return total
-
-
-def _summarise(problem: EstimationProblem, fits: Sequence[Fit], loss: Loss | None) -> Fit:
-    """The last fit with the effort of all, and a status without the outliers' residuals."""
-    fit = fits[-1].with_effort_of(*fits[:-1])
-    status = fit.status
-    if loss is not None and status.converged and fit.jumps is None:
-        status = Status(status.code, _describe_outliers(problem, fit, len(fits)))
-    return replace(fit, stats={**fit.stats, "refits": len(fits) - 1.0}, status=status)
 
 
 def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> tuple[str, ...]:

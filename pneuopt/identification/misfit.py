@@ -166,10 +166,8 @@ def disagreement_p(clusters: Clusters, variance: float) -> float:
     scale, own = _whiten(clusters)
     scores = _simulate_scores(own) if clusters.by_chance is None else clusters.by_chance @ scale.T
     assumed = ASSUMED_SHARE / clusters.count * np.eye(len(scale))
-    seen, *chance = _chow(
-        np.concatenate([(clusters.scores @ scale.T)[None], scores]),
-        np.asarray(np.linalg.inv(own + assumed), dtype=np.float64),
-    )
+    every = np.concatenate([(clusters.scores @ scale.T)[None], scores])
+    seen, *chance = np.einsum("ngi,gij,ngj->n", every, np.linalg.inv(own + assumed), every, optimize=True)
     mean, spread = float(np.mean(chance)), float(np.var(chance, ddof=1))
     return float(chi2.sf(seen / variance * 2 * mean / spread, 2 * mean**2 / spread)) if spread > 0 else 1.0
 
@@ -177,11 +175,6 @@ def disagreement_p(clusters: Clusters, variance: float) -> float:
 def t_quantile(dof: Array | float, level: float = LEVEL) -> Array:
     """Half width of an interval in standard deviations, by Student's t."""
     return np.asarray(t.ppf(0.5 + level / 2, dof))
-
-
-def _chow(scores: Array, inverse: Array) -> Array:
-    """Chow's statistic of sets of whitened scores, shape (n, K, k), with the inverse information of each cluster."""
-    return np.asarray(np.einsum("ngi,gij,ngj->n", scores, inverse, scores, optimize=True))
 
 
 def _simulate_scores(own: Array) -> Array:

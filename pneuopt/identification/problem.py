@@ -146,25 +146,17 @@ class EstimationProblem:
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
         h = np.append(np.diff(t), np.diff(t)[-1])
-        breaks = self._breaks(experiment)
-        nodes, guess = (
-            regular_nodes(len(t), self._samples_a_segment(h), breaks),
-            states.matrix(names(self.system.states)),
-        )
+        breaks = [end for begin, end in experiment.holes if begin > 0 and end < len(t)]
+        if not math.isinf(self.window):
+            breaks = sorted({*breaks, *(begin for begin, _ in window_runs(experiment, self.window) if begin > 0)})
+        nodes = regular_nodes(len(t), self._samples_a_segment(h), breaks)
+        guess = states.matrix(names(self.system.states))
         for begin, end in experiment.holes:
             h[max(begin - 1, 0) : end] = 0.0  # the state stands still where its inputs are unknown
         driven = self.system.input_matrix(experiment.trajectory, experiment.name)
         driven = append_slopes(t, driven, self._linear, self._rising(experiment))
         start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
         return Phase(experiment.name, t, h, driven, nodes, start, guess=guess, breaks=np.array(breaks, dtype=np.intp))
-
-    def _breaks(self, experiment: Experiment) -> list[int]:
-        """The samples at which a log starts anew: after a hole in its inputs, and at the start of each window."""
-        t = experiment.trajectory.t
-        holes = [end for begin, end in experiment.holes if begin > 0 and end < len(t)]
-        if math.isinf(self.window):
-            return holes
-        return sorted({*holes, *(begin for begin, _ in window_runs(experiment, self.window) if begin > 0)})
 
     def _samples_a_segment(self, h: Array) -> int:
         """Samples between two nodes; a static map has no gaps, and is cut only for batches and blocks of time."""
@@ -364,7 +356,9 @@ def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tu
     log, inputs = experiment.trajectory, names(system.inputs)
     known: Mask = np.asarray(np.isfinite(log.matrix(inputs)).all(axis=1))
     holes = _find_holes(log, known, system) if system.states else []
-    lost = ~known if not system.states else _inside(holes, len(log))
+    lost = np.zeros(len(log), dtype=bool) if system.states else ~known
+    for begin, end in holes:
+        lost[begin:end] = True
     everything = (
         f"{experiment.name}: no part holds {', '.join(inputs)} and {MIN_RUN} samples of an output; log them together"
     )
@@ -422,13 +416,6 @@ def _find_holes(log: Trajectory, known: Mask, system: Fittable) -> list[tuple[in
     inner = range(2, len(edges) - 2, 2)
     outer = [(edges[k], edges[k + 1]) for k in (0, len(edges) - 2) if edges[k + 1] > edges[k]]
     return sorted({*outer, *((edges[k], edges[k + 1]) for k in inner)})
-
-
-def _inside(holes: Sequence[tuple[int, int]], n: int) -> Mask:
-    inside = np.zeros(n, dtype=bool)
-    for begin, end in holes:
-        inside[begin:end] = True
-    return inside
 
 
 def _bridge(log: Trajectory, behaviour: dict[str, Intersample], lost: Mask) -> dict[str, Array]:

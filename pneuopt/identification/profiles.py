@@ -391,9 +391,11 @@ def _linearise(result: IdentificationResult, function: Callable[[ParameterValues
     found = {str(n): float(v) for n, v in result.estimates["value"].items()}
     at = {**known, **{n: known[n.partition("[")[0]] if math.isnan(v) else v for n, v in found.items()}}
     variances = np.diag(result.covariance.to_numpy(dtype=float))
-    slopes = [
-        _central_difference(function, at, str(n), v) for n, v in zip(result.covariance.index, variances, strict=True)
-    ]
+    slopes = []
+    for name, variance in zip(map(str, result.covariance.index), variances, strict=True):
+        step = DELTA_METHOD_STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
+        up, down = (np.asarray(function({**at, name: at[name] + side * step}), dtype=float) for side in (1, -1))
+        slopes.append((up - down) / (2 * step))
     value = np.asarray(function(at), dtype=float)
     return value, np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
 
@@ -403,11 +405,3 @@ def _deviations(result: IdentificationResult, slopes: Array) -> Array:
     used = np.any(slopes != 0, axis=0)  # parameters without an interval do no harm where no figure depends on them
     covariance = result.covariance.to_numpy(dtype=float)[np.ix_(used, used)]
     return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", slopes[:, used], covariance, slopes[:, used])))
-
-
-def _central_difference(
-    function: Callable[[ParameterValues], ArrayLike], at: ParameterValues, name: str, variance: float
-) -> Array:
-    step = DELTA_METHOD_STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
-    up, down = (np.asarray(function({**at, name: at[name] + side * step}), dtype=float) for side in (1, -1))
-    return np.asarray((up - down) / (2 * step))

@@ -68,7 +68,12 @@ class Verdict(Shown):
             for (is_unknown, reason), names in by_reason.items()
         ]
         hints, inflation = self.identification_hints, self.table["inflation"]
-        groups = [_describe_group(group, inflation, hints) for group in self.indistinguishable]
+        groups = []
+        for group in self.indistinguishable:
+            times = float(inflation[list(group)].max())
+            known = f"each {times:.0f} times better known if the others are fixed"
+            known = known if times < 1e5 else "nothing separates them"  # beyond it the figure is rounding
+            groups.append(f"{join_names(group)} act only together ({known}): {remedy(hints, group)}")
         if not self.unchanged:
             return (*single, *groups)
         values = join_names([f"{n} ({self.table['value'][n]:.4g})" for n in self.unchanged])
@@ -328,13 +333,6 @@ def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:
     return Report((Table((*text_columns("log", "channel"), *figures_heads, *text_columns("unit")), tuple(rows)),))
 
 
-def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", hints: IdentificationHints) -> str:
-    times = float(inflation[list(group)].max())
-    known = f"each {times:.0f} times better known if the others are fixed"
-    message = known if times < 1e5 else "nothing separates them"  # beyond it the figure is rounding
-    return f"{join_names(group)} act only together ({message}): {remedy(hints, group)}"
-
-
 def join_names(names: Sequence[str]) -> str:
     """Names in a sentence: "a, b and c"."""
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
@@ -420,7 +418,9 @@ def summarise_motion(
     experiments: Sequence[Experiment], states: Mapping[str, Trajectory], values: ParameterSet, given: ParameterSet
 ) -> LoggedMotion | None:
     """The speeds and accelerations of all logs, of estimated states where none is logged; None where nothing moves."""
-    runs = [r for e in experiments if (r := _speed(e, states.get(e.name))) is not None]
+    sources = [e.trajectory if "speed" in e.trajectory else states.get(e.name) for e in experiments]
+    speeds = [(s.t, s["speed"]) for s in sources if s is not None and "speed" in s]
+    runs = [(t[np.isfinite(speed)], speed[np.isfinite(speed)]) for t, speed in speeds]
     v = np.concatenate([speed for _, speed in runs]) if runs else np.zeros(0)
     if not np.any(v):
         return None
@@ -483,15 +483,6 @@ def _write_values(words: str, values: ParameterSet) -> str:
 
 def _base_name(name: str) -> str:
     return name.partition("[")[0]
-
-
-def _speed(experiment: Experiment, states: Trajectory | None) -> tuple[Array, Array] | None:
-    log = experiment.trajectory
-    source = log if "speed" in log else states
-    if source is None or "speed" not in source:
-        return None
-    known = np.isfinite(source["speed"])
-    return source.t[known], source["speed"][known]
 
 
 def _acceleration(t: Array, v: Array) -> Array:

@@ -288,7 +288,11 @@ def fit_candidates(
 ) -> Fits:
     """Fit every candidate alike, or refute it; one that does not converge begins again at the richest one within it."""
     alike = _Alike(experiments, method or LeastSquares(), window)
-    trials, out = _try_all(candidates, alike), Fits()
+    trials, allowed, out = Trials(), tuple[float, ...](), Fits()
+    for name in _richest_first(candidates):  # which leaves the others the fewest squares
+        alike.announce("trying", name, len(trials), len(candidates))
+        trials[name] = alike.try_shortly(candidates[name], allowed=allowed)
+        allowed = _hopeless_squares(min(trials.values(), key=lambda trial: trial.squares))
     for name in _by_rank(candidates, trials):
         alike.announce("fitting", name, len(out), len(candidates))
         out[name] = fit = alike.fit(candidates[name])
@@ -296,16 +300,6 @@ def fit_candidates(
             out = _fit_beside(name, fit, candidates, trials, alike)
             break
     return {n: out[n] for n in candidates}
-
-
-def _try_all(candidates: Mapping[str, Candidate], alike: "_Alike") -> Trials:
-    """A trial of each candidate's first start, the richest first, which leaves the others the fewest squares."""
-    trials, allowed = Trials(), tuple[float, ...]()
-    for name in _richest_first(candidates):
-        alike.announce("trying", name, len(trials), len(candidates))
-        trials[name] = alike.try_shortly(candidates[name], allowed=allowed)
-        allowed = _hopeless_squares(min(trials.values(), key=lambda trial: trial.squares))
-    return trials
 
 
 def _richest_first(candidates: Mapping[str, Candidate]) -> list[str]:
@@ -516,8 +510,9 @@ def _candidate_rows(
     """A row for each candidate, the lowest BIC first, those that did not converge last."""
     fits = {n: fit for n, fit in found.items() if isinstance(fit, IdentificationResult)}
     best = min(predicted, key=lambda n: _chi_square(fits[n]))
-    scale = _variance(fits[best]) * fits[best].stats["variance_inflation"]
-    count = _residual_count(fits[best]) / fits[best].stats["variance_inflation"]
+    samples, inflation = _residual_count(fits[best]), fits[best].stats["variance_inflation"]
+    scale = _chi_square(fits[best]) / max(1.0, samples - len(fits[best].estimates)) * inflation
+    count = samples / inflation
     comparable = {n: fit for n, fit in found.items() if n in predicted or n not in fits}
     rows = {}
     for name, fit in found.items():
@@ -581,10 +576,6 @@ def _chi_square(
     if isinstance(fit, Refutation):
         return fit.ratio * _chi_square(fits[fit.leader])
     return float(((fit.fit["rmse"] / fit.fit["noise"]) ** 2 * fit.fit["samples"]).sum())
-
-
-def _variance(fit: IdentificationResult) -> float:
-    return _chi_square(fit) / max(1.0, _residual_count(fit) - len(fit.estimates))
 
 
 def _residual_count(fit: IdentificationResult) -> float:

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import brentq
@@ -77,17 +77,22 @@ class Tracking(Shown):
         calm = f"no parameter drifts: no look has p <= {self.look_level:.2g}"
         head = [Line(f"drift of {', '.join(self.drifting)}: identify and tune again", Tone.DOUBTFUL)]
         parts: list[Line | Table] = [*(head if self.drifting else [Line(calm, Tone.GOOD)])]
-        parts += [
-            Line(_describe_alarm(str(n), row), indent=2) for n, row in self.table.iterrows() if str(n) in self.drifting
-        ]
+        rows = []
+        for name, row in self.table.iterrows():
+            share = f"{row['percent_a_week']:.2g}"
+            low, high = f"{row['percent_a_week_low']:.2g}", f"{row['percent_a_week_high']:.2g}"
+            if str(name) in self.drifting:
+                seen = f"seen since {row['alarm']:%Y-%m-%d}"
+                parts.append(Line(f"{name} changes by {share} % a week ({low} to {high}), {seen}", indent=2))
+            value, ends = format_number(row["value"], 4), f"{row['ci_low']:.4g} to {row['ci_high']:.4g}"
+            numbers = (format_number(float(row[n]), 2) for n in ("p", "scatter", "logs_90"))
+            rows.append((str(name), value, ends, share, f"{low} to {high}", *numbers, str(row["unit"])))
         level = f"without a drift, {100 * self.level:.2g} % of histories of {self.horizon} logs have an alarm"
         parts.append(Line(level, indent=2))
         seen = f"logs until\n{100 * self.asked:.2g} % a week"
         heads = ("value", "95 % interval", "% a week", "95 % interval", "p", "scatter", f"{seen}\nseen in 90 %")
-        rows = tuple(_row(str(n), row) for n, row in self.table.iterrows())
-        return Report(
-            (*parts, Table((*text_columns("parameter"), *number_columns(*heads), *text_columns("unit")), rows))
-        )
+        columns = (*text_columns("parameter"), *number_columns(*heads), *text_columns("unit"))
+        return Report((*parts, Table(columns, tuple(rows))))
 
 
 def track(
@@ -319,16 +324,3 @@ def _percent_a_week(line: DriftLine) -> dict[str, float]:
     first = abs(float(line.at(np.zeros(1))[0][0]))
     ends = zip(("", "_low", "_high"), (0.0, -width, width), strict=True)
     return {f"percent_a_week{end}": 100 * (line.slope + d) / first for end, d in ends}
-
-
-def _describe_alarm(name: str, row: "pd.Series[Any]") -> str:
-    low, high = row["percent_a_week_low"], row["percent_a_week_high"]
-    since = f"{row['alarm']:%Y-%m-%d}"
-    return f"{name} changes by {row['percent_a_week']:.2g} % a week ({low:.2g} to {high:.2g}), seen since {since}"
-
-
-def _row(name: str, row: "pd.Series[Any]") -> tuple[str, ...]:
-    ends = f"{row['ci_low']:.4g} to {row['ci_high']:.4g}"
-    rate = f"{row['percent_a_week_low']:.2g} to {row['percent_a_week_high']:.2g}"
-    numbers = (format_number(float(row[n]), 2) for n in ("p", "scatter", "logs_90"))
-    return name, format_number(row["value"], 4), ends, f"{row['percent_a_week']:.2g}", rate, *numbers, str(row["unit"])
