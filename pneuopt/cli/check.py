@@ -12,7 +12,7 @@ from pneuopt.cli.tolerances import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_SUCCESS
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check, finding_line
-from pneuopt.identification.mending import mend_findings
+from pneuopt.identification.examination import mend_findings
 from pneuopt.identification.problem import as_estimation_model, check_logs
 from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiment import Experiment

@@ -3,10 +3,10 @@
 How an identification starts from logs, what is wrong with logs, where the plant rests, which hardware cannot exist, and
 the limits beyond which the equations no longer hold (end stops, a vacuum).
 
-Which motion a log must show for a model's parameters to be identifiable: models declare it (`System.excitation`).
+Which motion a log must show for a model's parameters to be identifiable (`System.identification_hints`).
 
 Names are those of parameters. A part of a plant uses its own ("viscous") for its own parameters and whole ones
-("load.force") for those of other parts; `Excitation.with_prefix` turns the first into the second.
+("load.force") for those of other parts; `IdentificationHints.with_prefix` turns the first into the second.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -315,8 +315,8 @@ class Width:
 
 
 @dataclass(frozen=True)
-class Excitation:
-    """Which motion a model's parameters need in a log, and the runs that separate its parameters.
+class IdentificationHints:
+    """What a model tells an identification: the motion its parameters need in a log, and the runs that separate them.
 
     Parameters
     ----------
@@ -333,13 +333,13 @@ class Excitation:
     widths: tuple[Width, ...] = ()
     at_least: Mapping[str, str] = field(default_factory=dict)
 
-    def __or__(self, other: "Excitation") -> "Excitation":
+    def __or__(self, other: "IdentificationHints") -> "IdentificationHints":
         known = {w.name for w in self.widths}
         widths = self.widths + tuple(w for w in other.widths if w.name not in known)
         at_least = {**self.at_least, **other.at_least}
-        return Excitation({**self.needs, **other.needs}, self.runs + other.runs, widths, at_least)
+        return IdentificationHints({**self.needs, **other.needs}, self.runs + other.runs, widths, at_least)
 
-    def with_prefix(self, prefix: str) -> "Excitation":
+    def with_prefix(self, prefix: str) -> "IdentificationHints":
         """Put `prefix.` before the names of a part's own parameters: "viscous" becomes "friction.viscous"."""
 
         def own(name: str) -> str:
@@ -351,4 +351,4 @@ class Excitation:
         needs = {f"{prefix}.{n}": replace(e, confused_with=whole(e.confused_with)) for n, e in self.needs.items()}
         runs = tuple(replace(r, some=whole(r.some), others=whole(r.others)) for r in self.runs)
         widths = tuple(Width(own(w.name), w.factor, tuple(map(own, w.follows)), own(w.hides)) for w in self.widths)
-        return Excitation(needs, runs, widths, {own(n): own(m) for n, m in self.at_least.items()})
+        return IdentificationHints(needs, runs, widths, {own(n): own(m) for n, m in self.at_least.items()})

@@ -16,8 +16,8 @@ import numpy as np
 from pneuopt.dynamics.compiled.rollout import Pieces
 from pneuopt.dynamics.hooks import (
     Axis,
-    Excitation,
     HardwareCheckHook,
+    IdentificationHints,
     Log,
     LogWarningHook,
     RestHook,
@@ -74,7 +74,7 @@ class System:
     meter : casadi.Function, optional
         ``(t, x, u, p) -> (...)``: what the plant consumes, a named output for each channel, "power" [W] say. They are
         no outputs of the system, as no log holds them.
-    excitation : Excitation
+    identification_hints : IdentificationHints
         Which motion a log must show for its parameters to be identifiable.
     axis : Axis, optional
         The body that it moves against friction.
@@ -91,7 +91,7 @@ class System:
     validity_limits: tuple[ValidityLimit, ...] = ()
     log_warning_hook: LogWarningHook | None = None
     meter: ca.Function | None = None
-    excitation: Excitation = field(default_factory=Excitation)
+    identification_hints: IdentificationHints = field(default_factory=IdentificationHints)
     axis: Axis | None = None
 
     def __repr__(self) -> str:

@@ -1,12 +1,10 @@
 """`ExperimentDesign`: a planned experiment: what to play, what its log will tell, and what its log has told.
 
-`DOptimal`, `AOptimal`, `Precision`, `WantedPrecision`: what judges a planned experiment, by one number.
-
-A newcomer adds a class like these: the parameters that it is about, and its figure of their covariance. Source:
-Atkinson, Donev, Tobias, Optimum Experimental Designs, with SAS, 2007, chapter 10.
+`DOptimal`, `AOptimal`, `Precision`, `WantedPrecision` judge a plan by one number (Atkinson, Donev, Tobias, Optimum
+Experimental Designs, with SAS, 2007, chapter 10). A newcomer adds a class like these: the parameters that it is about,
+and its figure of their covariance.
 
 `linked_information`: what a log that is cut into linked segments tells about parameters, once it is identified.
-
 `identify` weighs the gaps between segments as if the states jumped there a little, and its covariance is the sandwich
 B^-1 M B^-1 (`Equations.covariance`): B is the Gram matrix of data and gaps with the nodes eliminated, M that of the
 data alone with the nodes where B puts them, since true gaps carry no noise. Its inverse B M^-1 B is the information
@@ -26,7 +24,6 @@ import numpy as np
 from pneuopt.experiments.tolerances import (
     LARGEST,
     REACHED_ROOM,
-    SHOWN_BLOCKS,
     SINGULAR,
     STATE_RIDGE,
     UNINFORMED,
@@ -213,13 +210,13 @@ class ExperimentDesign(Result):
         heads = number_columns("value", "95 % now", "95 % after", "narrower")
         return Table((*text_columns("parameter"), *heads, *text_columns("unit", "")), tuple(rows))
 
-    def _steps(self) -> list[Line]:
+    def _steps(self, shown: int = 8) -> list[Line]:
         start = write_value(self.stats["origin"], self.units[self.channel], 4)
         out = [Line(f"{self.channel} begins at {start}; about that, each block as long as the others:")]
         for k, blocks in enumerate(self.blocks, 1):
             lead = f"run {k}: " if len(self.blocks) > 1 else ""
-            more = f"; and {len(blocks) - SHOWN_BLOCKS} more" if len(blocks) > SHOWN_BLOCKS else ""
-            out.append(Line(lead + "; ".join(blocks[:SHOWN_BLOCKS]) + more, indent=2))
+            more = f"; and {len(blocks) - shown} more" if len(blocks) > shown else ""
+            out.append(Line(lead + "; ".join(blocks[:shown]) + more, indent=2))
         return out
 
 
@@ -403,18 +400,11 @@ class WantedPrecision:
 
 
 def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int = 0) -> Array:
-    """The information of linked segments about parameters, as the estimates of `identify` have it; shape (m, k, k).
+    """The information (m, k, k) of m logs' linked segments about parameters, as the estimates of `identify` have it.
 
-    Parameters
-    ----------
-    grams : ndarray, shape (m, count, n + w, n + w)
-        Of m logs and their segments: the data's Gram matrices about start state and parameters, in unit noise.
-    ends : ndarray, shape (m, count, n, n + w)
-        Derivatives of each segment's end state by the same.
-    jumps : ndarray, shape (n,)
-        Standard deviations that the gaps are weighed with. States and jumps are in nominal sizes.
-    eliminated : int
-        So many parameters, the first ones, are each log's own; k are the others.
+    By the Gram matrices of each segment about its start state and w parameters, in unit noise, the derivatives of its
+    end state by the same, and the standard deviations of the gaps; the first `eliminated` parameters are each log's
+    own.
     """
     m, count, n, width = ends.shape
     gaps, follows = _gap_information(ends[:, :-1], 1 / jumps**2), list[Array]()
@@ -424,7 +414,7 @@ def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int 
         follows.append(response)
         found = ahead + grams[:, j + 1]
     last = n + eliminated
-    response = _respond(found, last)
+    response = -_scaled_inverse(found[:, :last, :last], SINGULAR) @ found[:, :last, last:]
     bread = found[:, last:, last:] + np.swapaxes(found[:, :last, last:], 1, 2) @ response
     k = width - last
     parameters = np.concatenate([response[:, n:], np.broadcast_to(np.eye(k), (m, k, k))], axis=1)
@@ -460,11 +450,6 @@ def _advance(information: Array, gap: Array, n: int) -> tuple[Array, Array]:
     mixed[:, :, n:] += information[:, :n, n:]
     response = np.asarray(-np.linalg.solve(gap[:, :n, :n] + information[:, :n, :n], mixed), dtype=np.float64)
     return _symmetric(out + np.swapaxes(mixed, 1, 2) @ response), response
-
-
-def _respond(information: Array, count: int) -> Array:
-    """How the first `count` unknowns follow the others, shape (m, count, k - count)."""
-    return -_scaled_inverse(information[:, :count, :count], SINGULAR) @ information[:, :count, count:]
 
 
 def _scaled_inverse(information: Array, smallest: float) -> Array:

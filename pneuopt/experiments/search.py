@@ -3,13 +3,10 @@
 A short run is simulated in a fraction of the time: the search also begins with a quarter of the duration, whose
 information counts four times. Where that does better, it is refined, played twice in a row, and refined again.
 
-`Block`: a stretch of a planned excitation, a wave about a level; excitations are blocks one behind the other.
-
-`PlannedRun`: candidates of an experiment, simulated many at once in SIMD lanes; their limits and their information.
-
-The information about the parameters is that of the log that the run would leave: the plant's command and its measured
-outputs. So a loop only makes the run; it is the plant that is identified, along short segments whose sensitivities are
-chained, the start state eliminated, as `identify` does.
+A `Block` is a stretch of a planned excitation, a wave about a level. A `PlannedRun` simulates many candidates at once
+in SIMD lanes, with their limits and their information: that of the log that the run would leave, the plant's command
+and its measured outputs. So a loop only makes the run; it is the plant that is identified, along short segments whose
+sensitivities are chained, the start state eliminated, as `identify` does.
 """
 
 import itertools
@@ -130,17 +127,7 @@ def join_blocks(blocks: Sequence[Block], t: Array) -> Array:
 
 
 def library(amplitude: float, duration: float, sample_time: float) -> list[Block]:
-    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps.
-
-    Parameters
-    ----------
-    amplitude : float
-        The largest [unit of the excitation].
-    duration : float
-        Of a block [s].
-    sample_time : float
-        [s]
-    """
+    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps."""
     fastest = max(CYCLES_A_SAMPLE / sample_time, 2 / duration)
     sizes = amplitude * np.geomspace(LEAST_AMPLITUDE, 1.0, AMPLITUDES)
     paces = np.geomspace(1 / duration, fastest, FREQUENCIES)
@@ -149,18 +136,7 @@ def library(amplitude: float, duration: float, sample_time: float) -> list[Block
 
 
 def vary(block: Block, rng: np.random.Generator, spread: float, amplitude: float, ends: tuple[float, float]) -> Block:
-    """A block near another one, its numbers moved by about `spread` of themselves, its level by that of the range.
-
-    Parameters
-    ----------
-    block : Block
-    rng : numpy.random.Generator
-    spread : float
-    amplitude : float
-        The largest [unit of the excitation].
-    ends : (float, float)
-        Lowest and highest frequency [Hz].
-    """
+    """A block near another one, its numbers moved by about `spread` of themselves, its level by that of the range."""
     size, pace, shift = rng.standard_normal(3) * spread
     level = block.level + shift * amplitude * 0.3 if rng.random() < 0.5 else block.level
     wave = list(Wave)[rng.integers(len(Wave))] if rng.random() < 0.15 else block.wave
@@ -183,19 +159,6 @@ def vary_run(
     """A run near another one: mostly with one block changed, else with all, with one exchanged, copied or moved.
 
     Small changes alone stay where the exchange of separate blocks began: what a block tells depends on its neighbours.
-
-    Parameters
-    ----------
-    run : sequence of Block
-    rng : numpy.random.Generator
-    spread : float
-        As for `vary`.
-    reach : (float, float)
-        How far the excitation may go down and up from the start [its unit].
-    ends : (float, float)
-        Lowest and highest frequency [Hz].
-    fresh : sequence of Block
-        Blocks that one may be exchanged for, at any level.
     """
     changed, amplitude = list(run), max(abs(v) for v in reach)
     k, j = (int(n) for n in rng.integers(len(run), size=2))
@@ -219,37 +182,17 @@ Limits = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """The plant, or the loop that moves it, as a planned experiment runs it.
-
-    Attributes
-    ----------
-    plant : System
-    loop : ClosedLoop or None
-    free : tuple of str
-        Parameters of the plant whose information counts.
-    per_log : tuple of str
-        Free ones that each log has for itself, which are eliminated.
-    noise : mapping of str to float
-        Of the outputs that will be logged [unit].
-    limits : mapping of str to (float, float)
-        Of outputs, states, the command or the reference.
-    sample_time : float
-        [s]
-    start : mapping of str to float
-        Outputs at the rest from which each run begins.
-    origin : float
-        The excitation there [its unit].
-    """
+    """The plant, or the loop that moves it, as a planned experiment runs it."""
 
     plant: System
     loop: ClosedLoop | None
-    free: tuple[str, ...]
-    per_log: tuple[str, ...]
-    noise: Mapping[str, float]
-    limits: Limits
-    sample_time: float
-    start: Mapping[str, float]
-    origin: float = 0.0
+    free: tuple[str, ...]  # parameters of the plant whose information counts
+    per_log: tuple[str, ...]  # free ones that each log has for itself, which are eliminated
+    noise: Mapping[str, float]  # of the outputs that will be logged [unit]
+    limits: Limits  # of outputs, states, the command or the reference
+    sample_time: float  # [s]
+    start: Mapping[str, float]  # outputs at the rest from which each run begins
+    origin: float = 0.0  # the excitation there [its unit]
 
     @cached_property
     def command(self) -> Quantity:
@@ -258,8 +201,8 @@ class PlannedRun:
         return self.plant.inputs[0]
 
     @cached_property
-    def excitation(self) -> Quantity:
-        """What the excitation is: the loop's reference as logs name it, or the plant's command."""
+    def excited_quantity(self) -> Quantity:
+        """What is excited: the loop's reference as logs name it, or the plant's command."""
         if self.loop is None:
             return self.command
         seen = self.loop.feedback
@@ -269,7 +212,7 @@ class PlannedRun:
     @property
     def channels(self) -> tuple[Quantity, ...]:
         """What a run shows: the excitation, the command, the plant's outputs, then states that are no outputs."""
-        shown = [self.excitation, self.command, *self.plant.outputs, *self.plant.states]
+        shown = [self.excited_quantity, self.command, *self.plant.outputs, *self.plant.states]
         return tuple({q.name: q for q in reversed(shown)}[n] for n in dict.fromkeys(names(shown)))
 
     def rest_excitation(self, parameters: ParameterSet) -> float:
@@ -281,7 +224,7 @@ class PlannedRun:
 
     def excited_limits(self) -> tuple[float, float]:
         """The range of the excitation; a reference has that of its output if none of its own."""
-        name = self.excitation.name
+        name = self.excited_quantity.name
         given = [n for n in (name, self.loop.feedback.name if self.loop else name) if n in self.limits]
         ends = self.limits[given[0]] if given else (-math.inf, math.inf)
         finite = math.isfinite(ends[0]) and math.isfinite(ends[1])
@@ -305,16 +248,12 @@ class PlannedRun:
         for u in np.split(given, range(size, m, size)):
             run = self._run.run(np.tile(x0, (len(u), 1)), u, p, t, h, substeps=substeps, states=1)
             assert run.x is not None
-            parts.append(self._gather(u, run.y, run.x))
+            held = run.y[:, :, -1:] if self.loop is not None else u
+            columns = {self.excited_quantity.name: u[..., 0], self.command.name: held[..., 0]}
+            columns |= {s: run.x[:, :, i] for i, s in enumerate(names(self.plant.states))}
+            columns |= {y: run.y[:, :, i] for i, y in enumerate(names(self.plant.outputs))}
+            parts.append(np.stack([columns[q.name] for q in self.channels], axis=2))
         return np.concatenate(parts)
-
-    def _gather(self, u: Array, y: Array, x: Array) -> Array:
-        """The channels of a run, in their order."""
-        held = y[:, :, -1:] if self.loop is not None else u
-        columns = {self.excitation.name: u[..., 0], self.command.name: held[..., 0]}
-        columns |= {n: x[:, :, i] for i, n in enumerate(names(self.plant.states))}
-        columns |= {n: y[:, :, i] for i, n in enumerate(names(self.plant.outputs))}
-        return np.stack([columns[q.name] for q in self.channels], axis=2)
 
     def violations(self, runs: Array, parameters: ParameterSet) -> Mapping[str, Array]:
         """How far each run leaves each limit, as a share of its width, shape (m,); below zero: the room left."""
@@ -363,9 +302,11 @@ class PlannedRun:
         grams = found.grams[:, :-1, :-1].reshape(m, count, *found.grams[0, :-1, :-1].shape)
         ends = found.dx_end.reshape(m, count, *found.dx_end.shape[1:])
         good = np.isfinite(grams).all(axis=(1, 2, 3)) & np.isfinite(ends).all(axis=(1, 2, 3))
-        own = self._parameter_sizes(parameters)
+        known = self.plant.parameters | parameters  # by whose sizes numbers of all units meet in one matrix
+        own = np.array([abs(known.value(n)) or 1.0 for n in (*self.per_log, *self.free)])
         nominal = np.array([q.nominal for q in self.plant.states])
-        scale, jumps = np.concatenate([nominal, own]), method.stages[-1].gap * self._jumps(parameters)
+        scale = np.concatenate([nominal, own])
+        jumps = method.stages[-1].gap * gap_scales(self._segments_about_rest(parameters), LeastSquares().kinematic)
         out = np.zeros((m, len(self.free), len(self.free)))
         kept = own[len(self.per_log) :]
         given = grams[good] * np.outer(scale, scale), ends[good] * scale / nominal[:, None]
@@ -380,10 +321,6 @@ class PlannedRun:
         q = np.array([v.value for v in segments.transcription.parameters.values()])
         return max(MIN_SUBSTEPS, 2 * stable_substeps(segments, start_nodes(segments), q, RK4_MAX_H_LAMBDA))
 
-    def _jumps(self, parameters: ParameterSet) -> Array:
-        """The size of each state's jump at a node beside the others': smaller where kinematics give its rate."""
-        return np.asarray(gap_scales(self._segments_about_rest(parameters), LeastSquares().kinematic))
-
     def _segments_about_rest(self, parameters: ParameterSet) -> Segments:
         x = self.plant.rest_state(self.plant.parameters | parameters, self.start)
         usual = np.diag([q.nominal for q in self.plant.states])
@@ -393,11 +330,6 @@ class PlannedRun:
         phase = Phase("rest", t, h, np.zeros((n, 1)), np.arange(n), guess=guess)
         known = self.plant.parameters | parameters.select(q for q in parameters if q in self.plant.parameters)
         return segment(Transcription(self.plant.discrete(), known, (phase,)))
-
-    def _parameter_sizes(self, parameters: ParameterSet) -> Array:
-        """By which the parameters are scaled, so that numbers of all units meet in one matrix."""
-        known = self.plant.parameters | parameters
-        return np.array([abs(known.value(n)) or 1.0 for n in (*self.per_log, *self.free)])
 
     @cached_property
     def _run(self) -> Rollout:
@@ -478,13 +410,13 @@ class DesignSearch:
         runs = tuple(Trajectory(self._grid, dict(zip(channels, r.T, strict=True))) for r in shown)
         table = tabulate_design(nominal, self.run.free, self.judge.targets, self.known, gained)
         origin = self.run.origin
-        steps = tuple(tuple(b.describe(self.run.excitation.unit) for b in blocks) for blocks in chosen)
+        steps = tuple(tuple(b.describe(self.run.excited_quantity.unit) for b in blocks) for blocks in chosen)
         units, tried = {q.name: q.unit for q in self.run.channels}, sum(s.tried for s in (self, *self._parts.values()))
         before, after = (float(self.judge.deviation(f[None])) for f in (self.known, self.known + gained))
         figures = {"before": before, "after": after, "tried": float(tried), "origin": origin}
         figures |= {"plants": float(len(self.plants)), "cpu_seconds": self.budget.seconds}
         return ExperimentDesign(
-            self.run.excitation.name,
+            self.run.excited_quantity.name,
             runs,
             steps,
             table,
@@ -541,16 +473,11 @@ class DesignSearch:
         origin = self.run.origin
         return low - origin, high - origin
 
-    @property
-    def _amplitude(self) -> float:
-        """The largest amplitude."""
-        return max(abs(v) for v in self._reach)
-
     @cached_property
     def _waves(self) -> list[Block]:
         """Blocks of every kind."""
         t = self._grid[: self.samples // self._blocks]
-        return library(self._amplitude, float(t[-1]) or self.run.sample_time, self.run.sample_time)
+        return library(max(abs(v) for v in self._reach), float(t[-1]) or self.run.sample_time, self.run.sample_time)
 
     def _choose_blocks(self) -> list[list[Block]]:
         """The blocks of all runs by exchange: their information adds up."""
@@ -577,14 +504,14 @@ class DesignSearch:
 
     def _fit_into_limits(self, runs: list[list[Block]]) -> list[list[Block]]:
         """The blocks of each run in a row, all made smaller until the whole run keeps the limits."""
-        return [self._shrink(blocks) for blocks in runs]
-
-    def _shrink(self, blocks: list[Block]) -> list[Block]:
-        sizes = np.geomspace(1.0, 1e-3, 25)
-        rows = [[replace(b, amplitude=b.amplitude * size) for b in blocks] for size in sizes.tolist()]
-        _, keeps = self._evaluate(np.stack([self._signal(row) for row in rows]))
-        require(bool(keeps.any()), "the blocks of a run, one behind the other, keep no limits; plan a shorter duration")
-        return rows[int(np.argmax(keeps))]
+        message, fitted = "the blocks of a run, one behind the other, keep no limits; plan a shorter duration", []
+        for blocks in runs:
+            sizes = np.geomspace(1.0, 1e-3, 25).tolist()
+            rows = [[replace(b, amplitude=b.amplitude * size) for b in blocks] for size in sizes]
+            _, keeps = self._evaluate(np.stack([self._signal(row) for row in rows]))
+            require(bool(keeps.any()), message)
+            fitted.append(rows[int(np.argmax(keeps))])
+        return fitted
 
     def _figure(self, runs: list[list[Block]]) -> float:
         """The criterion after these runs."""

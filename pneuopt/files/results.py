@@ -34,7 +34,7 @@ def load_result(path: str | Path) -> Any:
     -------
     IdentificationResult, TuningResult or another
         Of the class that was saved, with the same numbers to the last digit. What a model needs of a log's motion
-        (`Verdict.excitation.needs`) is not in it.
+        (`Verdict.identification_hints.needs`) is not in it.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """From logs to parameters with confidence intervals, and what logs cannot identify.
 
-The estimation problem, its multi-start, robust losses, review of the residuals, model selection, profiles. `studies`,
-`files`, `plotting` and `cli` may import it; it never imports `models` or `tuning`. A newcomer adds a robust loss in
-`losses`, or a check of the logs in `checks`.
+`problem` poses it, `search` and `windows` solve it, `misfit`, `profiles` and `review` judge the estimates; `identify`
+is the whole way. `experiments`, `studies`, `files`, `plotting`, `report` and `cli` may import it; it never imports
+`models` or `tuning`. A newcomer adds a robust loss in `losses`. Read `identify` first.
 """

@@ -19,10 +19,10 @@ from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.identification.examination import (
     QUIET_CHECKS,
     accept_remedy,
+    axis_from_model,
     find_exchange,
     is_accepted,
     is_refused,
-    stated_axis,
 )
 from pneuopt.identification.identifiability import verdict_from_sensitivities
 from pneuopt.identification.problem import (
@@ -38,12 +38,12 @@ from pneuopt.identification.problem import (
     outputs_in_log,
 )
 from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, Verdict
-from pneuopt.identification.tolerances import MAX_PERCENT, MIN_PERCENT
+from pneuopt.identification.tolerances import MIN_PERCENT
 from pneuopt.logs.doctor import LogFinding, Severity, evidence, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise
 from pneuopt.quantities.errors import ModelError, PhysicsWarning
-from pneuopt.quantities.parameters import Parameter, ParameterSet, check_parameters
+from pneuopt.quantities.parameters import ParameterSet, check_parameters
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, text_columns
 from pneuopt.quantities.results import Shown
 from pneuopt.quantities.units import ATMOSPHERE, write_value
@@ -91,21 +91,7 @@ class Assumption:
 def list_assumptions(
     system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
 ) -> tuple[Assumption, ...]:
-    """The noise, the behaviour between samples and the fixed parameters that nobody has stated.
-
-    Parameters
-    ----------
-    system : Fittable
-    given, checked : sequence of Experiment
-        The logs as read, and as `check_logs` returns them, with all noise levels.
-    parameters : ParameterSet
-        As the user gives them; what is free is no assumption.
-
-    Returns
-    -------
-    tuple of Assumption
-        The logs' first.
-    """
+    """The noise, the behaviour between samples and the fixed parameters that nobody has stated."""
     logs = (*_noise_levels(system, given, checked), *_behaviour(system, given), *_gauge_zero(system, given))
     return (*logs, *_defaults(system.parameters, parameters))
 
@@ -150,13 +136,10 @@ def _defaults(defaults: ParameterSet, given: ParameterSet) -> Iterator[Assumptio
         if used.free or used.stated or used != usual:
             continue
         section, _, key = name.partition(".")
-        yield Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, _reason(used))
-
-
-def _reason(p: Parameter) -> str:
-    if p.source == DEFAULT_WIDTH:
-        return f"{p.meaning}; identify chooses it by the logs"
-    return f"{p.meaning} ({p.source})" if p.source else p.meaning
+        reason = f"{used.meaning} ({used.source})" if used.source else used.meaning
+        if used.source == DEFAULT_WIDTH:
+            reason = f"{used.meaning}; identify chooses it by the logs"
+        yield Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason)
 
 
 MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
@@ -289,37 +272,21 @@ def check(
     check_parameters(parameters)
     logs = check_logs(model, given, parameters)
     assumptions = list_assumptions(model, given, logs, parameters)
-    parameters, found = _find_centre(model, logs, parameters)
-    found += [f for log in logs for f in examine(log, stated_axis(model.plant, log, parameters))]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", PhysicsWarning)
+        parameters = find_centre(model, logs, parameters)
+    found = [_model_finding(str(w.message), logs) for w in said]
+    found += [f for log in logs for f in examine(log, axis_from_model(model.plant, log, parameters))]
     found += [f for log in logs for f in _exchange_findings(model, log, parameters, found)]
-    found += [*_model_findings(model, logs, parameters), *_log_findings(model, given, logs), *_free(logs, parameters)]
+    found += [_model_finding(sentence, logs) for sentence in find_log_warnings(model, logs, parameters)]
+    found += [*_log_findings(model, given, logs), *_free(logs, parameters)]
     ranked = sorted(
         (_locate(_rank(f, found, logs), logs) for f in found), key=lambda f: list(Severity).index(f.severity)
     )
     is_open = any(f.severity is Severity.FAULT for f in ranked)
-    verdict = None if is_open else _find_verdict(model, logs, parameters)
-    return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
-
-
-def _find_verdict(model: Fittable, logs: Sequence[Experiment], parameters: ParameterSet) -> Verdict:
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
-    return verdict_from_sensitivities(problem, problem.candidates()[0])
-
-
-def _find_centre(
-    model: Fittable, logs: Sequence[Experiment], parameters: ParameterSet
-) -> tuple[ParameterSet, list[LogFinding]]:
-    """The parameters with the valve's centre, and what is to be said of it."""
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", PhysicsWarning)
-        parameters = find_centre(model, logs, parameters)
-    return parameters, [_model_finding(str(w.message), logs) for w in said]
-
-
-def _model_findings(model: Fittable, logs: Sequence[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:
-    """What only the equations see: a gauge pressure read as absolute, a sensor before the line."""
-    for sentence in find_log_warnings(model, logs, parameters):
-        yield _model_finding(sentence, logs)
+    verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates()[0])
+    return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
 
 
 def _model_finding(sentence: str, logs: Sequence[Experiment]) -> LogFinding:
@@ -509,6 +476,6 @@ def _deviation(value: float, relative: float, stderr: float, unit: str) -> str:
     share = 100 * (relative if math.isfinite(relative) else stderr / abs(value) if value else math.inf)
     if share < MIN_PERCENT:
         return f"+-{MIN_PERCENT} % or better"
-    if math.isfinite(relative) and share < MAX_PERCENT:
+    if math.isfinite(relative) and share < 100:
         return f"+-{share:.2g} %"
     return f"+-{write_value(stderr, unit, 2)}" if math.isfinite(stderr) else "not computed"

@@ -13,7 +13,7 @@ from pneuopt.identification.identify import identify
 from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.problem import as_estimation_model, as_experiments, check_logs
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.identification.tolerances import DISAGREEMENT_DEVIATIONS, MIN_RELATIVE_DIFFERENCE
+from pneuopt.identification.tolerances import CLEAR_DEVIATIONS, MIN_RELATIVE_DIFFERENCE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -141,7 +141,7 @@ def _inverse_variance_mean(estimates: Sequence[tuple[float, float]]) -> tuple[fl
 
 def _disagreements(table: "pd.DataFrame") -> "pd.DataFrame":
     """The rows of estimates that disagree, the worst first."""
-    far = (table["deviation"].abs() > DISAGREEMENT_DEVIATIONS) & (
+    far = (table["deviation"].abs() > CLEAR_DEVIATIONS) & (
         (table["value"] - table["others"]).abs() > MIN_RELATIVE_DIFFERENCE * table["others"].abs()
     )
     return table[far].sort_values("deviation", key=abs, ascending=False)

@@ -1,14 +1,12 @@
 """`examine_logs`: what the log doctor finds in logs of a plant; `check_content` refuses logs for it.
 
-`pose_problem` makes the estimation problem of logs that pass.
-
-`stated_axis`: what a plant and its parameters say of the axis that a log is of, for the log doctor.
-
-`find_exchange`: two channels of a log whose columns are exchanged, by trying.
+Below: `pose_problem` of logs that pass, what plant and parameters say of the axis (`axis_from_model`), exchanged
+columns (`find_exchange`), and `mend_findings`, which mends a fault where a rule is certain and the fault is gone then.
+A newcomer adds a rule: ``rule(mended, finding, ambient) -> MendedLog | None`` and its row in `RULES`.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -29,8 +27,9 @@ from pneuopt.identification.problem import (
 from pneuopt.identification.tolerances import CHANGE, MIN_FORCE_SHARE, MIN_STOP_FORCE, STOP_DEPTH
 from pneuopt.logs.doctor import PISTON, LogFinding, StatedAxis, examine
 from pneuopt.logs.experiment import Experiment
+from pneuopt.logs.mending import MendedLog, convert, empty_cells, leave_out
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import InputError, LogError
+from pneuopt.quantities.errors import InputError, LogError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import LeastSquares
 
@@ -70,13 +69,7 @@ def pose_problem(
     parameters: ParameterSet,
     method: LeastSquares,
 ) -> EstimationProblem:
-    """The estimation problem of logs that `identify` accepts, before any width is chosen.
-
-    Raises
-    ------
-    InputError
-        If logs, system and parameters do not fit together.
-    """
+    """The estimation problem of logs that `identify` accepts, before any width is chosen."""
     model = as_estimation_model(system)
     logs = check_logs(model, experiments, parameters)
     parameters = find_centre(model, logs, parameters)
@@ -86,17 +79,9 @@ def pose_problem(
 
 
 def check_content(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
-    """Refuse logs of which more than half show the same fault; a window of a good log may well stand still.
+    """Refuse logs of which more than half show the same fault; return a sentence on each accepted fault and each doubt.
 
-    Returns
-    -------
-    tuple of str
-        A sentence for each fault that the logs accept by name, and for each doubt.
-
-    Raises
-    ------
-    LogError
-        With the finding and its evidence.
+    A window of a good log may well stand still.
     """
     found, said = list(_find(system, experiments, parameters)), dict[str, str]()
     for finding in found:
@@ -128,24 +113,11 @@ def accept_remedy(finding: LogFinding) -> str:
 
 def _find(system: Fittable, experiments: Iterable[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:
     for experiment in experiments:
-        yield from examine(experiment, stated_axis(system.plant, experiment, parameters))
+        yield from examine(experiment, axis_from_model(system.plant, experiment, parameters))
 
 
-def stated_axis(plant: System, experiment: Experiment, parameters: ParameterSet) -> StatedAxis:
-    """The channels of the plant's axis, and the forces on it; a piston's channels if the plant declares none.
-
-    Parameters
-    ----------
-    plant : System
-    experiment : Experiment
-        Its conditions override parameters.
-    parameters : ParameterSet
-        What is free in it is not stated.
-
-    Returns
-    -------
-    StatedAxis
-    """
+def axis_from_model(plant: System, experiment: Experiment, parameters: ParameterSet) -> StatedAxis:
+    """The channels of the plant's axis and the forces on it that are not free; a piston's by default."""
     if plant.axis is None:
         return PISTON._replace(forces={})
     known = plant.parameters | parameters.select(n for n in parameters if n in plant.parameters)
@@ -245,15 +217,7 @@ class _Body:
 
 
 def find_exchange(model: Fittable, log: Experiment, parameters: ParameterSet) -> tuple[str, str] | None:
-    """Two channels with which exchanged the log doctor finds no fault; None where there is no such pair, or several.
-
-    Parameters
-    ----------
-    model : Fittable
-    log : Experiment
-    parameters : ParameterSet
-        As for `identify`.
-    """
+    """Two channels with which exchanged the log doctor finds no fault; None where there is no such pair, or several."""
     pairs = [pair for pair in combinations(log.trajectory, 2) if _is_right(model, exchange(log, *pair), parameters)]
     return pairs[0] if len(pairs) == 1 else None
 
@@ -274,4 +238,89 @@ def _is_right(model: Fittable, log: Experiment, parameters: ParameterSet) -> boo
         (full,) = check_logs(model, log, parameters)
     except InputError:
         return False
-    return not any(f.fault for f in examine(full, stated_axis(model.plant, full, parameters)))
+    return not any(f.fault for f in examine(full, axis_from_model(model.plant, full, parameters)))
+
+
+Rule = Callable[[MendedLog, LogFinding, float], MendedLog | None]
+
+
+def mend_findings(model: Fittable, mended: MendedLog, parameters: ParameterSet, ambient: float) -> MendedLog:
+    """Mend the faults of a log for which there is a rule; a rule after which the fault is still found is taken back.
+
+    Gauge pressures count from `ambient` [Pa]. Where motion and force are both wrong nobody can tell what is right:
+    `LogError`.
+    """
+    several = len({f.channel for f in _find_faults(model, mended.log, parameters)}) > 1
+    pair = find_exchange(model, mended.log, parameters) if several else None
+    if pair is not None:
+        why = f"columns of {pair[0]} and {pair[1]} exchanged, for with them so nothing is wrong"
+        return MendedLog(exchange(mended.log, *pair), mended.rows, (*mended.changes, why))
+    tried, used = set[tuple[str, str]](), set[str]()
+    while True:
+        found = [f for f in _find_faults(model, mended.log, parameters) if _key(f) not in tried and f.check in RULES]
+        if not found:
+            break
+        tried.add(_key(found[0]))
+        changed = RULES[found[0].check](mended, found[0], ambient)
+        if changed and _key(found[0]) not in {_key(f) for f in _find_faults(model, changed.log, parameters)}:
+            mended = changed
+            used.add(found[0].check)
+    both = "the signs or sizes of two channels are wrong at once: is a column another channel? say in [columns] which"
+    require(not used >= {"work", "scale"}, f"{mended.log.name}: {both}", LogError)
+    return mended
+
+
+def _key(finding: LogFinding) -> tuple[str, str]:
+    return finding.check, finding.channel
+
+
+def _find_faults(model: Fittable, log: Experiment, parameters: ParameterSet) -> list[LogFinding]:
+    (full,) = check_logs(model, log, parameters)
+    found = examine(full, axis_from_model(model.plant, full, parameters))
+    return [f for f in found if f.fault and not is_accepted(f, [full])]
+
+
+def _between_jumps(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
+    """A counter that loses steps and finds them again: nothing is known of the position in between."""
+    if finding.evidence is None:
+        return None
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], finding.evidence.contradiction, [False]]).astype(int)))
+    begins, ends = edges[::2] + 1, edges[1::2] - 1  # first sample behind a jump, last sample of its mark
+    if begins.size % 2:
+        return None
+    lost = np.zeros(len(mended.log.trajectory), dtype=bool)
+    for begin, end in zip(begins[::2], ends[1::2], strict=True):
+        lost[begin:end] = True
+    return empty_cells(mended, finding.channel, lost, "between two jumps")
+
+
+def _at_stop(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
+    lost = None if finding.evidence is None else finding.evidence.contradiction
+    return None if lost is None else leave_out(mended, lost, "at an end stop that the model has not")
+
+
+def _turn_sign(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
+    """Of a force that brakes on balance; of two pressures, nobody knows which sensor is meant."""
+    if finding.channel not in mended.log.trajectory:
+        return None
+    return convert(mended, finding.channel, -1.0, 0.0, "for it brakes the motion on balance")
+
+
+def _to_metres(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
+    return convert(mended, finding.channel, 1e-3, 0.0, "for it moves as fast as mm that are read as m")
+
+
+def _to_absolute(mended: MendedLog, finding: LogFinding, ambient: float) -> MendedLog | None:
+    if "a vacuum" not in finding.message:
+        return None
+    return convert(mended, finding.channel, 1.0, ambient, "for it is a gauge pressure that is read as absolute")
+
+
+RULES: dict[str, Rule] = {
+    "jumps": _between_jumps,
+    "stops": _at_stop,
+    "work": _turn_sign,
+    "scale": _to_metres,
+    "pressures": _to_absolute,
+}
+"""By the name of the check."""

@@ -30,15 +30,14 @@ from pneuopt.identification.result import (
 from pneuopt.identification.tolerances import (
     HARMLESS_DEVIATION,
     INFORMATION_ROUNDING,
+    LEVEL,
     MAX_EXPECTED_DEVIATION,
     MAX_INFLATION,
-    MAX_INVERSE_SINGULAR,
     MAX_PRIOR_DEVIATION,
     MAX_PRIOR_VARIANCE_SHARE,
     MAX_REDUCTION_SEGMENTS,
     MAX_RELATIVE_DEVIATION,
     MIN_COMBINATION_SHARE,
-    REJECTION_CONFIDENCE,
     UNIDENTIFIABLE_DEVIATION,
 )
 from pneuopt.identification.widths import excerpts
@@ -94,31 +93,16 @@ def identifiability(
 
 
 def verdict_from_sensitivities(problem: EstimationProblem, start: Start, variance: float = 1.0) -> Verdict:
-    """The verdict from the sensitivities of the outputs at a start, or at a fit.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    start : Start
-    variance : float
-        Variance of the residuals, in noise variances.
-    """
+    """The verdict from the sensitivities at a start or fit; `variance` of the residuals in noise variances."""
     return _make_verdict(problem, start, _root_information(problem, start) / math.sqrt(variance))
 
 
 def verdict_from_covariance(
     problem: EstimationProblem, fit: Start, covariance: "pd.DataFrame", *, trusted: bool
 ) -> Verdict:
-    """The verdict from the covariance of a fit.
+    """The verdict from the covariance of a fit, NaN at a bound.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Start
-    covariance : DataFrame
-        Of the estimates in their own units; NaN at a bound.
-    trusted : bool
-        Whether the model explains the logs to their noise; its deviations then count whatever motion the logs lack.
+    Where the model explains the logs to their noise (`trusted`) its deviations count whatever motion the logs lack.
     """
     unknowns = problem.unknowns().with_values(fit.parameters)
     chain = np.array([unknowns[str(n)].value if unknowns[str(n)].log else 1.0 for n in covariance.index])
@@ -126,29 +110,22 @@ def verdict_from_covariance(
     keep = np.isfinite(np.diag(searched))
     root = np.zeros_like(searched)
     if keep.any():
-        root[np.ix_(keep, keep)] = _root_of_inverse(searched[np.ix_(keep, keep)])
+        known = searched[np.ix_(keep, keep)]
+        deviation = np.sqrt(np.diag(known))  # by which covariances of any units meet in one matrix
+        values, vectors = np.linalg.eigh(known / np.outer(deviation, deviation))
+        root[np.ix_(keep, keep)] = (vectors / np.sqrt(np.maximum(values, 1e-14))).T / deviation
     return _make_verdict(problem, fit, root, inside_bounds=keep, trusted=trusted)
 
 
 def foresee_unidentifiable(problem: EstimationProblem) -> tuple[str, ...]:
-    """Find what logs cannot identify, before the search: the motion does not show it, and no output depends on it.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-
-    Returns
-    -------
-    tuple of str
-        A sentence with the remedy for the parameters of each reason; empty where the motion shows all, or the outputs
-        of stretches of the logs, at the noise alone, tell what the motion shows too little of.
-    """
+    """Sentences on what logs cannot identify, before the search: motion and outputs show it too little."""
     if not problem.system.states:  # a static map is fitted as soon
         return ()
-    start, free, excitation = problem.candidates()[0], problem.unknowns().free_names, problem.system.plant.excitation
+    start, free = problem.candidates()[0], problem.unknowns().free_names
+    hints = problem.system.plant.identification_hints
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
-    lacking = [n for n in free if missing_excitation(excitation, n, free, seen) is not None]
+    lacking = [n for n in free if missing_excitation(hints, n, free, seen) is not None]
     if not lacking:
         return ()
     part = replace(problem, experiments=excerpts(problem.experiments))
@@ -170,7 +147,7 @@ def add_profiles(verdict: Verdict, profiles: Mapping[str, Profile]) -> Verdict:
         identifiable[name] = bool(identifiable[name]) and not is_unidentifiable
         reasons.pop(name, None)
         if not found.high - found.low < MAX_RELATIVE_INTERVAL * abs(found.estimate):
-            reasons[name] = f"{found.sentence}; {remedy(verdict.excitation, [name])}"
+            reasons[name] = f"{found.sentence}; {remedy(verdict.identification_hints, [name])}"
     return replace(verdict, table=verdict.table.assign(identifiable=identifiable), reasons=reasons)
 
 
@@ -182,45 +159,36 @@ def add_unidentifiable(verdict: Verdict, names: Sequence[str], local: Verdict, u
     groups = tuple(group for group in local.indistinguishable if {*group} & {*names})
     grouped = {n for group in groups for n in group}
     reasons = {n: reason for n, reason in verdict.reasons.items() if n not in names}
-    vague = {n: f"{VAGUER_THAN_PRIOR}; {remedy(verdict.excitation, [n])}" for n in names if n not in grouped}
+    vague = {n: f"{VAGUER_THAN_PRIOR}; {remedy(verdict.identification_hints, [n])}" for n in names if n not in grouped}
     reasons |= {**vague, **{n: local.reasons[n] for n in names if n in local.reasons}}
     ordered = tuple(str(n) for n in table.index if n in unchanged)
-    return Verdict(table, (*verdict.indistinguishable, *groups), reasons, ordered, verdict.excitation)
+    return Verdict(table, (*verdict.indistinguishable, *groups), reasons, ordered, verdict.identification_hints)
 
 
-def rejects_held_values(fit: Fit, first: Fit, held: int) -> bool:
-    """Whether a likelihood-ratio test rejects the values at which `held` parameters are.
+def rejects_fixed_values(fit: Fit, first: Fit, held: int) -> bool:
+    """Whether a likelihood-ratio test rejects the values of `held` parameters that `first` was free in.
 
-    Parameters
-    ----------
-    fit, first : Fit
-        The fits with the parameters held, and before that.
-    held : int
-
-    Returns
-    -------
-    bool
-        A rise of the gaps' cost alone does not count: finer integration steps show gaps that the first fit missed.
+    A rise of the gaps' cost alone does not count: finer integration steps show gaps that the first fit missed.
     """
     before, after = first.stats["cost"], fit.stats["cost"]
     rise = min(2 * (after - before), fit.chi_square - first.chi_square)
     noise = max(1.0, 2 * before / max(1, first.count))
-    return not rise <= noise * chi2.ppf(REJECTION_CONFIDENCE, held)
+    return not rise <= noise * chi2.ppf(LEVEL, held)
 
 
-def leans_on_prior(covariance: Array, prior_covariance: Array) -> Mask:
+def prior_influenced(covariance: Array, prior_covariance: Array) -> Mask:
     """The mask of estimates whose variance the priors of held parameters dominate; covariances of shape (k, k)."""
     return np.asarray(np.diag(prior_covariance) > MAX_PRIOR_VARIANCE_SHARE * np.diag(covariance))
 
 
-def rests_on_prior(covariance: Array, prior_covariance: Array, values: Array, held: Iterable[float]) -> Mask:
+def prior_dominated(covariance: Array, prior_covariance: Array, values: Array, held: Iterable[float]) -> Mask:
     """The mask of estimates that the logs do not identify: they lean on priors, and are not known well even so.
 
     A factor of ten says nothing of what is held at zero, so nothing that leans on it is known.
     """
     is_close = np.sqrt(np.diag(covariance)) <= MAX_PRIOR_DEVIATION * np.abs(values)
     is_close &= all(held)
-    return leans_on_prior(covariance, prior_covariance) & ~is_close
+    return prior_influenced(covariance, prior_covariance) & ~is_close
 
 
 def _make_verdict(
@@ -234,7 +202,7 @@ def _make_verdict(
     names, (spread, alone, weak) = list(free), _standard_deviations(root)
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
-    rows, reasons, excitation = {}, {}, with_values_in_words(problem.system.plant.excitation, values)
+    rows, reasons, hints = {}, {}, with_values_in_words(problem.system.plant.identification_hints, values)
     for i, (name, p) in enumerate(free.items()):
         if inside_bounds is not None and not inside_bounds[i]:
             rows[name] = [p.value, *[math.nan] * 4, True]
@@ -242,20 +210,20 @@ def _make_verdict(
             continue
         unit, size = p.value if p.log else 1.0, 1.0 if p.log else _comparison_size(name, p, problem)
         relative = spread[i] / size if size > 0 else math.nan
-        lack = None if trusted else missing_excitation(excitation, name, names, seen)
+        lack = None if trusted else missing_excitation(hints, name, names, seen)
         is_unidentifiable = (
             lack is not None
             or math.isinf(spread[i])
             or relative > (MAX_EXPECTED_DEVIATION if inside_bounds is None else UNIDENTIFIABLE_DEVIATION)
         )
         if is_unidentifiable or relative > MAX_RELATIVE_DEVIATION:
-            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(excitation, [name]))
+            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(hints, [name]))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=list(IdentifiableRow.__annotations__))
     groups = (tuple(names[i] for i in np.flatnonzero(row)) for row in weak)
     harmful = tuple(group for group in groups if _is_harmful(table.loc[list(group)]))
-    return Verdict(table, harmful, reasons, excitation=excitation)
+    return Verdict(table, harmful, reasons, identification_hints=hints)
 
 
 def _is_harmful(members: "pd.DataFrame") -> bool:
@@ -294,7 +262,7 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
     spread, weak = alone.copy(), np.zeros((0, len(size)), dtype=bool)
     if informed.any():
         _, singular, right = np.linalg.svd(root[:, informed] / size[informed])
-        inverse = 1 / np.maximum(singular, 1 / MAX_INVERSE_SINGULAR)
+        inverse = 1 / np.maximum(singular, INFORMATION_ROUNDING)
         spread[informed] = np.linalg.norm(right * inverse[:, None], axis=0) / size[informed]
         parts = np.abs(right[inverse > MAX_INFLATION])
         member = (
@@ -326,15 +294,10 @@ def _root_information(problem: EstimationProblem, start: Start) -> Array:
     assert run.dx_end is not None
     weighted = np.where(np.isfinite(segments.measured)[..., None], run.dy / segments.noise[..., None], 0.0)
     roots = [np.zeros((0, len(chain)))]
-    for first, last in _log_chains(segments):
+    ends = (np.flatnonzero(~segments.linked) + 1).tolist()  # of each chain of linked segments
+    for first, last in zip([0, *ends[:-1]], ends, strict=True):
         roots.append(_log_root_information(segments, weighted[first:last], run.dx_end[first:last], first, chain))
     return _triangularise(np.concatenate(roots))
-
-
-def _log_chains(segments: Segments) -> list[tuple[int, int]]:
-    """First and last segment (exclusive) of each chain of linked ones."""
-    ends = np.flatnonzero(~segments.linked) + 1
-    return list(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True))
 
 
 def _log_root_information(
@@ -345,7 +308,11 @@ def _log_root_information(
     carried = np.concatenate([np.eye(n), np.zeros((n, k))], axis=1)
     carried[np.isfinite(segments.fixed_start[first])] = 0.0
     root, rows = np.zeros((0, n + k)), []
-    chosen = np.concatenate([np.zeros((len(segments.columns), n)), _column_derivatives(segments, first, chain)], axis=1)
+    index = np.full(len(segments.transcription.parameters), -1, dtype=np.intp)
+    index[segments.transcription.free] = np.arange(k)
+    unknown = index[segments.parameter_positions[first, segments.columns]]
+    by_parameter = np.where(unknown[:, None] == np.arange(k), chain, 0.0)  # of each column, alike in all segments
+    chosen = np.concatenate([np.zeros((len(segments.columns), n)), by_parameter], axis=1)
     for i, (y, x) in enumerate(zip(weighted, end_sensitivities, strict=True)):
         moved = np.concatenate([carried, chosen])
         with np.errstate(over="ignore", invalid="ignore"):
@@ -356,24 +323,9 @@ def _log_root_information(
     return np.asarray(root[n:, n:])
 
 
-def _column_derivatives(segments: Segments, first: int, chain: Array) -> Array:
-    """d(sensitivity column)/d(free parameter, as searched), the same in all segments of a log."""
-    index = np.full(len(segments.transcription.parameters), -1, dtype=np.intp)
-    index[segments.transcription.free] = np.arange(len(chain))
-    unknown = index[segments.parameter_positions[first, segments.columns]]
-    return np.where(unknown[:, None] == np.arange(len(chain)), chain, 0.0)
-
-
 def _triangularise(rows: Array) -> Array:
     """The square upper triangle (QR) that has the same Gram matrix."""
     width = rows.shape[1]
     padded = np.concatenate([rows, np.zeros((max(0, width - len(rows)), width))])
     finite = bool(np.isfinite(padded).all())
     return np.asarray(np.linalg.qr(padded, mode="r")) if finite else np.full((width, width), np.nan)
-
-
-def _root_of_inverse(covariance: Array) -> Array:
-    """R with R'R the inverse of a covariance, whatever its units."""
-    deviation = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))
-    return np.asarray((vectors / np.sqrt(np.maximum(values, 1e-14))).T / deviation)

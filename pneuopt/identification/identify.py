@@ -1,8 +1,7 @@
-"""`identify`: parameters with confidence intervals, from logs, by lifted multiple shooting; `validate`: held-out runs.
+"""`identify`: parameters with confidence intervals from logs, by lifted multiple shooting; `validate`, `predict`.
 
-The system is any ODE with named signals that proposes its own starts (`System.starts`).
-
-`fit_table`, `agreement_rows`, `residual_diagnosis`: how well runs agree with logs, and what is left of these.
+The system is any ODE with named signals that proposes its own starts (`System.starts`). Below: the fit and its review,
+the predictions of logs, and the tables of results.
 """
 
 import math
@@ -19,7 +18,7 @@ from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
 from pneuopt.identification.examination import check_content
-from pneuopt.identification.identifiability import foresee_unidentifiable, leans_on_prior, rests_on_prior
+from pneuopt.identification.identifiability import foresee_unidentifiable, prior_dominated, prior_influenced
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, suspect_widths
 from pneuopt.identification.problem import (
@@ -40,13 +39,13 @@ from pneuopt.identification.problem import (
 from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult
 from pneuopt.identification.review import FixedValueTest, review_fit
 from pneuopt.identification.search import (
+    enforce_ordering,
+    fit_fixing_unidentifiable,
     fit_from_profiles,
     fit_from_starts,
-    fit_holding_unidentifiable,
     fit_logs,
-    fit_with_closed_gaps,
-    hold_order,
     mark_order,
+    tighten_gaps,
 )
 from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
 from pneuopt.identification.widths import choose_widths
@@ -56,7 +55,6 @@ from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.output import one_blas_thread
 from pneuopt.quantities.parameters import (
-    Parameter,
     ParameterSet,
     as_tuple,
     check_argument,
@@ -214,17 +212,17 @@ def _fit_and_review(
         is_plain = loss is None and not estimate_noise
         held, fit, label = fit_logs(problem, search) if is_plain else search(problem)
     else:
-        began = fit_holding_unidentifiable(problem, problem.start_from(start))
+        began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
     chosen = ChosenWindow(window, window, window, fit.stats["gap_share"]) if math.isfinite(window) else None
     restarts = False
-    if not doubts.found and (closed := fit_with_closed_gaps(held, fit)):
+    if not doubts.found and (closed := tighten_gaps(held, fit)):
         fit = closed
     elif not doubts.found and (windowed := fit_in_windows(held, fit)):
         restarts = 2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
-    held, fit = hold_order(held, fit, label)
+    held, fit = enforce_ordering(held, fit, label)
     reviewed, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
     while better := fit_from_profiles(held, fit, profiles):
         fit = better
@@ -356,6 +354,8 @@ def _result(
 
     `restarts` says that windows follow logs that the model does not follow from end to end.
     """
+    import pandas as pd
+
     free = fit.parameters.free_names
     estimates = problem.unknowns().with_values({n: fit.parameters.value(n) for n in free}).select(free)
     shared = [n for n in free if n in problem.parameters]
@@ -367,18 +367,19 @@ def _result(
     diagnosed = replace(diagnose_misfit(problem, fit, variance, dof), restarts=restarts)
     misfit = suspect_widths(diagnosed, problem, fit, variance)
     covariance = misfit.covariance
-    leaning = resting = np.zeros(len(free), dtype=bool)
+    influenced = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
-        leaning = leans_on_prior(covariance, fit.prior_covariance)
+        influenced = prior_influenced(covariance, fit.prior_covariance)
         found = np.array([p.value for p in estimates.values()])
-        resting = rests_on_prior(covariance, fit.prior_covariance, found, problem.held.values())
-    unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.held)
+        resting = prior_dominated(covariance, fit.prior_covariance, found, problem.fixed.values())
+    unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
     status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else misfit.assess(fit.status)
+    matrix = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
     result = IdentificationResult(
         problem.parameters.with_values(values),
-        _estimates(estimates, covariance, fit.at_bound, leaning, status, misfit),
-        _covariance_frame(free, covariance),
+        _estimates(estimates, covariance, fit.at_bound, influenced, status, misfit),
+        pd.DataFrame(matrix, index=list(free), columns=list(free)),
         fit_table(problem, fit),
         runs,
         status,
@@ -396,7 +397,7 @@ def _estimates(
     parameters: ParameterSet,
     covariance: Array | None,
     at_bound: Mask,
-    leaning: Mask,
+    influenced: Mask,
     status: Status,
     misfit: Misfit,
 ) -> "pd.DataFrame":
@@ -408,23 +409,14 @@ def _estimates(
     for i, (name, p) in enumerate(parameters.items()):
         deviation, dof = math.nan if at_bound[i] else float(stderr[i]), float(misfit.dof[i])
         low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
-        ends = [_move(p, change) for change in misfit.ranges[i].tolist()]
-        mark = misfit.mark(i, is_optimum=status.converged and math.isfinite(deviation) and not leaning[i])
+        ends = [
+            (p.value * math.exp(change / p.value) if p.log else p.value + change)
+            for change in misfit.ranges[i].tolist()
+        ]
+        mark = misfit.mark(i, is_optimum=status.converged and math.isfinite(deviation) and not influenced[i])
         shown = [p.value, low, high, p.unit, mark]
         rows[name] = [*shown, deviation, dof, *ends, p.lower, p.upper, bool(at_bound[i]), p.source]
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
-
-
-def _move(p: Parameter, change: float) -> float:
-    """A parameter's value after a change; its logarithm moves where it is searched as one."""
-    return p.value * math.exp(change / p.value) if p.log else p.value + change
-
-
-def _covariance_frame(free: Sequence[str], covariance: Array | None) -> "pd.DataFrame":
-    import pandas as pd
-
-    values = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
-    return pd.DataFrame(values, index=list(free), columns=list(free))
 
 
 def fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":

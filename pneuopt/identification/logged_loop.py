@@ -42,16 +42,6 @@ class LoggedLoop:
     The rates of the reference that a cascade or a feedforward uses are those of the log's "speed_reference" beside its
     "position_reference", where it holds both, and else differences of the reference from one sample of the controller
     to the next; a reference that is logged in coarse steps needs its speed beside it.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-
-    Raises
-    ------
-    ModelError
-        If the controller is continuous, reads an encoder, whose steps leave a fit without derivatives, or resets its
-        integral, whose jumps do so too.
     """
 
     loop: ClosedLoop
@@ -157,9 +147,10 @@ class LoggedLoop:
         for was_at_rest in (True, False):
             replayed = {n: self._replay_controller(log, n, was_at_rest=was_at_rest) for n, log in logs.items()}
             plant = {n: self._plant_log(log, replayed[n]) for n, log in logs.items()}
+            controller = {n: {s: run[s] for s in run if s != "control"} for n, run in replayed.items()}
             label = "from rest" if was_at_rest else "from an empty integral"
             for start in self.loop.plant.starts(plant)[: None if was_at_rest else 1]:
-                states = {n: run.with_columns(_controller_states(replayed[n])) for n, run in start.states.items()}
+                states = {n: run.with_columns(controller[n]) for n, run in start.states.items()}
                 out.append(Start(states, start.parameters, ", ".join(filter(None, (start.label, label)))))
         return out
 
@@ -247,10 +238,6 @@ class LoggedLoop:
         plant = self.loop.plant
         measured = log.measured.with_columns({self.loop.command.name: replayed["control"]})
         return Log(measured, log.parameters.select(plant.parameters))
-
-
-def _controller_states(replayed: Trajectory) -> dict[str, Array]:
-    return {n: replayed[n] for n in replayed if n != "control"}
 
 
 def _add_acting_input(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSystem:

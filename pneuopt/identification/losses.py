@@ -5,7 +5,7 @@ residual over the channel's own scale (1.4826 MAD), and the next fit starts wher
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,11 +13,11 @@ import numpy as np
 
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.tolerances import (
+    CLEAR_DEVIATIONS,
     ESTIMATE_CHANGE_TOLERANCE,
     MAX_REFITS,
     MIN_WEIGHT,
     NOISE_CHANGE_TOLERANCE,
-    OUTLIER_THRESHOLD,
     REFIT_STAGES,
 )
 from pneuopt.logs.experiment import Experiment
@@ -105,23 +105,9 @@ def fit_robustly(
 ) -> tuple[EstimationProblem, Fit]:
     """Repeat a fit with new weights and noise levels until neither they nor the estimates move.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-        A fit of that problem.
-    loss : Loss, optional
-    estimate_noise : bool
-        Each channel's noise becomes the white part of its residuals (`noise_level`): the error of a wrong model varies
-        slowly, does not count as noise, and so stays visible.
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With the weights and noise levels that the last fit was made with.
-    fit : Fit
-        With neither loss nor noise to estimate the same as before. Its `variance_inflation` is Huber's sandwich
-        ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for all.
+    Each channel's noise becomes the white part of its residuals: a wrong model's slow error stays visible. The
+    variances are inflated by Huber's sandwich ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for
+    all.
     """
     if loss is None and not estimate_noise:
         return problem, fit
@@ -134,8 +120,11 @@ def fit_robustly(
         fits.append(fit)
         if _is_stationary(before, (current, fit)):
             break
-    current = replace(current, method=problem.method)
-    return current, _summarise(current, fits, loss)
+    current, fit = replace(current, method=problem.method), fits[-1].with_effort_of(*fits[:-1])
+    status = fit.status
+    if loss is not None and status.converged and fit.jumps is None:
+        status = Status(status.code, _describe_outliers(current, fit, len(fits)))
+    return current, replace(fit, stats={**fit.stats, "refits": len(fits) - 1.0}, status=status)
 
 
 def white_chi_square(problem: EstimationProblem, fit: Fit) -> float:
@@ -154,27 +143,18 @@ def white_chi_square(problem: EstimationProblem, fit: Fit) -> float:
     return total
 
 
-def _summarise(problem: EstimationProblem, fits: Sequence[Fit], loss: Loss | None) -> Fit:
-    """The last fit with the effort of all, and a status without the outliers' residuals."""
-    fit = fits[-1].with_effort_of(*fits[:-1])
-    status = fit.status
-    if loss is not None and status.converged and fit.jumps is None:
-        status = Status(status.code, _describe_outliers(problem, fit, len(fits)))
-    return replace(fit, stats={**fit.stats, "refits": len(fits) - 1.0}, status=status)
-
-
 def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> tuple[str, ...]:
     """Sentences on the outliers, and on the misfit in the other samples."""
     worst, level, beyond, count = "", 1.0, 0, 0
     for e, run in zip(problem.experiments, fit.trajectories, strict=True):
         residuals = _residuals_in_noise(problem, e, run)
         scales = _channel_scales(residuals)
-        beyond += int(np.sum(np.abs(residuals) > OUTLIER_THRESHOLD * scales))
+        beyond += int(np.sum(np.abs(residuals) > CLEAR_DEVIATIONS * scales))
         count += int(np.isfinite(residuals).sum())
         if scales.max() > level:
             level, channel = float(scales.max()), outputs_in_log(problem.system, e)[int(np.argmax(scales))]
             worst = f"{channel} of {e.name}"
-    outliers = f"{beyond} of {count} samples are outliers, beyond {OUTLIER_THRESHOLD:g} standard deviations"
+    outliers = f"{beyond} of {count} samples are outliers, beyond {CLEAR_DEVIATIONS:g} standard deviations"
     verdict = f"{fits - 1} refits, {outliers}"
     if level**2 <= MAX_CHI_SQUARE_RATIO:
         return (verdict,)

@@ -1,25 +1,18 @@
-"""`diagnose_misfit`: what the residuals of a fit tell about its intervals, beyond their size.
+"""`diagnose_misfit`: what the residuals of a fit say about its intervals, beyond their size.
 
-Three questions, in this order: do parts of the logs agree on the parameters (`clusters.robust_covariance`); does the
-mean of the residuals depend on the simulated motion, which is an error of the model; is the misfit so large that no
-interval says anything.
+`robust_covariance`: residuals count in clusters, blocks of time and logs. Where the clusters agree on the parameters as
+chance lets them (after Chow, Econometrica 28, 1960), the covariance of white residuals stays. Otherwise the estimates'
+changes when one cluster is left out measure their variance: CR3, the jackknife, over blocks of time, CR2 over logs,
+with the degrees of freedom of Bell and McCaffrey (Survey Methodology 28(2), 2002), so that few clusters give a wide
+interval and not a lucky one. `problems/identify/interval_coverage.py` measures the coverage.
 
-`robust_covariance`: the covariance of estimates whose residuals are correlated in time, or differ from log to log.
+`motion_p`: whether the mean of the residuals depends on the simulated motion, which is an error of the model.
 
-Residuals count in clusters: blocks of time, and logs. Where the clusters agree on the parameters as chance lets them
-(after Chow, Econometrica 28, 1960), the covariance of white residuals stays. Otherwise the estimates' changes when one
-cluster is left out measure their variance: CR3, the jackknife, over blocks of time, CR2 over logs, each with the
-degrees of freedom of Bell and McCaffrey (Survey Methodology 28(2), 2002), so that few clusters give a wide interval and
-not a lucky one. `problems/identify/interval_coverage.py` measures the coverage.
-
-`suspect_widths`: whether the logs reject a width that only serves the integration, and which estimates it biases.
-
-A smooth model turns friction round over a width; a drive that truly sticks does it over none. What the width hides goes
-into the parameters, the Stribeck velocity first, before the residuals show it: at 1.006 times the noise it was 7 %
-off, 5.6 of its deviations (`problems/identify/mismatch.py`). The width counts as one more parameter, and the gradient
-of the cost by it at the estimates tells whether the logs reject the one in use (Rao's score test, Proc. Cambridge
-Philos. Soc. 44, 1948): no fit with another width is needed, which the integration could not follow where it is narrow.
-Where the drive has the width that the model has, as in a log that the model has made itself, the logs do not reject it.
+`suspect_widths`: whether the logs reject a width that only serves the integration, and which estimates it biases. The
+width counts as one more parameter, and the gradient of the cost by it at the estimates decides (Rao's score test, Proc.
+Cambridge Philos. Soc. 44, 1948): no fit with another width is needed, which the integration could not follow where it
+is narrow. After true stiction the Stribeck velocity was 7 % off, 5.6 of its deviations, with residuals of 1.006 times
+the noise (`problems/identify/mismatch.py`).
 """
 
 import math
@@ -37,7 +30,6 @@ from pneuopt.identification.result import Mark, join_names
 from pneuopt.identification.statistics import agreement
 from pneuopt.identification.tolerances import (
     ASSUMED_SHARE,
-    GATE_LEVEL,
     HARMLESS_SHIFT,
     LEAST_TIME_DOF,
     LEFT_OUT_REGULARISATION,
@@ -68,23 +60,13 @@ from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Residuals in K clusters, as k parameters see them.
+    """Residuals in K clusters, as k parameters see them."""
 
-    Parameters
-    ----------
-    scores : ndarray, shape (K, k)
-        Gradient of half the squared residuals of each cluster by the parameters; they sum to zero at an optimum.
-    information : ndarray, shape (K, k, k)
-        J'J of each cluster, for residuals in noise standard deviations.
-    logs : ndarray of int, shape (K,)
-        The log that each cluster is of, in ascending order; a log's clusters are in the order of time.
-    by_chance : ndarray, shape (n, K, k), optional
-        Scores of n fits to white residuals of unit variance; by default those of independent residuals.
-    """
-
+    # gradient of half the squared residuals of each cluster by the parameters; they sum to zero at an optimum
     scores: Array
-    information: Array
-    logs: Indices
+    information: Array  # J'J of each cluster, for residuals in noise standard deviations
+    logs: Indices  # the log that each cluster is of, in ascending order; a log's clusters are in the order of time
+    # scores of n fits to white residuals of unit variance; by default those of independent residuals
     by_chance: Array | None = None
 
     @property
@@ -117,71 +99,38 @@ class Clusters:
 
 
 class Spread(NamedTuple):
-    """The variance of estimates by one set of clusters.
-
-    Attributes
-    ----------
-    covariance : ndarray, shape (k, k)
-    dof : ndarray, shape (k,)
-        Bell and McCaffrey's degrees of freedom of each variance.
-    changes : ndarray, shape (K, k)
-        What each cluster adds to the estimates, by which the covariance is made.
-    """
+    """The variance of estimates by one set of clusters."""
 
     covariance: Array
-    dof: Array
-    changes: Array
+    dof: Array  # Bell and McCaffrey's degrees of freedom of each variance
+    changes: Array  # what each cluster adds to the estimates, by which the covariance is made
 
 
 @dataclass(frozen=True, eq=False)
 class RobustCovariance:
-    """The covariance of estimates, and what it rests on.
-
-    Attributes
-    ----------
-    covariance : ndarray, shape (k, k)
-    dof : ndarray, shape (k,)
-        Degrees of freedom of each variance: of Student's t for an interval.
-    widened : bool
-        Whether the clusters disagree more than chance lets them.
-    is_slow : bool
-        Whether the misfit varies as slowly as the logs, or from log to log.
-    lone : ndarray of bool, shape (k,)
-        Parameters that one of several logs alone determines: how they scatter between logs is unknown.
-    """
+    """The covariance of estimates, and what it rests on."""
 
     covariance: Array
-    dof: Array
-    widened: bool
-    is_slow: bool
-    lone: Mask
+    dof: Array  # degrees of freedom of each variance: of Student's t for an interval
+    widened: bool  # whether the clusters disagree more than chance lets them
+    is_slow: bool  # whether the misfit varies as slowly as the logs, or from log to log
+    lone: Mask  # parameters that one of several logs alone determines: how they scatter between logs is unknown
 
 
 def robust_covariance(
     blocks: Clusters, white: Array, variance: float, dof: float, classes: Sequence[Clusters] = ()
 ) -> RobustCovariance:
-    """The covariance that makes each parameter's interval the widest among those of white residuals and of clusters.
+    """The covariance (k, k) that gives each parameter its widest interval among white residuals and clusters.
 
-    Parameters
-    ----------
-    blocks : Clusters
-        Blocks of time, `TIME_BLOCKS` or so over all logs.
-    white : ndarray, shape (k, k)
-        The covariance for white residuals.
-    variance, dof : float
-        Of the residuals, in noise variances, and its degrees of freedom.
-    classes : sequence of Clusters
-        Further clusters, by a motion on which the residuals depend; with any, the gate does not count.
-
-    Returns
-    -------
-    RobustCovariance
+    `classes` are further clusters, by a motion on which the residuals depend; with any, agreement of the blocks is no
+    excuse.
     """
-    times = [c for c in _distinct([blocks, blocks.halve(), blocks.halve().halve()]) if c.count > 1]
+    halves = [blocks, blocks.halve(), blocks.halve().halve()]  # halving ends at one cluster a log
+    times = [c for i, c in enumerate(halves) if c.count > 1 and c.count not in [h.count for h in halves[:i]]]
     logs = [blocks.by_log()] if len(np.unique(blocks.logs)) > 1 else []
     levels = [*times, *logs]
     none = np.zeros(len(white), dtype=bool)
-    agree = min((disagreement_p(c, variance) for c in levels), default=1.0) * len(levels) >= GATE_LEVEL
+    agree = min((disagreement_p(c, variance) for c in levels), default=1.0) * len(levels) >= 1 - LEVEL
     if not levels or (agree and not classes):
         return RobustCovariance(white, np.full(len(white), dof), widened=False, is_slow=False, lone=none)
     within = [jackknife(c) for c in (*times, *classes) if c.count > 1]
@@ -191,7 +140,8 @@ def robust_covariance(
     spreads += [(s, s.dof >= MIN_LOG_DOF) for s in between]
     covariance, degrees = _widest(white, dof, spreads)
     lone = between[0].dof < MIN_LOG_DOF if between else none
-    slow = len(times) > 1 and _is_slow(within[len(times) - 1], within[0])
+    fine, coarse = (np.diag(spread.covariance) for spread in (within[0], within[max(len(times) - 1, 0)]))
+    slow = len(times) > 1 and bool(np.median(coarse / fine) > SLOW_RATIO)
     return RobustCovariance(covariance, degrees, widened=True, is_slow=slow, lone=lone)
 
 
@@ -210,25 +160,14 @@ def between_clusters(clusters: Clusters) -> Spread:
 def disagreement_p(clusters: Clusters, variance: float) -> float:
     """Probability that chance makes clusters of white residuals disagree so much on the parameters.
 
-    Parameters
-    ----------
-    clusters : Clusters
-    variance : float
-        Of the residuals, in noise variances.
-
-    Returns
-    -------
-    float
-        Of Chow's statistic, the decrease of squared residuals if each cluster had its own parameters; it counts as
-        chi-square with the mean and the variance that it has by chance (Satterthwaite 1946).
+    Of Chow's statistic, the decrease of squared residuals if each cluster had its own parameters; it counts as chi-
+    square with the mean and the variance that it has by chance (Satterthwaite 1946).
     """
     scale, own = _whiten(clusters)
     scores = _simulate_scores(own) if clusters.by_chance is None else clusters.by_chance @ scale.T
     assumed = ASSUMED_SHARE / clusters.count * np.eye(len(scale))
-    seen, *chance = _chow(
-        np.concatenate([(clusters.scores @ scale.T)[None], scores]),
-        np.asarray(np.linalg.inv(own + assumed), dtype=np.float64),
-    )
+    every = np.concatenate([(clusters.scores @ scale.T)[None], scores])
+    seen, *chance = np.einsum("ngi,gij,ngj->n", every, np.linalg.inv(own + assumed), every, optimize=True)
     mean, spread = float(np.mean(chance)), float(np.var(chance, ddof=1))
     return float(chi2.sf(seen / variance * 2 * mean / spread, 2 * mean**2 / spread)) if spread > 0 else 1.0
 
@@ -236,11 +175,6 @@ def disagreement_p(clusters: Clusters, variance: float) -> float:
 def t_quantile(dof: Array | float, level: float = LEVEL) -> Array:
     """Half width of an interval in standard deviations, by Student's t."""
     return np.asarray(t.ppf(0.5 + level / 2, dof))
-
-
-def _chow(scores: Array, inverse: Array) -> Array:
-    """Chow's statistic of sets of whitened scores, shape (n, K, k), with the inverse information of each cluster."""
-    return np.asarray(np.einsum("ngi,gij,ngj->n", scores, inverse, scores, optimize=True))
 
 
 def _simulate_scores(own: Array) -> Array:
@@ -299,65 +233,26 @@ def _widest(white: Array, dof: float, spreads: Sequence[tuple[Spread, Mask]]) ->
     return together * np.outer(stretch, stretch), freedom
 
 
-def _is_slow(coarse: Spread, fine: Spread) -> bool:
-    """Whether coarser blocks see clearly more variance: the residuals vary as slowly as the blocks last."""
-    return bool(np.median(np.diag(coarse.covariance) / np.diag(fine.covariance)) > SLOW_RATIO)
-
-
-def _distinct(levels: Sequence[Clusters]) -> list[Clusters]:
-    """The levels without those of as many clusters as one before: halving ends at one cluster a log."""
-    return [c for i, c in enumerate(levels) if c.count not in [known.count for known in levels[:i]]]
-
-
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """What the residuals of a fit tell about its intervals.
+    """What the residuals of a fit tell about its intervals."""
 
-    Attributes
-    ----------
-    covariance : ndarray, shape (k, k), or None
-        Of all free parameters; NaN for those that the fit has not determined.
-    dof : ndarray, shape (k,)
-        Degrees of freedom of each variance, for Student's t.
-    inflation : float
-        Mean ratio of the variances to those of white residuals.
-    ranges : ndarray, shape (k, 2)
-        The least and the largest change of each estimate when a sixth of the logs, a log, or a class of the motion is
-        left out.
-    widened : bool
-        Whether parts of the logs disagree on the parameters more than chance lets them.
-    level : float
-        Residuals over the noise, root mean squares [1].
-    noisy_states : bool
-        Whether gaps between segments stand for noise of the states.
-    is_excessive : bool
-        Whether the residuals are so large that there is no interval.
-    signals : tuple of str
-        The simulated signals on which the residuals depend, the clearest first.
-    rejected_widths : tuple of str
-        The widths of the model that the logs reject.
-    biased : ndarray of bool, shape (k,), or None
-        The estimates that such a width biases; None without one.
-    restarts : bool
-        Whether windows that start anew follow the logs where the model, over whole logs, does not.
-    is_slow, lone
-        As of a `RobustCovariance`; `lone` by name.
-    """
-
-    covariance: Array | None
-    dof: Array
-    inflation: float
+    covariance: Array | None  # of all free parameters; NaN for those that the fit has not determined
+    dof: Array  # degrees of freedom of each variance, for Student's t
+    inflation: float  # mean ratio of the variances to those of white residuals
+    # the least and the largest change of each estimate when a sixth of the logs, a log, or a class of the motion is
+    # left out
     ranges: Array
-    level: float
-    noisy_states: bool
-    is_excessive: bool
-    widened: bool = False
-    signals: tuple[str, ...] = ()
-    is_slow: bool = False
+    level: float  # residuals over the noise, root mean squares [1]
+    noisy_states: bool  # whether gaps between segments stand for noise of the states
+    is_excessive: bool  # whether the residuals are so large that there is no interval
+    widened: bool = False  # whether parts of the logs disagree on the parameters more than chance lets them
+    signals: tuple[str, ...] = ()  # the simulated signals on which the residuals depend, the clearest first
+    is_slow: bool = False  # whether it varies as slowly as the logs, or from log to log
     lone: tuple[str, ...] = ()
-    rejected_widths: tuple[str, ...] = ()
-    biased: Mask | None = None
-    restarts: bool = False
+    rejected_widths: tuple[str, ...] = ()  # the widths of the model that the logs reject
+    biased: Mask | None = None  # the estimates that such a width biases; None without one
+    restarts: bool = False  # whether windows that start anew follow the logs where the model, over whole logs, does not
 
     @property
     def is_suspect(self) -> bool:
@@ -403,19 +298,7 @@ class Misfit:
 
 
 def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: float) -> Misfit:
-    """Diagnose the residuals of a fit.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-    variance, dof : float
-        Of the residuals, in noise variances, and its degrees of freedom.
-
-    Returns
-    -------
-    Misfit
-    """
+    """Diagnose the residuals of a fit from their variance, in noise variances, and its degrees of freedom."""
     k, free = len(fit.parameters.free_names), fit.parameters.free_names
     scores = None if fit.optimum is None else fit_scores(fit.optimum)
     white = None if fit.covariance is None else fit.covariance * variance * fit.variance_inflation
@@ -473,25 +356,10 @@ class Signal(NamedTuple):
 
 
 def motion_p(values: Array, residuals: Array, derivatives: Array, scores: FitScores, blocks: Indices) -> float:
-    """Probability that chance makes the mean of residuals depend so much on a signal.
+    """Probability that chance makes one output's residuals (m,) depend so much on a signal (m,), by segment.
 
-    Parameters
-    ----------
-    values : ndarray, shape (m,)
-        The signal in each segment.
-    residuals : ndarray, shape (m,)
-        The sum of one output's residuals in each segment.
-    derivatives : ndarray, shape (m, k)
-        Its derivatives by the parameters.
-    scores : FitScores
-    blocks : ndarray of int, shape (m,)
-        The block of time of each segment.
-
-    Returns
-    -------
-    float
-        Of Hotelling's T^2 of the sums over classes of the signal, less what a change of the parameters explains; they
-        count as independent from block to block, not within (Hotelling 1931).
+    Of Hotelling's T^2 (1931) of the sums over classes of the signal, less what a change of the parameters explains
+    (`derivatives`, (m, k)); sums of different blocks of time count as independent.
     """
     members = _classes(values) == np.arange(MOTION_CLASSES)[:, None]
     explained = np.linalg.solve(scores.whole_information, (members @ derivatives).T)
@@ -595,37 +463,15 @@ def _clusters(scores: FitScores, groups: Indices, *, simulate: bool = False) -> 
 
 
 class RejectedWidth(NamedTuple):
-    """A width that the logs reject.
-
-    Attributes
-    ----------
-    name : str
-    fall : float
-        Of the squared residuals, in noise variances, to the width that the logs prefer.
-    shifts : ndarray, shape (k,)
-        What each free parameter of the fit changes by to there, to first order; at most to a width of zero.
-    """
+    """A width that the logs reject."""
 
     name: str
-    fall: float
-    shifts: Array
+    fall: float  # of the squared residuals, in noise variances, to the width that the logs prefer
+    shifts: Array  # what each free parameter of the fit changes by to there, to first order; at most to a width of zero
 
 
 def suspect_widths(misfit: Misfit, problem: EstimationProblem, fit: Fit, variance: float) -> Misfit:
-    """The misfit, with the widths behind it; only looked for where there is one (`Misfit.is_suspect`).
-
-    Parameters
-    ----------
-    misfit : Misfit
-    problem : EstimationProblem
-    fit : Fit
-    variance : float
-        Of the residuals, in noise variances.
-
-    Returns
-    -------
-    Misfit
-    """
+    """The misfit, with the widths behind it; only looked for where there is one (`Misfit.is_suspect`)."""
     if not (misfit.is_suspect and fit.status.converged) or misfit.covariance is None:
         return misfit
     level = SIGNIFICANT_FALL * max(1.0, variance) * max(1.0, misfit.inflation)
@@ -636,18 +482,9 @@ def suspect_widths(misfit: Misfit, problem: EstimationProblem, fit: Fit, varianc
 
 
 def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth]:
-    """What each width of a model would change if it was estimated, too.
+    """What each width of a model would change if a converged fit estimated it, too.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-        A converged one.
-
-    Yields
-    ------
-    RejectedWidth
-        None where the model has no width, or gaps stand for noise of the states, whose costs are of other weights.
+    Nothing where gaps stand for noise of the states, whose costs have other weights.
     """
     names = fixed_widths(problem)
     if not names or fit.jumps is not None:
@@ -670,7 +507,7 @@ def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth
 
 def fixed_widths(problem: EstimationProblem) -> list[str]:
     """The widths of the model that are not free; a free one is an estimate itself."""
-    names = dict.fromkeys(n for w in problem.system.plant.excitation.widths for n in (w.name, *w.follows))
+    names = dict.fromkeys(n for w in problem.system.plant.identification_hints.widths for n in (w.name, *w.follows))
     return [n for n in names if n in problem.parameters and not problem.parameters[n].free]
 
 

@@ -1,13 +1,8 @@
-"""`EstimationProblem`: logs, conditions and parameters of an identification, as a multiple-shooting `Transcription`.
+"""`EstimationProblem`: logs, conditions and parameters, as a multiple-shooting `Transcription`.
 
-Checks that logs, a system and parameters fit together, before anything is solved; each refusal names the remedy.
-
-Holes of a log's inputs: a short one is bridged, at a long one the log is cut; `repair_log` says which and where.
-
-`find_centre`: the centre of a valve whose command was logged from 0 to 10 V, to be estimated with the rest.
-
-A command that stays between 0 and twice the valve's span, and rests near the span, is that of a valve which is closed
-there. Taken as a command about 0 V, it would show a valve that is fully open while the drive rests.
+Below it the checks that logs, system and parameters fit together, each with its remedy; the repair of holes in a log's
+inputs (a short one is bridged, at a long one the log is cut); and `find_centre`, for a valve whose command was logged
+from 0 to 10 V: read as a command about 0 V it would show a valve that is fully open while the drive rests.
 """
 
 import itertools
@@ -56,35 +51,21 @@ from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regu
 
 @dataclass(frozen=True, eq=False)
 class EstimationProblem:
-    """An estimation problem: a system, logs and parameters; its transcription, and starts from its fits.
-
-    Parameters
-    ----------
-    system : Fittable
-    experiments : tuple of Experiment
-    parameters : ParameterSet
-    method : LeastSquares
-    weights : mapping of str to ndarray, each of shape (n, n_measured_outputs)
-        By log, the weight of each sample's squared residual; 1 for logs that are absent.
-    held : mapping of str to float
-        Values of free parameters that are held, for the logs cannot identify them.
-    noise_is_stated : bool
-        Whether the logs state the noise of all outputs; otherwise it is estimated from them.
-    window : float
-        Time after which a log starts anew with a state of its own [s]; math.inf where it never does.
-    is_whole : bool
-        Whether logs stay whole also where the model does not follow them.
-    """
+    """An estimation problem: a system, logs and parameters; its transcription, and starts from its fits."""
 
     system: Fittable
     experiments: tuple[Experiment, ...]
     parameters: ParameterSet
     method: LeastSquares
+    # by log, the weight of each sample's squared residual; 1 for logs that are absent
     weights: Mapping[str, Array] = field(default_factory=dict)
-    held: Mapping[str, float] = field(default_factory=dict)
+    # values of free parameters that stay fixed, for the logs cannot identify them
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    # whether the logs state the noise of all outputs; otherwise it is estimated from them
     noise_is_stated: bool = False
+    # time after which a log starts anew with a state of its own [s]; math.inf where it never does
     window: float = math.inf
-    is_whole: bool = False
+    is_whole: bool = False  # whether logs stay whole also where the model does not follow them
 
     @property
     def has_gaps(self) -> bool:
@@ -138,7 +119,7 @@ class EstimationProblem:
         phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
         residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
         parameters = self.unknowns().with_values(candidate.parameters)
-        held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.held.items()}
+        held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.fixed.items()}
         parameters = parameters | ParameterSet(held)
         return Transcription(self._discrete, parameters, phases, residuals)
 
@@ -165,25 +146,17 @@ class EstimationProblem:
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
         h = np.append(np.diff(t), np.diff(t)[-1])
-        breaks = self._breaks(experiment)
-        nodes, guess = (
-            regular_nodes(len(t), self._samples_a_segment(h), breaks),
-            states.matrix(names(self.system.states)),
-        )
+        breaks = [end for begin, end in experiment.holes if begin > 0 and end < len(t)]
+        if not math.isinf(self.window):
+            breaks = sorted({*breaks, *(begin for begin, _ in window_runs(experiment, self.window) if begin > 0)})
+        nodes = regular_nodes(len(t), self._samples_a_segment(h), breaks)
+        guess = states.matrix(names(self.system.states))
         for begin, end in experiment.holes:
             h[max(begin - 1, 0) : end] = 0.0  # the state stands still where its inputs are unknown
         driven = self.system.input_matrix(experiment.trajectory, experiment.name)
         driven = append_slopes(t, driven, self._linear, self._rising(experiment))
         start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
         return Phase(experiment.name, t, h, driven, nodes, start, guess=guess, breaks=np.array(breaks, dtype=np.intp))
-
-    def _breaks(self, experiment: Experiment) -> list[int]:
-        """The samples at which a log starts anew: after a hole in its inputs, and at the start of each window."""
-        t = experiment.trajectory.t
-        holes = [end for begin, end in experiment.holes if begin > 0 and end < len(t)]
-        if math.isinf(self.window):
-            return holes
-        return sorted({*holes, *(begin for begin, _ in window_runs(experiment, self.window) if begin > 0)})
 
     def _samples_a_segment(self, h: Array) -> int:
         """Samples between two nodes; a static map has no gaps, and is cut only for batches and blocks of time."""
@@ -257,7 +230,11 @@ def check_logs(
             read = tuple(n for n in read if n in known)
         own = replace(experiment.select(read), name=name)
         _check_channels(system, own, name, known)
-        _check_conditions(system, own, parameters, name)
+        check_names("parameter", own.conditions, system.parameters, f"{name}: condition")
+        try:
+            system.check((system.parameters | parameters).with_values(own.conditions))
+        except InputError as error:
+            raise InputError(f"{name}: condition {error}") from None
         out.append(repair_log(system, own)[0])
     return _fill_noise(system, out)
 
@@ -313,15 +290,6 @@ def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence
                 levels = f"stated as {stated:.2g} {unit}, the log itself shows {shown:.2g} {unit}"
                 out.append(f"{named.name}: the noise of {channel} is {levels}; leave it out to have it estimated")
     return tuple(out)
-
-
-def _check_conditions(system: Fittable, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
-    """Check the parameters under the conditions of a log."""
-    check_names("parameter", experiment.conditions, system.parameters, f"{name}: condition")
-    try:
-        system.check((system.parameters | parameters).with_values(experiment.conditions))
-    except InputError as error:
-        raise InputError(f"{name}: condition {error}") from None
 
 
 def _check_channels(system: Fittable, experiment: Experiment, name: str, known: set[str]) -> None:
@@ -380,31 +348,17 @@ def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Inter
 
 
 def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tuple[str, ...]]:
-    """Bridge the short holes of a log's inputs and cut it at the long ones, for want of rows or of single samples.
+    """Bridge the short holes of a log's inputs and cut it at the long ones; returns the log and what was done in words.
 
-    Parameters
-    ----------
-    system : Fittable
-    experiment : Experiment
-        With a name, and with every input of the system.
-
-    Returns
-    -------
-    experiment : Experiment
-        With every sample of every input. Where it is cut, `holes` names the samples whose inputs nobody knows; what was
-        measured there is left out.
-    sentences : tuple of str
-        What was done, with figures.
-
-    Raises
-    ------
-    LogError
-        If a long hole cuts the log of a sampled loop, whose controller goes on meanwhile, or leaves nothing of a log.
+    `holes` of a cut log names the samples whose inputs nobody knows; a sampled loop is refused there, for its
+    controller goes on.
     """
     log, inputs = experiment.trajectory, names(system.inputs)
     known: Mask = np.asarray(np.isfinite(log.matrix(inputs)).all(axis=1))
     holes = _find_holes(log, known, system) if system.states else []
-    lost = ~known if not system.states else _inside(holes, len(log))
+    lost = np.zeros(len(log), dtype=bool) if system.states else ~known
+    for begin, end in holes:
+        lost[begin:end] = True
     everything = (
         f"{experiment.name}: no part holds {', '.join(inputs)} and {MIN_RUN} samples of an output; log them together"
     )
@@ -417,7 +371,9 @@ def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tu
     short = ~known & ~lost
     sentences = [f"{experiment.name}: inputs are unknown {where}; the log is cut there"] if holes else []
     if short.any():
-        gaps = f"{experiment.name}: {int(short.sum())} samples lack an input, {_longest_run(short)} in a row at most"
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], short, [False]]).astype(int)))
+        longest = int(np.max(edges[1::2] - edges[::2]))
+        gaps = f"{experiment.name}: {int(short.sum())} samples lack an input, {longest} in a row at most"
         sentences.append(f"{gaps}; they are bridged")
     if not (sentences or lost.any()):
         return experiment, ()
@@ -462,13 +418,6 @@ def _find_holes(log: Trajectory, known: Mask, system: Fittable) -> list[tuple[in
     return sorted({*outer, *((edges[k], edges[k + 1]) for k in inner)})
 
 
-def _inside(holes: Sequence[tuple[int, int]], n: int) -> Mask:
-    inside = np.zeros(n, dtype=bool)
-    for begin, end in holes:
-        inside[begin:end] = True
-    return inside
-
-
 def _bridge(log: Trajectory, behaviour: dict[str, Intersample], lost: Mask) -> dict[str, Array]:
     """The columns of a log without holes in its inputs, and without outputs where the inputs are lost."""
     out = {}
@@ -485,30 +434,10 @@ def _bridge(log: Trajectory, behaviour: dict[str, Intersample], lost: Mask) -> d
     return out
 
 
-def _longest_run(mask: Mask) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return int(np.max(edges[1::2] - edges[::2]))
-
-
 def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> ParameterSet:
     """Free the centre of a plant's valve, with a warning, where logs count its command from 0 and nobody has stated it.
 
-    Parameters
-    ----------
-    system : Fittable
-    experiments : sequence of Experiment
-        Each with a name.
-    parameters : ParameterSet
-
-    Returns
-    -------
-    ParameterSet
-        The same where a centre is stated, where no log shows one, or where the plant has none.
-
-    Raises
-    ------
-    LogError
-        If the logs, or a log and a stated centre, count the command from different voltages.
+    Logs that count it from different voltages are refused, and so is a log that contradicts a stated centre.
     """
     name, element = centre_name(system.plant), system.plant.axis.final_element if system.plant.axis else None
     if name is None or element is None:
@@ -519,7 +448,10 @@ def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters:
     shown = [c for c in commands if c.is_counted_from(0.0)]
     about = [c for c in commands if c.is_counted_from(-c.half)]
     if stated.value:
-        _check_stated(name, stated.value, about)
+        for command in about:  # it has been counted from the stated centre already
+            message = f"{command}, which is no command of a valve with {name} = {stated.value:g} {command.unit}"
+            remedy = "leave that out of the drive, or of the log's sidecar (or Python) what has subtracted it"
+            require(abs(stated.value) < MAX_REST_DISTANCE * command.half, f"{message}; {remedy}", LogError)
         return parameters
     if not shown:
         return parameters
@@ -558,14 +490,6 @@ class _Command(NamedTuple):
     def __str__(self) -> str:
         run = f"runs from {self.low:.3g} to {self.high:.3g} {self.unit}"
         return f"{self.log}: {self.channel} {run} and rests at {self.rest:.3g} {self.unit}"
-
-
-def _check_stated(name: str, value: float, about: Sequence[_Command]) -> None:
-    """Refuse a centre where a log's command has been counted from it already."""
-    for command in about:
-        message = f"{command}, which is no command of a valve with {name} = {value:g} {command.unit}; leave that out"
-        remedy = "of the drive, or of the log's sidecar (or Python) what has subtracted it"
-        require(abs(value) < MAX_REST_DISTANCE * command.half, f"{message} {remedy}", LogError)
 
 
 def _commands(

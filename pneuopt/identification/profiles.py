@@ -1,7 +1,4 @@
-"""`profile`: the profile-likelihood interval of a parameter, with the others fitted again at each of its values.
-
-`propagate_error`: a figure computed from estimates, with the confidence interval that theirs imply.
-"""
+"""`profile`: a parameter's profile-likelihood interval; `propagate_error`: a figure of estimates, with its interval."""
 
 import itertools
 import math
@@ -180,7 +177,8 @@ class _Refits:
         last, steps = Stage(result.stats["gap_deviation"], REFIT_ITERATIONS, refine=4), int(result.stats["substeps"])
         method = replace(problem.method, stages=(last,), substeps=max(1, steps // 4), progress=None)
         self.method = replace(method, checks_steps=False)
-        self.spread = self._search_deviation(float(result.estimates["stderr"][name]))
+        stderr = float(result.estimates["stderr"][name])
+        self.spread = stderr / self.parameter.value if self.parameter.log else stderr
         self.points: list[_ProfilePoint] = []
         self.refit_at(self.to_search(self.parameter.value))
         inflation = result.stats["variance_inflation"]
@@ -230,9 +228,6 @@ class _Refits:
             others = {n: point.fit.parameters.value(n) for n in self.start.parameters if n != self.name}
             rows.append({"value": self.value(point.z), "deviance": self.deviance_root(point) ** 2, **others})
         return pd.DataFrame(rows)
-
-    def _search_deviation(self, stderr: float) -> float:
-        return stderr / self.parameter.value if self.parameter.log else stderr
 
     def _scale(self, noise: float, *, limited: bool) -> float:
         """The cost that counts as one variance, from the curvature: weighted gaps rise less than the likelihood.
@@ -382,20 +377,7 @@ def propagate_error(result: IdentificationResult, function: Callable[[ParameterV
 def propagate_intervals(
     result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]
 ) -> tuple[Array, Array]:
-    """Compute several figures at once with their 95 % confidence intervals, as a curve over a grid.
-
-    Parameters
-    ----------
-    result : IdentificationResult
-    function : callable
-        As for `propagate_error`; returns n numbers.
-
-    Returns
-    -------
-    values : ndarray, shape (n,)
-    intervals : ndarray, shape (n, 2)
-        NaN where a figure depends on a parameter without an interval.
-    """
+    """Figures (n,) with their 95 % intervals (n, 2), NaN where a parameter of theirs has none; as `propagate_error`."""
     values, slopes = _linearise(result, function)
     dof = result.estimates["dof"][result.covariance.index].to_numpy(dtype=float)
     spreads, degrees = _deviations(result, slopes), [min(dof[row != 0], default=math.inf) for row in slopes]
@@ -409,9 +391,11 @@ def _linearise(result: IdentificationResult, function: Callable[[ParameterValues
     found = {str(n): float(v) for n, v in result.estimates["value"].items()}
     at = {**known, **{n: known[n.partition("[")[0]] if math.isnan(v) else v for n, v in found.items()}}
     variances = np.diag(result.covariance.to_numpy(dtype=float))
-    slopes = [
-        _central_difference(function, at, str(n), v) for n, v in zip(result.covariance.index, variances, strict=True)
-    ]
+    slopes = []
+    for name, variance in zip(map(str, result.covariance.index), variances, strict=True):
+        step = DELTA_METHOD_STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
+        up, down = (np.asarray(function({**at, name: at[name] + side * step}), dtype=float) for side in (1, -1))
+        slopes.append((up - down) / (2 * step))
     value = np.asarray(function(at), dtype=float)
     return value, np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
 
@@ -421,11 +405,3 @@ def _deviations(result: IdentificationResult, slopes: Array) -> Array:
     used = np.any(slopes != 0, axis=0)  # parameters without an interval do no harm where no figure depends on them
     covariance = result.covariance.to_numpy(dtype=float)[np.ix_(used, used)]
     return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", slopes[:, used], covariance, slopes[:, used])))
-
-
-def _central_difference(
-    function: Callable[[ParameterValues], ArrayLike], at: ParameterValues, name: str, variance: float
-) -> Array:
-    step = DELTA_METHOD_STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
-    up, down = (np.asarray(function({**at, name: at[name] + side * step}), dtype=float) for side in (1, -1))
-    return np.asarray((up - down) / (2 * step))

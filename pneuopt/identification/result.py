@@ -1,10 +1,7 @@
-"""`IdentificationResult`: estimates with intervals; `Verdict`: which parameters the logs identify, and how well.
+"""`IdentificationResult`: estimates with intervals and marks; `Verdict`: which parameters the logs identify, how well.
 
-`Mark`: how far an estimate can be trusted, and the notes that stand beside one.
-
-The motion that a set of logs shows, what it lacks to identify a parameter, and the run that would identify it.
-
-Which motion a parameter needs is declared by the model (`System.excitation`).
+Below: their tables and words, the motion that a set of logs shows, what it lacks to identify a parameter
+(`System.identification_hints`), and the run that would identify it.
 """
 
 import math
@@ -16,8 +13,8 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from pneuopt.dynamics.hooks import Excitation, Lack, LoggedMotion
-from pneuopt.identification.tolerances import INFINITE_INFLATION, MAX_FIT_ROWS, MOVING_SPEED_SHARE
+from pneuopt.dynamics.hooks import IdentificationHints, Lack, LoggedMotion
+from pneuopt.identification.tolerances import MOVING_SPEED_SHARE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
@@ -45,7 +42,7 @@ class Verdict(Shown):
         By parameter: why the logs do not identify it, or only roughly, and which run would.
     unchanged : tuple of str
         Parameters that a fit left at their given values.
-    excitation : Excitation
+    identification_hints : IdentificationHints
         The model's: which runs would show or separate its parameters.
     """
 
@@ -53,7 +50,7 @@ class Verdict(Shown):
     indistinguishable: tuple[tuple[str, ...], ...]
     reasons: Mapping[str, str]
     unchanged: tuple[str, ...] = ()
-    excitation: Excitation = field(default_factory=Excitation)
+    identification_hints: IdentificationHints = field(default_factory=IdentificationHints)
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -70,14 +67,18 @@ class Verdict(Shown):
             f"the logs {'do not identify' if is_unknown else 'identify only roughly'} {join_names(names)}: {reason}"
             for (is_unknown, reason), names in by_reason.items()
         ]
-        groups = [_describe_group(group, self.table["inflation"], self.excitation) for group in self.indistinguishable]
-        return (*single, *groups, *([self._describe_unchanged()] if self.unchanged else []))
-
-    def _describe_unchanged(self) -> str:
-        """A sentence on the values at which a fit has held parameters."""
+        hints, inflation = self.identification_hints, self.table["inflation"]
+        groups = []
+        for group in self.indistinguishable:
+            times = float(inflation[list(group)].max())
+            known = f"each {times:.0f} times better known if the others are fixed"
+            known = known if times < 1e5 else "nothing separates them"  # beyond it the figure is rounding
+            groups.append(f"{join_names(group)} act only together ({known}): {remedy(hints, group)}")
+        if not self.unchanged:
+            return (*single, *groups)
         values = join_names([f"{n} ({self.table['value'][n]:.4g})" for n in self.unchanged])
         verb = "keep their given values" if len(self.unchanged) > 1 else "keeps its given value"
-        return f"{values} {verb}, on which the other intervals do not rest"
+        return (*single, *groups, f"{values} {verb}, on which the other intervals do not rest")
 
     def to_dict(self) -> dict[str, Any]:
         """The verdict without its table, for a file."""
@@ -309,14 +310,7 @@ class IdentificationResult(Result):
 
 
 def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> Report:
-    """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen.
-
-    Parameters
-    ----------
-    estimates : DataFrame
-        Of an `IdentificationResult`.
-    widths : sequence of ChosenWidth
-    """
+    """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen."""
     rows = [_estimate_row(str(n), row) for n, row in estimates.to_dict(orient="index").items()]
     rows += [(w.name, format_number(w.value, 3), "-", w.unit, "chosen") for w in widths]
     columns = *text_columns("parameter"), *number_columns("value", f"95{TIED}% interval"), *text_columns("unit", "mark")
@@ -324,17 +318,11 @@ def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = 
     return Report((*table, *(Line(str(width)) for width in widths)))
 
 
-def report_agreement(fit: "pd.DataFrame") -> Report:
-    """Agreement of each log and channel; of many logs the median and the worst.
-
-    Parameters
-    ----------
-    fit : DataFrame
-        Of an `IdentificationResult`, or from `validate`.
-    """
+def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:
+    """Agreement of each log and channel; of more than so many the median and the worst."""
     if fit.empty:  # no channel was compared
         return Report()
-    if len(fit) > MAX_FIT_ROWS:
+    if len(fit) > most_rows:
         return Report((_agreement_in_short(fit),))
     rows = []
     for row in fit.reset_index().to_dict(orient="records"):
@@ -343,16 +331,6 @@ def report_agreement(fit: "pd.DataFrame") -> Report:
         rows.append((str(row["log"]), str(row["channel"]), *figures, str(row["unit"])))
     figures_heads = number_columns("NRMSE [%]", "free run", "RMSE", "free run")
     return Report((Table((*text_columns("log", "channel"), *figures_heads, *text_columns("unit")), tuple(rows)),))
-
-
-def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:
-    times = float(inflation[list(group)].max())
-    message = (
-        f"each {times:.0f} times better known if the others are fixed"
-        if times < INFINITE_INFLATION
-        else "nothing separates them"
-    )
-    return f"{join_names(group)} act only together ({message}): {remedy(excitation, group)}"
 
 
 def join_names(names: Sequence[str]) -> str:
@@ -378,7 +356,9 @@ def _agreement_in_short(fit: "pd.DataFrame") -> Table:
 def _estimate_row(name: str, row: Mapping[Hashable, Any]) -> tuple[str, str, str, str, str]:
     value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
     if math.isnan(row["ci_low"]) and math.isfinite(row["range_low"]):
-        interval = _format_range(float(row["range_low"]), float(row["range_high"]))
+        low, high = float(row["range_low"]), float(row["range_high"])
+        spread = (high - low) / 4  # the digits then show a fiftieth of the range, which is no confidence interval
+        interval = f"range{TIED}{_join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))}"
     value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
     mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
     return name, value, interval, str(row["unit"]), str(mark)
@@ -392,12 +372,6 @@ def _format_interval(value: float, spread: float, low: float, high: float) -> tu
     if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
         return format_number(value, 4), "not determined"
     return _format_to_stderr(value, spread), _join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))
-
-
-def _format_range(low: float, high: float) -> str:
-    """A range, which is no confidence interval, with the digits that show a fiftieth of it."""
-    spread = (high - low) / 4
-    return f"range{TIED}{_join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))}"
 
 
 def _join_ends(low: str, high: str) -> str:
@@ -443,33 +417,23 @@ _VALUE_IN_WORDS = re.compile(r"<(?:([\d.]+) )?(\w+)>")
 def summarise_motion(
     experiments: Sequence[Experiment], states: Mapping[str, Trajectory], values: ParameterSet, given: ParameterSet
 ) -> LoggedMotion | None:
-    """Summarise the speeds and accelerations of all logs.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    states : mapping of str to Trajectory
-        Estimated states of each log, whose speed counts where none is logged.
-    values, given : ParameterSet
-        As estimated from the logs, and as the user gives them.
-
-    Returns
-    -------
-    LoggedMotion or None
-        None where no log has a speed, or nothing moves.
-    """
-    runs = [r for e in experiments if (r := _speed(e, states.get(e.name))) is not None]
+    """The speeds and accelerations of all logs, of estimated states where none is logged; None where nothing moves."""
+    sources = [e.trajectory if "speed" in e.trajectory else states.get(e.name) for e in experiments]
+    speeds = [(s.t, s["speed"]) for s in sources if s is not None and "speed" in s]
+    runs = [(t[np.isfinite(speed)], speed[np.isfinite(speed)]) for t, speed in speeds]
     v = np.concatenate([speed for _, speed in runs]) if runs else np.zeros(0)
     if not np.any(v):
         return None
     moving = v[np.abs(v) > MOVING_SPEED_SHARE * float(np.quantile(np.abs(v), 0.99))]
     low, high = np.quantile(np.abs(moving), [0.1, 0.9])
-    rates = np.concatenate([_acceleration(t, speed) for t, speed in runs])
+    strides = [(t, speed, max(1, len(t) // 200)) for t, speed in runs]
+    rates = np.concatenate([np.diff(speed[::k]) / np.diff(t[::k]) for t, speed, k in strides])
+    sides = [np.sign(speed[np.abs(speed) > MOVING_SPEED_SHARE * float(high)]) for _, speed in runs]
     return LoggedMotion(
         float(low),
         float(high),
         float(np.mean(moving > 0)),
-        sum(_count_reversals(speed, MOVING_SPEED_SHARE * float(high)) for _, speed in runs),
+        sum(int(np.count_nonzero(np.diff(side))) for side in sides),
         float(np.sqrt(np.mean(rates**2))),
         v,
         values,
@@ -478,48 +442,29 @@ def summarise_motion(
 
 
 def missing_excitation(
-    excitation: Excitation, name: str, free: Sequence[str], seen: LoggedMotion | None
+    hints: IdentificationHints, name: str, free: Sequence[str], seen: LoggedMotion | None
 ) -> Lack | None:
-    """The motion that the logs lack to identify a parameter, and the run to log; None if nothing known is lacking.
-
-    Parameters
-    ----------
-    excitation : Excitation
-        The model's.
-    name : str
-        Of the parameter, "name[log]" for one of a log.
-    free : sequence of str
-        All parameters that are to be identified at once.
-    seen : LoggedMotion or None
-    """
-    need = excitation.needs.get(_base_name(name))
+    """The motion that the logs lack to identify a parameter, and the run to log; None if nothing known is lacking."""
+    need = hints.needs.get(_base_name(name))
     if need is None or seen is None:
         return None
     others = {_base_name(n) for n in free} - {_base_name(name)}
     return need.lack(seen) if need.confused_with & others or not need.confused_with else None
 
 
-def remedy(excitation: Excitation, names: Sequence[str]) -> str:
+def remedy(hints: IdentificationHints, names: Sequence[str]) -> str:
     """The run that would separate these parameters, in words."""
     bases = {_base_name(n) for n in names}
-    for run in excitation.runs:
+    for run in hints.runs:
         if bases & run.some and (len(bases) == 1 or bases & run.others):
             return _write_values(run.words, ParameterSet())
     return f"fix {'it' if len(bases) == 1 else 'one of them'}, or log a run that moves differently"
 
 
-def with_values_in_words(excitation: Excitation, values: ParameterSet) -> Excitation:
-    """The excitation, with the values in use in the words of its runs.
-
-    Parameters
-    ----------
-    excitation : Excitation
-        In whose words "<stribeck_velocity>" stands for the value of the parameter that ends so, "<5 stribeck_velocity>"
-        for five times it.
-    values : ParameterSet
-    """
-    runs = tuple(replace(run, words=_write_values(run.words, values)) for run in excitation.runs)
-    return replace(excitation, runs=runs)
+def with_values_in_words(hints: IdentificationHints, values: ParameterSet) -> IdentificationHints:
+    """The hints with values in their runs' words: "<5 stribeck_velocity>" becomes five times that parameter's value."""
+    runs = tuple(replace(run, words=_write_values(run.words, values)) for run in hints.runs)
+    return replace(hints, runs=runs)
 
 
 def _write_values(words: str, values: ParameterSet) -> str:
@@ -538,15 +483,6 @@ def _write_values(words: str, values: ParameterSet) -> str:
 
 def _base_name(name: str) -> str:
     return name.partition("[")[0]
-
-
-def _speed(experiment: Experiment, states: Trajectory | None) -> tuple[Array, Array] | None:
-    log = experiment.trajectory
-    source = log if "speed" in log else states
-    if source is None or "speed" not in source:
-        return None
-    known = np.isfinite(source["speed"])
-    return source.t[known], source["speed"][known]
 
 
 def _acceleration(t: Array, v: Array) -> Array:

@@ -1,11 +1,9 @@
-"""`review_fit`: corrected intervals of a fit, its unidentifiable parameters, and the worst place of a failed fit.
+"""`review_fit`: corrected intervals of a fit, what its logs do not identify, and the worst place of a failed fit.
 
-`FixedValueTest`: whether a fixed value that is wrong explains why a model misses its logs, and which one.
-
-Each fixed parameter counts as one more unknown where a search has ended, and the gradient of the cost by it tells how
-much of the misfit its freeing would take away (Rao's score test, Proc. Cambridge Philos. Soc. 44, 1948): one run with
-more sensitivities for all of them. The promise is linear, and a wrong model promises much; so the best are tried, each
-by a fit with it freed, and one is named by what that fit has found.
+`FixedValueTest`: whether a wrong fixed value explains why a model misses its logs, and which one. Each fixed parameter
+counts as one more unknown where a search has ended, and the gradient of the cost by it tells how much of the misfit its
+freeing would take away (Rao's score test, Proc. Cambridge Philos. Soc. 44, 1948). The promise is linear, and a wrong
+model promises much; so the best are tried, each by a fit with it freed, and named by what that fit finds.
 """
 
 import math
@@ -35,12 +33,12 @@ from pneuopt.identification.result import (
 )
 from pneuopt.identification.tolerances import (
     ALIKE_SQUARES,
+    CLEAR_DEVIATIONS,
     GAP_SUBSTEPS,
     LAST_TRIAL_ITERATIONS,
     MAX_FREED_TRIALS,
     MAX_LINEAR_DEVIATION,
     MAX_TESTS,
-    MIN_CHANGE,
     MIN_EXPLAINED_SHARE,
     MIN_PROMISED_SHARE,
     MIN_RELATIVE_CHANGE,
@@ -66,25 +64,10 @@ if TYPE_CHECKING:
 def review_fit(
     problem: EstimationProblem, result: IdentificationResult, unidentifiable: Sequence[str] = ()
 ) -> tuple[IdentificationResult, tuple[Profile, ...]]:
-    """Review the intervals of a fit, and mark what its logs do not identify.
+    """Review the intervals of a fit, mark what its logs do not identify, and return the profiles traced on the way.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    result : IdentificationResult
-        The result of the search, with linear intervals.
-    unidentifiable : sequence of str
-        Free parameters that rest on a prior: those held, and those whose variance the priors dominate.
-
-    Returns
-    -------
-    result : IdentificationResult
-        The result with its verdict; where the search did not converge, without any interval, and with the worst place
-        in its status. Doubtful intervals are replaced by those of the profile likelihood; a parameter with an open
-        interval, or one that the logged motion does not excite, has no standard deviation. Ctrl-C leaves the other
-        intervals as they are, and the status says so.
-    profiles : tuple of Profile
-        Those that were traced.
+    Doubtful linear intervals become those of the profile likelihood. Without convergence no interval stays, and the
+    status names the worst place. Ctrl-C leaves the other intervals as they are.
     """
     start = problem.start_from(result)
     if not result.status.converged:
@@ -101,26 +84,21 @@ def review_fit(
     profiles, waiting = _profiles(problem, result)
     result = _widen_dragged(result, profiles)
     trusted = result.stats["chi_square_ratio"] <= MAX_CHI_SQUARE_RATIO
-    verdict = verdict_from_covariance(
-        problem, start, _blank_covariance(result.covariance, unidentifiable), trusted=trusted
-    )
+    known, names = result.covariance.copy(), list(unidentifiable)
+    known.loc[names] = math.nan
+    known[names] = math.nan
+    verdict = verdict_from_covariance(problem, start, known, trusted=trusted)
     verdict = add_profiles(verdict, profiles)
     if unidentifiable:
         local = _verdict_at(problem, start, result)
-        verdict = add_unidentifiable(verdict, unidentifiable, local, _names_at_given_value(problem))
+        given = problem.unknowns()
+        unchanged = [n for n, v in problem.fixed.items() if v == given.value(n)]
+        verdict = add_unidentifiable(verdict, unidentifiable, local, unchanged)
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _widen_covariance(result.covariance, estimates["stderr"])
     status = _name_part(problem, _name_interruption(result.status, waiting), verdict)
     result = replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
     return result, tuple(profiles.values())
-
-
-def _blank_covariance(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
-    """The covariance with NaN for the named parameters."""
-    out, own = covariance.copy(), list(names)
-    out.loc[own] = math.nan
-    out[own] = math.nan
-    return out
 
 
 def _widen_covariance(covariance: "pd.DataFrame", stderr: "pd.Series[float]") -> "pd.DataFrame":
@@ -135,12 +113,6 @@ def _blank_intervals(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.Dat
     out = estimates.copy()
     out.loc[list(names), ["stderr", "ci_low", "ci_high", "range_low", "range_high"]] = math.nan
     return out
-
-
-def _names_at_given_value(problem: EstimationProblem) -> tuple[str, ...]:
-    """The parameters that are held at their given values."""
-    given = problem.unknowns()
-    return tuple(n for n, v in problem.held.items() if v == given.value(n))
 
 
 def _verdict_at(problem: EstimationProblem, start: Start, result: IdentificationResult) -> Verdict:
@@ -252,7 +224,7 @@ def _locate_failure(problem: EstimationProblem, start: Start, status: Status, ve
 def _name_part(problem: EstimationProblem, status: Status, verdict: Verdict) -> Status:
     """The status of a fit with what its logs do not identify, and where that is held; first where it is good."""
     unknowns = problem.unknowns()
-    held = [f"{n} at {write_value(problem.held[n], p.unit, 3)}" for n, p in unknowns.items() if n in problem.held]
+    held = [f"{n} at {write_value(problem.fixed[n], p.unit, 3)}" for n, p in unknowns.items() if n in problem.fixed]
     words = f"held: {join_names(held)}; the intervals of the others allow for a factor of ten" if held else ""
     said = tuple(filter(None, (_name_unidentifiable(verdict), words)))
     if not said or status.code is not Code.CONVERGED:
@@ -305,31 +277,16 @@ NATURE = ("ambient.", "gas.")
 
 @dataclass(frozen=True)
 class WrongValue:
-    """A fixed value that is wrong by the logs.
-
-    Attributes
-    ----------
-    name : str
-    given, found : float
-        The fixed value, and that of a fit with it freed [unit].
-    unit : str
-    share : float
-        Of the squared residuals beyond the noise that this fit explains [1].
-    squares : float
-        And gaps that this fit leaves, in noise variances.
-    alike : tuple of str
-        Other fixed values of which each would explain as much.
-    lag : float
-        The dead time in place of which the value may stand [s]; 0 where it is no bandwidth, or not a lower one.
-    """
+    """A fixed value that is wrong by the logs."""
 
     name: str
-    given: float
-    found: float
+    given: float  # the fixed value [unit]
+    found: float  # that of a fit with it freed [unit]
     unit: str
-    share: float
-    squares: float
-    alike: tuple[str, ...] = ()
+    share: float  # of the squared residuals beyond the noise that this fit explains [1]
+    squares: float  # residuals and gaps that this fit leaves, in noise variances
+    alike: tuple[str, ...] = ()  # other fixed values of which each would explain as much
+    # the dead time in place of which the value may stand [s]; 0 where it is no bandwidth, or not a lower one
     lag: float = 0.0
 
     @property
@@ -349,38 +306,19 @@ class WrongValue:
 
 @dataclass
 class FixedValueTest:
-    """The test of the fixed values of one problem, after the searches that have missed its logs.
+    """The test of the fixed values of one problem, after the searches that have missed its logs."""
 
-    Attributes
-    ----------
-    found : WrongValue or None
-        The value that explains most of the misfit.
-    tests : int
-        How many fits have been tested.
-    """
-
-    found: WrongValue | None = None
-    tests: int = field(default=0)
+    found: WrongValue | None = None  # the value that explains most of the misfit
+    tests: int = field(default=0)  # how many fits have been tested
 
     def explains(self, problem: EstimationProblem, fit: Fit) -> bool:
-        """Whether a fixed value explains most of what a fit misses; `found` then names it.
-
-        Parameters
-        ----------
-        problem : EstimationProblem
-        fit : Fit
-            Any, of that problem.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a fixed value explains most of what a fit misses; `found` then names it."""
         is_cut = fit.status.code in (Code.INTERRUPTED, Code.DIVERGED)
         if (
             is_cut
             or problem.weights
             or self.tests >= MAX_TESTS
-            or not _misses_logs(fit)
+            or not (2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count or fit.jumps is not None)
             or not math.isfinite(fit.stats["cost"])
         ):
             return False
@@ -390,23 +328,7 @@ class FixedValueTest:
 
 
 def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
-    """The fixed value whose freeing explains most of the misfit of a fit; None where none explains enough.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-        With residuals beyond the noise.
-
-    Returns
-    -------
-    WrongValue or None
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If a trial is interrupted, by Ctrl-C or at the end of a CPU budget.
-    """
+    """The fixed value whose freeing explains most of the misfit of a fit; None where none explains enough."""
     without, freed = _promised_squares(problem, fit)
     excess = (without if fit.jumps is not None else 2 * fit.stats["cost"]) - fit.count
     promised = [((without - squares) / max(excess, without - fit.count), name) for name, squares in freed.items()]
@@ -435,14 +357,12 @@ def _dead_time(problem: EstimationProblem, value: WrongValue) -> float:
     return max(0.0, (1 / value.found - 1 / value.given) / (2 * math.pi))
 
 
-def _misses_logs(fit: Fit) -> bool:
-    """Whether residuals and gaps of a fit are beyond the noise, or gaps stand for noise of the states."""
-    return 2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count or fit.jumps is not None
-
-
 def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
     """The squares with tight gaps by the equations linearised at a fit, and those with each fixed value freed."""
-    names = _fixed_values(problem)
+    # a fixed parameter may be wrong unless it is a width, or each log has or states one of its own
+    stated = {n for e in problem.experiments for n in e.conditions} | set(fixed_widths(problem))
+    fixed = {n: p for n, p in problem.parameters.items() if not (p.free or p.per_log) and n not in stated}
+    names = [n for n, p in fixed.items() if p.lower < p.value < p.upper]
     if not names:
         return math.nan, {}
     freed = replace(problem, parameters=problem.parameters.freed(*names))
@@ -453,13 +373,6 @@ def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict
     movable = scaling.has_effect(equations) & ~scaling.fixed & ~scaling.at_bound(begun.iterate.z)
     squares = {name: equations.promised_squares(movable & (~tested | (np.array(free) == name))) for name in names}
     return equations.promised_squares(movable & ~tested), squares
-
-
-def _fixed_values(problem: EstimationProblem) -> list[str]:
-    """The fixed parameters that may be wrong: all but widths, and what each log has or states by itself."""
-    stated = {n for e in problem.experiments for n in e.conditions} | set(fixed_widths(problem))
-    fixed = {n: p for n, p in problem.parameters.items() if not (p.free or p.per_log) and n not in stated}
-    return [n for n, p in fixed.items() if p.lower < p.value < p.upper]
 
 
 def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -> WrongValue | None:
@@ -475,7 +388,7 @@ def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -
     if found.covariance is not None:
         noise = max(1.0, found.chi_square / found.count)
         deviation = math.sqrt(noise * found.covariance[place, place])
-    least = max(MIN_CHANGE * deviation, MIN_RELATIVE_CHANGE * abs(given.value))
+    least = max(CLEAR_DEVIATIONS * deviation, MIN_RELATIVE_CHANGE * abs(given.value))
     is_clear = abs(value - given.value) > least and not found.at_bound[place]
     if not (share >= MIN_EXPLAINED_SHARE and is_clear and found.jumps is None):
         return None

@@ -1,51 +1,19 @@
-"""`fit_from_starts`: the best fit from the model's own starts, with the parameters held that the logs cannot identify.
+"""`fit_from_starts`: the best fit from the model's own starts, with the parameters held that logs cannot identify.
 
 The first start is tried alone. Where it is left, the parameters to which the prediction errors of a filter lead are
-tried (`predicted_fit`). Where these fail, too, the guessed parameters of each other start (`trial_parameters`, as the
-Stribeck velocity) are held for a few iterations, until the states and the other parameters have settled to them; the
-first that explains the logs is tried at once, the others are then tried by the cost they reached.
+tried (`fit_from_predictions`). Where these fail, too, the guessed parameters of each other start (`trial_parameters`,
+as the Stribeck velocity) are held for a few iterations, until the states and the other parameters have settled to them;
+the first that explains the logs is tried at once, the others are then tried by the cost they reached. A parameter that
+the data do not determine is held at its given value: that needs no weight for a prior beside that of the data, and the
+prior's spread is counted in the covariance of the others (`Fit.prior_covariance`).
 
-A parameter that the data do not determine is held at its given value. A weak prior (a decade about that value) would
-leave it there, too; holding it needs no weight for the prior beside that of the data, and the prior's spread is counted
-in the covariance of the others (`Fit.prior_covariance`).
+`fit_logs`: the short ways of long logs first: most need no more than a short search. Where gaps have to close slowly, a
+filter follows the parameters that wide gaps have found, or those of the liveliest part of each log (`cut_excerpts`),
+from node to node, and the tight gaps begin with its states (`problems/identify/random_plants.py --kind other`).
 
-`rank`: which of several fits of the same logs is the best; `are_alike`: whether two have found one optimum.
-
-`fit_logs`: the best fit of an estimation problem, the short ways of long logs first.
-
-Most long logs need no more than a short search. Where gaps have to close slowly, a filter follows the parameters that
-wide gaps have found, or those of a part of each log, from node to node, and the tight gaps begin with its states.
-
-`cut_excerpts`: the same problem on the liveliest part of each long log, from whose answer the whole one begins.
-
-A search costs as much as its logs are long, and most of its iterations find the way from a rough start; a part of a
-minute's log shows that way as well (`problems/identify/random_plants.py --kind other`).
-
-`fit_from_predictions`: the fit that begins with the parameters by which a filter predicts a part of the logs best.
-
-It is for logs whose first start has failed. Each of the model's guesses is tried with several values of what another
-parameter bounds (static friction, which filtered speeds show too low); the best of them descend side by side
-(`shooting.prediction_errors`), and the search with tight gaps begins with the states that a filter finds by what they
-lead to. Six of nine logs that stick and slip, and that no other start explained in 60 CPU s, are explained so.
-
-`fit_with_closed_gaps`: the optimum of a model that misses its logs, with gaps so tight that they carry no misfit.
-
-A search ends with gaps that a right model closes. A wrong model leaves them open at its optimum, where they take a part
-of the misfit, and the estimates depend on their weight. Gaps that are weighed more, from there on, close: what is left
-is the least squares of the whole logs' simulation, of which the estimates are a property of model and logs alone.
-
-`fit_from_profiles`: the fit to which a profile has shown the way, where the search has ended beside its optimum.
-
-A profile fits all other parameters again at each value of one. Where it finds less cost than the fit, its interval lies
-elsewhere: an estimate outside of its own interval is no optimum.
-
-`hold_order`: what no plant has below another parameter, but a search has left there, is held at that one's value.
-
-`mark_order` is for logs that reject this, and put one parameter below the other beyond chance: the model then lacks
-something, as friction that builds up over a displacement.
-
-Static friction of 0 N is no friction that a drive has. It only says that the logs do not show any beyond Coulomb
-friction, so it is held at Coulomb friction, as what is not identified, and the others are fitted again.
+What mends an end: `tighten_gaps`, where the gaps of a wrong model take a part of its misfit; `fit_from_profiles`, where
+a profile finds less cost than the fit; `enforce_ordering`, where a search has left a parameter below one that bounds it
+(static friction of 0 N), and `mark_order`, where the logs put it there beyond chance.
 """
 
 import math
@@ -57,7 +25,7 @@ import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.identifiability import rejects_held_values, rests_on_prior, verdict_from_sensitivities
+from pneuopt.identification.identifiability import prior_dominated, rejects_fixed_values, verdict_from_sensitivities
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.profiles import Profile
@@ -65,6 +33,7 @@ from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.identification.tolerances import (
     ACCEPTED_CHI_SQUARE_RATIO,
     BEST,
+    CLEAR_DEVIATIONS,
     DECIDING,
     EXCERPT_SEGMENTS,
     GAP_FACTOR,
@@ -72,7 +41,6 @@ from pneuopt.identification.tolerances import (
     GUESS_STAGES,
     HOPELESS_MISFIT,
     LEVELS,
-    MAX_BELOW_DEVIATIONS,
     MAX_CLOSED_MISFIT,
     MAX_CLOSED_SHARE,
     MAX_COST,
@@ -108,30 +76,8 @@ def fit_from_starts(
 ) -> Candidate:
     """Fit from the first start that converges at the noise's level; else take the best of all that were tried.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    loss : Loss, optional
-    estimate_noise : bool
-    gives_up : callable
-        Called with the best fit so far, where it is an optimum or the second one: whether another start cannot help.
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With the values held, the weights and the noise levels that the fit ended with.
-    fit : Fit
-        A wrong basin can converge, too, but leaves residuals above the noise; so more starts are tried until two of
-        them agree on the least cost; so is one more where a parameter is not clearly above another that bounds
-        it. Where a search explains the logs but for a parameter that does not settle, that one is held and one more
-        start is tried.
-    label : str
-        The label of its start.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If it comes before the first fit; after that the best fit so far is returned, marked.
+    A wrong basin leaves residuals above the noise, so more starts are tried until two agree on the least cost.
+    `gives_up` is called with the best fit so far: whether another start cannot help.
     """
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
@@ -143,15 +89,15 @@ def fit_from_starts(
             limit = HOPELESS_MISFIT if may_wait else math.inf
             known = _joinable_costs(fits) if is_plain else ()
             tried = replace(problem, method=_method_after(problem, fits)) if known else problem
-            held, fit = fit_holding_unidentifiable(tried, start, limit, known)
+            held, fit = fit_fixing_unidentifiable(tried, start, limit, known)
             held = replace(held, method=problem.method)
             if fit.end is SearchEnd.DUPLICATE:
                 break
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
-            if explains_to_noise(held, fit) and not held.held and is_in_order(held, fit):
+            if explains_to_noise(held, fit) and not held.fixed and is_in_order(held, fit):
                 return held, fit, start.label
             if fit.status.code is not Code.INTERRUPTED and is_at_noise(held, fit):
-                held, fit = fit_a_part(held, fit, start.label)
+                held, fit = fit_without_unsettled(held, fit, start.label)
             interrupted = fit.status.code is Code.INTERRUPTED
             fits.append((held, fit, start.label))
             fits.sort(key=lambda each: rank(each[1], tightest))
@@ -166,7 +112,7 @@ def fit_from_starts(
         interrupted = True
     held, fit, label = fits[0]
     if not interrupted:
-        held, fit = fit_a_part(held, fit, label)
+        held, fit = fit_without_unsettled(held, fit, label)
         interrupted = fit.status.code is Code.INTERRUPTED
     return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
 
@@ -203,31 +149,10 @@ def starts_by_cost(
     left_after: Callable[[], int] = lambda: 0,
     left_cost: Callable[[], float] = lambda: math.nan,
 ) -> Iterator[Start]:
-    """The model's first start; if more are asked for, the others: settled to what each holds, the least cost first.
+    """The model's first start, then the others, settled to what each holds, the least cost first.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    confirms : callable
-        Called before each further start: whether the first led to an optimum that only needs confirmation. The next
-        start is then taken as it is, for settling all would cost more; the others are settled where it is not called
-        enough.
-    left_after : callable
-        Called before the others settle: the stages after which the first start was left, 0 if it was not. The others
-        then get no more than those, either.
-    left_cost : callable
-        Called then, too: the cost of the first start after as many stages as the others get, NaN if it got fewer. Where
-        a start costs the same with another guess held, the guess is not what is wrong, and no more of them settle.
-
-    Yields
-    ------
-    Start
-        One that explains the logs to their noise with its guesses held comes as soon as it has settled.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If a start was interrupted while it settled.
+    `confirms` tells whether the first optimum only needs confirmation, by the next start as it is; `left_after` after
+    how many stages the first start was left, `left_cost` what it cost after as many as the others get.
     """
     candidates = problem.candidates()
     yield candidates[0]
@@ -286,7 +211,7 @@ def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> 
     return (gap, cost), replace(start, parameters={**start.parameters, **guesses}), explains
 
 
-def fit_holding_unidentifiable(
+def fit_fixing_unidentifiable(
     problem: EstimationProblem,
     start: Start,
     max_misfit: float = math.inf,
@@ -294,19 +219,7 @@ def fit_holding_unidentifiable(
 ) -> tuple[EstimationProblem, Fit]:
     """Fit from one start; while the data do not determine a parameter, hold that one and fit again.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    start : Start
-    max_misfit, known_costs
-        As of `LeastSquares`, for the first fit.
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With what is held: at the given values, or, if the logs reject those, where the search had left them.
-    fit : Fit
-        The first one, where holding does not converge, or would leave no parameter to estimate.
+    It is held at its given value, or, if the logs reject that, where the search had left it.
     """
     method = replace(problem.method, max_misfit=max_misfit, known_costs=known_costs)
     first = solve_least_squares(problem.transcription(start), method)
@@ -315,7 +228,9 @@ def fit_holding_unidentifiable(
     for is_given in (True, False) if not first.status.converged else (True,):
         held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
         is_settled = fit.status.converged and not fit.unidentifiable
-        if fit.status.code is Code.INTERRUPTED or (is_settled and not rejects_held_values(fit, first, len(held.held))):
+        if fit.status.code is Code.INTERRUPTED or (
+            is_settled and not rejects_fixed_values(fit, first, len(held.fixed))
+        ):
             return held, fit
     return problem, first
 
@@ -327,8 +242,8 @@ def _hold_unidentifiable(
     held, fit, given = problem, first, problem.unknowns()
     warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
     source = given if is_given else first.parameters
-    while fit.unidentifiable and len(held.held) + len(fit.unidentifiable) < len(given.free_names):
-        held = replace(held, held={**held.held, **{n: source.value(n) for n in fit.unidentifiable}})
+    while fit.unidentifiable and len(held.fixed) + len(fit.unidentifiable) < len(given.free_names):
+        held = replace(held, fixed={**held.fixed, **{n: source.value(n) for n in fit.unidentifiable}})
         before, fit = fit, solve_least_squares(held.transcription(held.start_from(fit, label)), warm)
         fit = fit.with_effort_of(before)
         if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):
@@ -336,24 +251,8 @@ def _hold_unidentifiable(
     return held, fit
 
 
-def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
-    """Where a search did not settle in a parameter, the fit of the others with that one held where it had come to.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-        The best of all starts.
-    label : str
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With what is held.
-    fit : Fit
-        The given one, where nothing was unsettled, the rest does not converge either, or only the prior of what is held
-        tells of it; marked, if that was interrupted.
-    """
+def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
+    """Where a search did not settle in a parameter, the fit of the others with that one held where it came to."""
     held, part = problem, fit
     last = problem.method.stages[-REFIT_STAGES:]
     warm = replace(
@@ -361,9 +260,9 @@ def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
     )
     while not part.status.converged:
         names = part.unidentifiable or part.unsettled
-        if not names or len(held.held) + len(names) >= len(part.parameters.free_names):
+        if not names or len(held.fixed) + len(names) >= len(part.parameters.free_names):
             return problem, fit
-        held = replace(held, held={**held.held, **{n: part.parameters.value(n) for n in names}})
+        held = replace(held, fixed={**held.fixed, **{n: part.parameters.value(n) for n in names}})
         before, part = part, solve_least_squares(held.transcription(held.start_from(part, label)), warm)
         part = part.with_effort_of(before)
         if part.status.code is Code.INTERRUPTED:
@@ -378,9 +277,9 @@ def _rests_on_held(problem: EstimationProblem, fit: Fit) -> bool:
     if fit.covariance is None or fit.prior_covariance is None:
         return False
     names = fit.parameters.free_names
-    values, free = np.array([fit.parameters.value(n) for n in names]), [n not in problem.held for n in names]
+    values, free = np.array([fit.parameters.value(n) for n in names]), [n not in problem.fixed for n in names]
     covariance = fit.covariance + fit.prior_covariance
-    return bool(rests_on_prior(covariance, fit.prior_covariance, values, problem.held.values())[free].all())
+    return bool(prior_dominated(covariance, fit.prior_covariance, values, problem.fixed.values())[free].all())
 
 
 def explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
@@ -411,7 +310,7 @@ def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
 
 def _joinable_costs(fits: Sequence[Candidate]) -> tuple[tuple[float, float], ...]:
     """The costs at the end of the best search's stages, at which another one that joins it only confirms it."""
-    return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].held else ()
+    return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].fixed else ()
 
 
 def _method_after(problem: EstimationProblem, fits: Sequence[Candidate]) -> LeastSquares:
@@ -444,8 +343,8 @@ def is_in_order(problem: EstimationProblem, fit: Fit) -> bool:
     Where it is not, a search may have lost it: it has ended so at the noise, with a Stribeck velocity 13 times too
     high, while the logs showed static friction of nearly twice Coulomb's.
     """
-    order, found = problem.system.plant.excitation.at_least, fit.parameters
-    bounded = [n for n in found.free_names if n not in problem.held and order.get(n) in found]
+    order, found = problem.system.plant.identification_hints.at_least, fit.parameters
+    bounded = [n for n in found.free_names if n not in problem.fixed and order.get(n) in found]
     return all(found.value(n) >= (1 + MIN_EXCESS) * found.value(order[n]) for n in bounded)
 
 
@@ -476,19 +375,7 @@ def are_alike(best: Fit, second: Fit) -> bool:
 
 
 def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], Candidate]) -> Candidate:
-    """Fit long logs by the short ways where these lead to the noise, and else by a search from all starts.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    search : callable
-        `fit_from_starts`, which states what is returned.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If it comes before the first fit; after that the best fit so far is returned, marked.
-    """
+    """Fit long logs by the short ways where these lead to the noise, and else by a search from all starts."""
     tried = list[Candidate]()
     try:
         found = _fit_long_logs(problem, tried) or search(problem)
@@ -509,9 +396,9 @@ def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candid
     What was tried is appended to `tried`. With a parameter held, or one that does not settle, one more start has been
     tried before; with one that is not clearly above another that bounds it, one that has led to the same.
     """
-    for found in _tries_of_long_logs(problem):
+    for found in _tries(problem):
         held, fit, label = _settle(*found) if tried else found
-        is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.held or bool(tried))
+        is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.fixed or bool(tried))
         is_sure = is_in_order(held, fit) or any(_is_confirmed(fit, other) for _, other, _ in tried)
         tried.append((held, fit, label))
         if (is_answer and is_sure) or fit.status.code is Code.INTERRUPTED:
@@ -527,10 +414,10 @@ def _is_confirmed(fit: Fit, other: Fit) -> bool:
 def _settle(problem: EstimationProblem, fit: Fit, label: str) -> Candidate:
     """The fit; where it is at the noise but for a parameter that did not settle, that of the others."""
     is_unsettled = fit.status.code is Code.NOT_CONVERGED and is_at_noise(problem, fit)
-    return (*(fit_a_part(problem, fit, label) if is_unsettled else (problem, fit)), label)
+    return (*(fit_without_unsettled(problem, fit, label) if is_unsettled else (problem, fit)), label)
 
 
-def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
+def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
     """What is tried before a long search of long logs; nothing where they are short.
 
     First a short search: most logs need no more, and one that is cut near the noise goes on. Then the fit from states
@@ -559,7 +446,7 @@ def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
         return
     warm = replace(problem, method=replace(problem.method, stages=stages[-1:]))
     start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters), stages[-1].gap)
-    whole, fit = fit_holding_unidentifiable(warm, start, HOPELESS_MISFIT)
+    whole, fit = fit_fixing_unidentifiable(warm, start, HOPELESS_MISFIT)
     yield replace(whole, method=problem.method), fit, f"{label}, of a part"
 
 
@@ -580,22 +467,12 @@ def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> 
         return None
     tight = replace(problem, method=replace(problem.method, stages=stages[-1:], allows_state_noise=False))
     start = filter_states(tight, replace(rough, parameters=problem.start_from(settled).parameters))
-    held, fit = fit_holding_unidentifiable(tight, start, HOPELESS_MISFIT)
+    held, fit = fit_fixing_unidentifiable(tight, start, HOPELESS_MISFIT)
     return replace(held, method=problem.method), fit.with_effort_of(settled), rough.label
 
 
 def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
-    """The problem with an excerpt in place of each long log.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-
-    Returns
-    -------
-    EstimationProblem or None
-        None where there is nothing to gain: no long log, one with holes, windows, or a model without guesses to try.
-    """
+    """The problem with an excerpt in place of each long log."""
     if math.isfinite(problem.window) or not problem.has_gaps or len(problem.candidates()) < 2:
         return None
     if not problem.system.states or any(e.holes for e in problem.experiments) or problem.weights:
@@ -607,20 +484,7 @@ def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
 
 
 def filter_states(problem: EstimationProblem, start: Start, gathered: float = GATHERED_DEVIATION) -> Start:
-    """The start with states along the logs that fit its parameters (`shooting.state_filter`).
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    start : Start
-    gathered : float
-        As of `filter_nodes`; the better the parameters are known, the less.
-
-    Returns
-    -------
-    Start
-        As it was, where the CPU budget ends before.
-    """
+    """The start with states along the logs that fit its parameters (`shooting.state_filter`)."""
     segments = segment(problem.transcription(start))
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     try:
@@ -638,16 +502,6 @@ def liveliest_part(columns: Array, count: int) -> int:
     """The first row of the part of so many rows with the largest product of the columns' variances.
 
     A product, for a part in which one output hardly moves shows no friction, however much the others do.
-
-    Parameters
-    ----------
-    columns : ndarray, shape (m, ..., k)
-        NaN where nothing was measured.
-    count : int
-
-    Returns
-    -------
-    int
     """
     flat = columns.reshape(len(columns), -1, columns.shape[-1])
     known = np.isfinite(flat)
@@ -681,25 +535,7 @@ RATIOS = np.geomspace(1.1, 2.4, 8)
 
 
 def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit | None:
-    """The fit with tight gaps from where the prediction errors of a filter lead.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    max_misfit : float
-        As of `LeastSquares`.
-
-    Returns
-    -------
-    Fit or None
-        Whatever its status. None of a model without guesses, where logs have holes, windows or weights, and where no
-        parameters predict the part to its noise.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If it comes, or the CPU budget ends, before the search.
-    """
+    """The fit with tight gaps from where the prediction errors of a filter lead; None where no guess predicts."""
     bounded, guesses = _bounded_parameters(problem), [c for c in problem.candidates() if c.trial_parameters]
     if not bounded or len(guesses) < 2 or not _is_plain(problem):
         return None
@@ -734,7 +570,8 @@ def _is_plain(problem: EstimationProblem) -> bool:
 
 def _bounded_parameters(problem: EstimationProblem) -> dict[str, str]:
     """The free parameters that another one bounds, and that one."""
-    free, order = set(problem.parameters.free_names) - set(problem.held), problem.system.plant.excitation.at_least
+    free = set(problem.parameters.free_names) - set(problem.fixed)
+    order = problem.system.plant.identification_hints.at_least
     return {n: m for n, m in order.items() if n in free and m in free}
 
 
@@ -769,20 +606,10 @@ def _liveliest(segments: Segments, problem: EstimationProblem) -> Indices:
     return np.concatenate(parts)
 
 
-def fit_with_closed_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:
+def tighten_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:
     """The fit with tighter gaps, where a search has ended at an optimum whose gaps absorb the misfit.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-        Of whole logs.
-
-    Returns
-    -------
-    Fit or None
-        A converged one; None where the fit has not failed by its gaps alone, tighter ones lead to no optimum, or to
-        residuals so large that the model does not follow the logs.
+    None where they lead to no optimum, or to residuals so large that the model does not follow the logs.
     """
     is_missed = fit.status.code is Code.NOT_CONVERGED and MAX_GAP_SHARE < fit.stats["gap_share"] < MAX_CLOSED_SHARE
     found, stage = fit, replace(problem.method.stages[-1], refine=1)  # steps are refined where it has converged
@@ -801,18 +628,7 @@ def fit_with_closed_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:
 def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[Profile]) -> Fit | None:
     """The fit that begins with the best values of the first profile whose interval does not hold the estimate.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-    profiles : iterable of Profile
-        Of that fit.
-
-    Returns
-    -------
-    Fit or None
-        None where every estimate lies in its interval. The given one, not converged, where no better one is found; of
-        an interrupted search the better of both, marked.
+    None where every estimate lies in its interval; the given fit, not converged, where no better one is found.
     """
     found = next((p for p in profiles if not p.low <= p.estimate <= p.high), None)
     if found is None:
@@ -832,27 +648,11 @@ def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[P
     return replace(fit, status=Status(Code.NOT_CONVERGED, (verdict, "try other start values, or fix a parameter")))
 
 
-def hold_order(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
-    """Hold parameters that no plant has below another one at that one's value, where the logs do not show them.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-    label : str
-        Of the fit's start.
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With what is held: those that ended below the other one at a bound, or were held there, and what has no effect
-        beside them, as the Stribeck velocity between equal frictions, where the search had left it.
-    fit : Fit
-        The given one, where there are none, or where the logs reject the other one's value.
-    """
+def enforce_ordering(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
+    """Hold parameters that no plant has below another one at that one's value, where the logs do not show them."""
     found, bound = fit.parameters, dict(zip(fit.parameters.free_names, fit.at_bound, strict=True))
-    order = problem.system.plant.excitation.at_least
-    below = {n: m for n, m in order.items() if bound.get(n) or n in problem.held}
+    order = problem.system.plant.identification_hints.at_least
+    below = {n: m for n, m in order.items() if bound.get(n) or n in problem.fixed}
     given = problem.unknowns()
     known = {n: m for n, m in below.items() if m in found and found.value(n) < found.value(m) <= given[n].upper}
     values = {n: found.value(m) for n, m in known.items()}
@@ -860,30 +660,19 @@ def hold_order(problem: EstimationProblem, fit: Fit, label: str) -> tuple[Estima
         return problem, fit
     start = problem.start_from(fit, label)
     start = replace(start, parameters={**start.parameters, **values})
-    ordered = replace(problem, held={**problem.held, **_without_effect(problem, start), **values})
-    if len(ordered.held) >= len(found.free_names):
+    ordered = replace(problem, fixed={**problem.fixed, **_without_effect(problem, start), **values})
+    if len(ordered.fixed) >= len(found.free_names):
         return problem, fit
-    held, other = fit_holding_unidentifiable(ordered, start)
+    held, other = fit_fixing_unidentifiable(ordered, start)
     settled = other.status.converged and not other.unidentifiable and (other.jumps is None or fit.jumps is not None)
-    rejected = not settled or rejects_held_values(other, fit, len(held.held))
+    rejected = not settled or rejects_fixed_values(other, fit, len(held.fixed))
     return (problem, fit) if rejected else (held, other.with_effort_of(fit))
 
 
 def mark_order(problem: EstimationProblem, result: IdentificationResult) -> IdentificationResult:
-    """Mark estimates that the logs put below another one beyond chance, though no plant has them there.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    result : IdentificationResult
-
-    Returns
-    -------
-    IdentificationResult
-        Both are marked "bias possible", and the status names them.
-    """
+    """Mark estimates that the logs put below another one beyond chance, though no plant has them there."""
     estimates, status = result.estimates.copy(), result.status
-    for low, high in problem.system.plant.excitation.at_least.items():
+    for low, high in problem.system.plant.identification_hints.at_least.items():
         if low in estimates.index and _is_below(result, low, high):
             estimates.loc[[n for n in (low, high) if n in estimates.index], "mark"] = Mark.BIAS_POSSIBLE
             words = f"{low} is below {high}, which no drive has: model error, both may be biased"
@@ -897,7 +686,7 @@ def _is_below(result: IdentificationResult, low: str, high: str) -> bool:
     signs = [1.0 if n == high else -1.0 for n in names]
     values = {low: float(result.estimates["value"][low]), high: result.parameters.value(high)}
     variance = float(signs @ result.covariance.loc[names, names].to_numpy() @ signs)
-    return variance >= 0 and values[high] - values[low] > MAX_BELOW_DEVIATIONS * math.sqrt(variance)
+    return variance >= 0 and values[high] - values[low] > CLEAR_DEVIATIONS * math.sqrt(variance)
 
 
 def _without_effect(problem: EstimationProblem, start: Start) -> dict[str, float]:

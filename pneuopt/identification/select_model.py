@@ -1,22 +1,12 @@
 """`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs.
 
-`fit_candidates`: fits of several models to the same logs, made alike so that their residuals can be compared.
+`fit_candidates` fits all alike, for residuals compare only where the models run alike: whole logs, or windows of one
+length, without gaps that take a misfit in their place; and at common widths, for a width that each candidate has chosen
+for itself would be a hidden parameter, by which Coulomb friction can imitate presliding or the Stribeck curve. Windows
+and widths are those of the leader, the simplest of the candidates that follow the logs best in short searches.
 
-Residuals compare where the models run alike: whole logs, or windows of one length, without gaps that take a misfit in
-their place. And they compare at common widths: a width is a means of integration, and one that each candidate has
-chosen for itself would be a hidden parameter, which Coulomb friction can use to imitate presliding or the Stribeck
-curve. A width that is a property of the friction is freed, in a candidate of its own.
-
-Windows and widths are those of the leader, the simplest of the candidates that follow the logs best in short searches
-with loose gaps; a model that is too simple would cut the logs into windows so short that nothing tells the others
-apart. Candidates that such searches show to be hopeless beside the leader's are not searched any longer. In windows the
-others begin where the leader has ended, if they have its states.
-
-`try_candidate`: a short search of a model with loose gaps, which ranks it, or shows that no search can save it.
-
-Gaps between segments only relax a fit: with any gaps allowed the squares are less than without. So where short searches
-with loose gaps have ended, and their squares exceed those of another model's whole fit many times, the model
-cannot explain the logs, and minutes of search would show only that.
+`try_candidate` is such a search, with loose gaps. Gaps only relax a fit: where it has ended with many times the squares
+of another model's whole fit, the model cannot explain the logs, and minutes of search would show only that.
 """
 
 import fnmatch
@@ -40,10 +30,10 @@ from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, Id
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.identification.tolerances import (
     HOPELESS_RATIO,
-    JUMPING_WINDOW_SAMPLES,
     LEADER_RATIO,
     MAX_HELD_OUT_RATIO,
     MAX_TRIALS,
+    MIN_WINDOW_SAMPLES,
     NESTED_TEST_LEVEL,
     TIE,
 )
@@ -65,26 +55,140 @@ if TYPE_CHECKING:
 TRIAL_STAGES = (Stage(3e-3, 12), Stage(1e-3, 8), Stage(1e-4, 12))
 
 
-@dataclass(frozen=True)
-class Trial:
-    """The best short search of a model.
+@dataclass(frozen=True, eq=False, repr=False)
+class ModelSelection(Result):
+    """The fits of several models to the same logs, ranked, and the recommended one; prints its `summary()`.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a candidate, the best first: converged, refuted (by short searches, without a fit), free (number of
+        estimates), deviance, bic, bic_above (the best's; all three estimated for a refuted one, as is p_value),
+        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
+        unidentifiable and at_bound (names of parameters), unphysical (which order of
+        `IdentificationHints.at_least` it breaks), message.
+    recommended : str
+        A candidate's name.
+    reason : str
+        One sentence.
+    fits : mapping of str to IdentificationResult
+        The fit of every candidate that short searches have not refuted, whatever its status.
+    """
+
+    table: "pd.DataFrame"
+    recommended: str
+    reason: str
+    fits: Mapping[str, IdentificationResult]
+
+    def summary(self) -> Report:
+        """The recommendation and its reason, then a row a candidate."""
+        rows = []
+        for row in self.table.reset_index(names="model").to_dict(orient="records"):
+            unidentifiable = row["unidentifiable"]
+            missing = f"{UNIDENTIFIABLE_NOTE}: {unidentifiable}" if unidentifiable else ""
+            why = str(row["message"]).partition(";")[0]
+            note = "" if row["converged"] else f"refuted: {why}" if row["refuted"] else f"not converged: {why}"
+            bound = f"{AT_BOUND_NOTE}: {row['at_bound']}" if row["at_bound"] else ""
+            figures = str(row["free"]), format_number(row["bic_above"], 4), str(row["contains"])
+            remark = note or row["unphysical"] or bound or missing
+            rows.append((str(row["model"]), *figures, format_number(row["p_value"], 2), str(remark)))
+        free, contains = number_columns("free", "BIC above best"), text_columns("contains")
+        columns = *text_columns("model"), *free, *contains, *number_columns("p of chance"), *text_columns("")
+        return Report((Line(self.reason, Tone.GOOD), Table(columns, tuple(rows))))
+
+
+def select_model(
+    candidates: Mapping[str, HasSystem],
+    experiments: Experiment | Sequence[Experiment],
+    parameters: ParameterSet,
+    *,
+    free: Sequence[str],
+    held_out: Experiment | Sequence[Experiment] = (),
+    method: LeastSquares | None = None,
+    window: float | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> ModelSelection:
+    """Fit every candidate alike and recommend one.
 
     Parameters
     ----------
-    squares : float
-        Squared residuals and gaps, in noise variances; infinite where no start is finite, or none was searched to the
-        end.
-    least : float
-        What these would still fall to, by the linearised equations; zero where these say nothing.
-    by_stage : tuple of float
-        The squares after each stage, at least the noise's.
-    ratio : float
-        The least squares over those that were allowed after the same stage, where no start kept within these; else 0.
-    """
+    candidates : mapping of str to drive or System
+        By name, say ``{n: ForceDrive(f) for n, f in friction_ladder().items()}``.
+    experiments : Experiment or sequence of Experiment
+    parameters : ParameterSet
+        Known values; a candidate takes those that it has. What is free among them stays so.
+    free : sequence of str
+        Names, or patterns, freed in each candidate that has them.
+    held_out : Experiment or sequence of Experiment, optional
+        Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
+    method : LeastSquares, optional
+    window : float, optional
+        As of `identify`; by default whole logs, or the windows of the candidate that follows them best.
+    progress : callable, optional
+        Receives a `Progress`, a line of text with the time, a candidate and an iteration.
 
+    Returns
+    -------
+    ModelSelection
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two candidates, or a parameter or pattern belongs to none.
+    ConvergenceError
+        If no candidate converged; `solution` maps each name to its marked result.
+
+    Notes
+    -----
+    All are fitted in the same windows and at the same widths (`fit_candidates` says why). The deviance is the squared
+    residuals over their variance in the best candidate, and over the factor by which that candidate's variances exceed
+    those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
+    with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
+    parameters count among the k, so that a candidate with such parameters gives way to a simpler one that fits as well.
+    A candidate that did not converge, ends at a bound or breaks its model's `IdentificationHints.at_least` is not
+    recommended while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without
+    any the fewer parameters.
+    """
+    import pandas as pd
+
+    check_options(method=method, window=window)
+    free = as_tuple("free", free, str, 'names or patterns of parameters, as ["friction.*"]')
+    check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
+    require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
+    systems = {name: as_system(model, f"candidates[{name!r}]") for name, model in candidates.items()}
+    experiments, held_out = as_experiments(experiments), as_experiments(held_out)
+    check_parameters(parameters)
+    given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
+    _check_names(given, parameters, free)
+    if progress is not None:
+        method = replace(method or LeastSquares(), progress=ProgressReporter(progress, "select_model"))
+    found = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
+    fits = {n: fit for n, fit in found.items() if isinstance(fit, IdentificationResult)}
+    converged = [n for n, fit in fits.items() if fit.status.converged]
+    if not converged:
+        message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
+        raise ConvergenceError(f"none of the candidates converged: {message}", fits)
+    predicted = {
+        n: float(validate(systems[n], held_out, fits[n].parameters)["nrmse"].mean()) if held_out else math.nan
+        for n in converged
+    }
+    rows = _candidate_rows(systems, found, predicted)
+    chosen, why = _choose(rows)
+    reason = _selection_reason(rows, chosen, why, _separate(rows, chosen, fits, systems))
+    table = pd.DataFrame.from_dict({n: asdict(row) for n, row in rows.items()}, orient="index")
+    table.insert(4, "bic_above", table["bic"] - table["bic"].min())
+    return ModelSelection(table, chosen, reason, fits)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The best short search of a model."""
+
+    # squared residuals and gaps, in noise variances; infinite where no start is finite, or none was searched to the end
     squares: float = math.inf
-    least: float = math.inf
-    by_stage: tuple[float, ...] = ()
+    least: float = math.inf  # what these would still fall to, by the linearised equations; zero where these say nothing
+    by_stage: tuple[float, ...] = ()  # the squares after each stage, at least the noise's
+    # the least squares over those that were allowed after the same stage, where no start kept within these; else 0
     ratio: float = 0.0
 
     @property
@@ -108,33 +212,9 @@ def try_candidate(
     known: Trial | None = None,
     allowed: Sequence[float] = (),
 ) -> Trial:
-    """Search shortly from a model's first starts.
+    """Search shortly from a model's first starts, and from `near`, a fit with another model of the same states.
 
-    Parameters
-    ----------
-    system : System
-    experiments : sequence of Experiment
-    parameters : ParameterSet
-    method : LeastSquares
-    window : float
-        Time after which a log starts anew [s].
-    near : IdentificationResult, optional
-        A fit with another model of the same states, from which a search begins, too, where the model's starts guess.
-    known : Trial, optional
-        Of the first start, which is not tried again; the other starts are tried where it is hopeless.
-    allowed : sequence of float
-        Squares after each stage beyond which a start is left, by default none; one that keeps within them is the last.
-
-    Returns
-    -------
-    Trial
-
-    Raises
-    ------
-    InputError
-        If logs, system and parameters do not fit together.
-    KeyboardInterrupt
-        If a search is interrupted.
+    A start is left where its squares exceed those `allowed` after a stage; `known` is the first start's trial.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # a fit says them
@@ -188,20 +268,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Refutation:
-    """Why a candidate was not fitted: its squares over the leader's in short searches, and a few words.
-
-    Parameters
-    ----------
-    leader : str
-    ratio : float
-    free : tuple of str
-        The parameters that it would estimate.
-    reason : str
-    """
+    """Why a candidate was not fitted: its squares over the leader's in short searches, and a few words."""
 
     leader: str
     ratio: float
-    free: tuple[str, ...]
+    free: tuple[str, ...]  # the parameters that it would estimate
     reason: str
 
 
@@ -215,24 +286,13 @@ def fit_candidates(
     method: LeastSquares | None,
     window: float | None,
 ) -> Fits:
-    """Fit every candidate alike, or refute it.
-
-    Parameters
-    ----------
-    candidates : mapping of str to Candidate
-    experiments : tuple of Experiment
-    method : LeastSquares or None
-    window : float or None
-        As of `identify`; None: whole logs, or the windows of the leader if it needs some.
-
-    Returns
-    -------
-    dict of str to IdentificationResult or Refutation
-        The results whatever their status. One that did not converge by itself has begun again at the richest one
-        within it.
-    """
+    """Fit every candidate alike, or refute it; one that does not converge begins again at the richest one within it."""
     alike = _Alike(experiments, method or LeastSquares(), window)
-    trials, out = _try_all(candidates, alike), Fits()
+    trials, allowed, out = Trials(), tuple[float, ...](), Fits()
+    for name in _richest_first(candidates):  # which leaves the others the fewest squares
+        alike.announce("trying", name, len(trials), len(candidates))
+        trials[name] = alike.try_shortly(candidates[name], allowed=allowed)
+        allowed = _hopeless_squares(min(trials.values(), key=lambda trial: trial.squares))
     for name in _by_rank(candidates, trials):
         alike.announce("fitting", name, len(out), len(candidates))
         out[name] = fit = alike.fit(candidates[name])
@@ -240,16 +300,6 @@ def fit_candidates(
             out = _fit_beside(name, fit, candidates, trials, alike)
             break
     return {n: out[n] for n in candidates}
-
-
-def _try_all(candidates: Mapping[str, Candidate], alike: "_Alike") -> Trials:
-    """A trial of each candidate's first start, the richest first, which leaves the others the fewest squares."""
-    trials, allowed = Trials(), tuple[float, ...]()
-    for name in _richest_first(candidates):
-        alike.announce("trying", name, len(trials), len(candidates))
-        trials[name] = alike.try_shortly(candidates[name], allowed=allowed)
-        allowed = _hopeless_squares(min(trials.values(), key=lambda trial: trial.squares))
-    return trials
 
 
 def _richest_first(candidates: Mapping[str, Candidate]) -> list[str]:
@@ -387,7 +437,7 @@ class _Alike:
         """The same with the window that a fit has needed, or whole logs; a fit whose states jump needs one, too."""
         if _has_jumps(fit, self.method):
             step = max(float(np.median(np.diff(e.trajectory.t))) for e in self.experiments)
-            return replace(self, window=JUMPING_WINDOW_SAMPLES * step)
+            return replace(self, window=MIN_WINDOW_SAMPLES * step)
         return replace(self, window=fit.window.duration if fit.window else math.inf)
 
 
@@ -398,128 +448,10 @@ def _has_jumps(fit: IdentificationResult, method: LeastSquares) -> bool:
 
 def _with_widths(candidate: Candidate, widths: Mapping[str, float]) -> Candidate:
     """The candidate with the common widths, where the user has stated none."""
-    own, known = candidate.parameters, candidate.system.excitation.widths
+    own, known = candidate.parameters, candidate.system.identification_hints.widths
     every = {name for width in known for name in (width.name, *width.follows)} & own.keys() & widths.keys()
     edits = {n: replace(own[n], value=widths[n], source=COMMON_WIDTH) for n in every}
     return replace(candidate, parameters=own | ParameterSet(edits))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ModelSelection(Result):
-    """The fits of several models to the same logs, ranked, and the recommended one; prints its `summary()`.
-
-    Attributes
-    ----------
-    table : DataFrame
-        A row a candidate, the best first: converged, refuted (by short searches, without a fit), free (number of
-        estimates), deviance, bic, bic_above (the best's; all three estimated for a refuted one, as is p_value),
-        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
-        unidentifiable and at_bound (names of parameters), unphysical (which order of
-        `Excitation.at_least` it breaks), message.
-    recommended : str
-        A candidate's name.
-    reason : str
-        One sentence.
-    fits : mapping of str to IdentificationResult
-        The fit of every candidate that short searches have not refuted, whatever its status.
-    """
-
-    table: "pd.DataFrame"
-    recommended: str
-    reason: str
-    fits: Mapping[str, IdentificationResult]
-
-    def summary(self) -> Report:
-        """The recommendation and its reason, then a row a candidate."""
-        rows = []
-        for row in self.table.reset_index(names="model").to_dict(orient="records"):
-            unidentifiable = row["unidentifiable"]
-            missing = f"{UNIDENTIFIABLE_NOTE}: {unidentifiable}" if unidentifiable else ""
-            why = str(row["message"]).partition(";")[0]
-            note = "" if row["converged"] else f"refuted: {why}" if row["refuted"] else f"not converged: {why}"
-            bound = f"{AT_BOUND_NOTE}: {row['at_bound']}" if row["at_bound"] else ""
-            figures = str(row["free"]), format_number(row["bic_above"], 4), str(row["contains"])
-            remark = note or row["unphysical"] or bound or missing
-            rows.append((str(row["model"]), *figures, format_number(row["p_value"], 2), str(remark)))
-        free, contains = number_columns("free", "BIC above best"), text_columns("contains")
-        columns = *text_columns("model"), *free, *contains, *number_columns("p of chance"), *text_columns("")
-        return Report((Line(self.reason, Tone.GOOD), Table(columns, tuple(rows))))
-
-
-def select_model(
-    candidates: Mapping[str, HasSystem],
-    experiments: Experiment | Sequence[Experiment],
-    parameters: ParameterSet,
-    *,
-    free: Sequence[str],
-    held_out: Experiment | Sequence[Experiment] = (),
-    method: LeastSquares | None = None,
-    window: float | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> ModelSelection:
-    """Fit every candidate alike and recommend one.
-
-    Parameters
-    ----------
-    candidates : mapping of str to drive or System
-        By name, say ``{n: ForceDrive(f) for n, f in friction_ladder().items()}``.
-    experiments : Experiment or sequence of Experiment
-    parameters : ParameterSet
-        Known values; a candidate takes those that it has. What is free among them stays so.
-    free : sequence of str
-        Names, or patterns, freed in each candidate that has them.
-    held_out : Experiment or sequence of Experiment, optional
-        Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
-    method : LeastSquares, optional
-    window : float, optional
-        As of `identify`; by default whole logs, or the windows of the candidate that follows them best.
-    progress : callable, optional
-        Receives a `Progress`, a line of text with the time, a candidate and an iteration.
-
-    Returns
-    -------
-    ModelSelection
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two candidates, or a parameter or pattern belongs to none.
-    ConvergenceError
-        If no candidate converged; `solution` maps each name to its marked result.
-
-    Notes
-    -----
-    All are fitted in the same windows and at the same widths (`fit_candidates` says why). The deviance is the squared
-    residuals over their variance in the best candidate, and over the factor by which that candidate's variances exceed
-    those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
-    with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
-    parameters count among the k, so that a candidate with such parameters gives way to a simpler one that fits as well.
-    A candidate that did not converge, ends at a bound or breaks its model's `Excitation.at_least` is not recommended
-    while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without any the
-    fewer parameters.
-    """
-    check_options(method=method, window=window)
-    free = as_tuple("free", free, str, 'names or patterns of parameters, as ["friction.*"]')
-    check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
-    require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
-    systems = {name: as_system(model, f"candidates[{name!r}]") for name, model in candidates.items()}
-    experiments, held_out = as_experiments(experiments), as_experiments(held_out)
-    check_parameters(parameters)
-    given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
-    _check_names(given, parameters, free)
-    if progress is not None:
-        method = replace(method or LeastSquares(), progress=ProgressReporter(progress, "select_model"))
-    found = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
-    fits = {n: fit for n, fit in found.items() if isinstance(fit, IdentificationResult)}
-    converged = [n for n, fit in fits.items() if fit.status.converged]
-    if not converged:
-        message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
-        raise ConvergenceError(f"none of the candidates converged: {message}", fits)
-    predicted = {n: _mean_nrmse(systems[n], held_out, fits[n]) for n in converged}
-    rows = _candidate_rows(systems, found, predicted)
-    chosen, why = _choose(rows)
-    reason = _selection_reason(rows, chosen, why, _separate(rows, chosen, fits, systems))
-    return ModelSelection(_selection_table(rows), chosen, reason, fits)
 
 
 @dataclass(frozen=True)
@@ -570,21 +502,6 @@ def _check_names(given: Mapping[str, ParameterSet], parameters: ParameterSet, fr
             raise UnknownNameError("parameter", pattern, every)
 
 
-def _selection_table(rows: Mapping[str, _CandidateRow]) -> "pd.DataFrame":
-    import pandas as pd
-
-    table = pd.DataFrame.from_dict({n: asdict(row) for n, row in rows.items()}, orient="index")
-    table.insert(4, "bic_above", table["bic"] - table["bic"].min())
-    return table
-
-
-def _mean_nrmse(system: System, held_out: Sequence[Experiment], fit: IdentificationResult) -> float:
-    """Mean NRMSE over the held-out runs and channels; NaN without any."""
-    if not held_out:
-        return math.nan
-    return float(validate(system, held_out, fit.parameters)["nrmse"].mean())
-
-
 def _candidate_rows(
     candidates: Mapping[str, System],
     found: Mapping[str, IdentificationResult | Refutation],
@@ -593,8 +510,9 @@ def _candidate_rows(
     """A row for each candidate, the lowest BIC first, those that did not converge last."""
     fits = {n: fit for n, fit in found.items() if isinstance(fit, IdentificationResult)}
     best = min(predicted, key=lambda n: _chi_square(fits[n]))
-    scale = _variance(fits[best]) * fits[best].stats["variance_inflation"]
-    count = _residual_count(fits[best]) / fits[best].stats["variance_inflation"]
+    samples, inflation = _residual_count(fits[best]), fits[best].stats["variance_inflation"]
+    scale = _chi_square(fits[best]) / max(1.0, samples - len(fits[best].estimates)) * inflation
+    count = samples / inflation
     comparable = {n: fit for n, fit in found.items() if n in predicted or n not in fits}
     rows = {}
     for name, fit in found.items():
@@ -613,17 +531,17 @@ def _candidate_rows(
             inside,
             p,
             predicted.get(name, math.nan),
-            *_said(candidates[name], fit),
+            *_notes(candidates[name], fit),
         )
     return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
 
 
-def _said(system: System, fit: IdentificationResult | Refutation) -> tuple[str, str, str, str]:
+def _notes(system: System, fit: IdentificationResult | Refutation) -> tuple[str, str, str, str]:
     """What is unidentifiable, what is at a bound, what is unphysical, and the message."""
     if isinstance(fit, Refutation):
         return "", "", "", fit.reason
     notes = ", ".join(_names_noted(fit, UNIDENTIFIABLE_NOTE)), ", ".join(_names_noted(fit, AT_BOUND_NOTE))
-    return *notes, _unphysical(fit, system.excitation.at_least), fit.status.message
+    return *notes, _unphysical(fit, system.identification_hints.at_least), fit.status.message
 
 
 def _free_names(fit: IdentificationResult | Refutation) -> set[str]:
@@ -658,10 +576,6 @@ def _chi_square(
     if isinstance(fit, Refutation):
         return fit.ratio * _chi_square(fits[fit.leader])
     return float(((fit.fit["rmse"] / fit.fit["noise"]) ** 2 * fit.fit["samples"]).sum())
-
-
-def _variance(fit: IdentificationResult) -> float:
-    return _chi_square(fit) / max(1.0, _residual_count(fit) - len(fit.estimates))
 
 
 def _residual_count(fit: IdentificationResult) -> float:
@@ -716,7 +630,7 @@ def _separate(
     terms = sorted(set(fits[other].estimates.index) ^ set(fits[chosen].estimates.index))
     if not terms:
         return ""
-    run = remedy(systems[max(other, chosen, key=lambda n: rows[n].free)].excitation, terms)
+    run = remedy(systems[max(other, chosen, key=lambda n: rows[n].free)].identification_hints, terms)
     if fall <= 2 * max(1, extra):
         return f"these logs do not tell it from {other}, nor would more of the same: {run}"
     times = max(2.0, (TIE + extra * math.log(_residual_count(fits[chosen]))) / fall)

@@ -13,15 +13,8 @@ from pneuopt.quantities.arrays import Array
 def agreement(measured: ArrayLike, predicted: ArrayLike) -> Mapping[str, float]:
     """Agreement of a prediction with a measurement; missing samples (NaN) do not count.
 
-    Parameters
-    ----------
-    measured, predicted : array_like, shape (n,)
-
-    Returns
-    -------
-    mapping
-        rmse [unit of the channel]; nrmse = |error| / |measured - its mean| [1]; fit_percent = 100 (1 - nrmse), as in
-        MATLAB's `compare`; samples. NRMSE is NaN for a constant channel.
+    rmse [unit of the channel]; nrmse = |error| / |measured - its mean| [1], NaN for a constant channel; fit_percent =
+    100 (1 - nrmse), as in MATLAB's `compare`; samples.
 
     Examples
     --------
@@ -88,18 +81,9 @@ def likelihood_ratio_p(drop: float, extra: int) -> float:
 
 
 def ljung_box(residuals: ArrayLike, lags: int = 20) -> tuple[float, float]:
-    """Ljung-Box test of whiteness: Q = n (n + 2) sum of rho_k^2 / (n - k), chi-square with `lags` degrees of freedom.
+    """Ljung-Box test of whiteness: Q = n (n + 2) sum of rho_k^2 / (n - k), and the probability of so large a one.
 
-    Parameters
-    ----------
-    residuals : array_like, shape (n,)
-        NaN where a sample is missing; such samples are left out.
-    lags : int
-
-    Returns
-    -------
-    (float, float)
-        Q and the probability of so large a one if the residuals are white (Ljung, Box, Biometrika 65, 1978).
+    Chi-square with `lags` degrees of freedom (Ljung, Box, Biometrika 65, 1978); missing samples (NaN) do not count.
 
     Examples
     --------
@@ -119,19 +103,10 @@ def ljung_box(residuals: ArrayLike, lags: int = 20) -> tuple[float, float]:
 
 
 def cross_correlation(residuals: ArrayLike, command: ArrayLike, lags: int = 20) -> tuple[float, int]:
-    """Largest correlation of residuals with an earlier input, over the lags 0 to `lags`, and its lag.
+    """Largest correlation of residuals with an earlier input and its lag in samples, 0 to `lags`.
 
-    Parameters
-    ----------
-    residuals, command : array_like, shape (n,)
-    lags : int
-        Largest delay of the residuals behind the input, in samples.
-
-    Returns
-    -------
-    (float, int)
-        The correlation over its standard deviation without a relation, ``1 / sqrt(n)`` for white residuals, and its
-        lag: beyond about 3 the model lacks an effect of the input.
+    In standard deviations without a relation, ``1 / sqrt(n)`` for white residuals: beyond about 3 the model lacks an
+    effect of the input.
 
     Examples
     --------

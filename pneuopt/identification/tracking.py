@@ -1,12 +1,11 @@
 """`track`: estimates over dated logs of one drive, and whether they drift, with alarms that chance seldom raises.
 
-A straight line through estimates that scatter from log to log, and the level at which it is watched log by log.
-
-The line is that of a random-effects meta-regression: an estimate differs from it by its own error, whose deviation its
-log states, and by a scatter from log to log, which all share. The scatter's variance is Paule and Mandel's (J. Res. NBS
-87(5), 1982): the one with which the weighted squares are as large as their degrees of freedom. The test is Student's,
-and its deviation never less than what the logs' own errors give (Knapp, Hartung, Statistics in Medicine 22, 2003, with
-the lower limit of Roever, Knapp, Friede, BMC Medical Research Methodology 15:99, 2015).
+The line through the estimates is that of a random-effects meta-regression: an estimate differs from it by its own
+error, whose deviation its log states, and by a scatter from log to log, which all share. The scatter's variance is
+Paule and Mandel's (J. Res. NBS 87(5), 1982): the one with which the weighted squares are as large as their degrees of
+freedom. The test is Student's, and its deviation never less than what the logs' own errors give (Knapp, Hartung,
+Statistics in Medicine 22, 2003, with the lower limit of Roever, Knapp, Friede, BMC Medical Research Methodology 15:99,
+2015).
 
 Whoever looks after each log would meet chance sooner or later. So each look has the same, smaller level (Pocock,
 Biometrika 64(2), 1977), with which chance raises an alarm in the asked share of whole histories. It is found by drawing
@@ -16,9 +15,9 @@ histories: where errors are equally large the test's distribution depends on the
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import date, datetime, timedelta
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import brentq
@@ -26,7 +25,7 @@ from scipy.stats import t as student
 
 from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.identification.tolerances import HISTORIES, MIN_LOGS, POWERS, WEEK
+from pneuopt.identification.tolerances import HISTORIES, MIN_LOGS, POWERS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import as_tuple
@@ -35,135 +34,6 @@ from pneuopt.quantities.results import Shown
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-@dataclass(frozen=True)
-class DriftLine:
-    """A weighted line through estimates.
-
-    Attributes
-    ----------
-    mean, slope : float
-        At the weighted mean of the times [unit], and by time [unit/time].
-    centre : float
-        That mean [time].
-    mean_error, slope_error : float
-        Standard errors, independent of each other.
-    scatter : float
-        Standard deviation from log to log [unit].
-    dof : int
-        Degrees of freedom of Student's t.
-    p : float
-        Probability of so steep a line without a drift, two-sided.
-    """
-
-    mean: float
-    slope: float
-    centre: float
-    mean_error: float
-    slope_error: float
-    scatter: float
-    dof: int
-    p: float
-
-    def at(self, times: Array, level: float = 0.95) -> tuple[Array, Array]:
-        """The line at given times, and the half width of its confidence band there."""
-        shift = np.asarray(times, dtype=float) - self.centre
-        error = np.hypot(self.mean_error, self.slope_error * shift)
-        return self.mean + self.slope * shift, float(student.ppf(0.5 + level / 2, self.dof)) * error
-
-
-def fit_line(times: Array, values: Array, errors: Array) -> DriftLine:
-    """Fit the line.
-
-    Parameters
-    ----------
-    times : array_like, shape (n,)
-        At least three, not all the same.
-    values, errors : array_like, shape (n,)
-        Estimates and their standard errors [unit].
-
-    Examples
-    --------
-    >>> line = fit_line([0, 1, 2, 3], [1.0, 2.1, 2.9, 4.0], [1e-3] * 4)  # errors far below the scatter: least squares
-    >>> round(line.slope, 3), round(line.slope_error, 4), line.dof
-    (0.98, 0.0424, 2)
-    """
-    x, y, s = (np.asarray(v, dtype=float) for v in (times, values, errors))
-    dof = len(x) - 2
-
-    def excess(variance: float) -> float:
-        return _squares(x, y, s**2 + variance) - dof
-
-    top = float(np.ptp(y)) ** 2 + 1e-300
-    while excess(top) > 0:
-        top *= 4
-    variance = float(brentq(excess, 0.0, top)) if excess(0.0) > 0 else 0.0
-    w = 1 / (s**2 + variance)
-    centre, mean = float(np.average(x, weights=w)), float(np.average(y, weights=w))
-    spread = float(w @ (x - centre) ** 2)
-    slope, error = float(w @ ((x - centre) * y)) / spread, spread**-0.5
-    p = 2 * float(student.sf(abs(slope) / error, dof))
-    return DriftLine(mean, slope, centre, float(w.sum()) ** -0.5, error, variance**0.5, dof, p)
-
-
-def _squares(x: Array, y: Array, variance: Array) -> float:
-    """Weighted squares of the residuals of a line."""
-    w = 1 / variance
-    x, y = x - np.average(x, weights=w), y - np.average(y, weights=w)
-    slope = (w @ (x * y)) / (w @ x**2)
-    return float(w @ (y - slope * x) ** 2)
-
-
-def look_level(times: tuple[float, ...], level: float) -> float:
-    """The p-value of a look at which an alarm is raised, so that a history of these logs has one by chance at `level`.
-
-    Parameters
-    ----------
-    times : tuple of float
-        Of all logs of the history, those to come too [any unit]; the first look is after the fourth.
-    level : float
-        Share of histories without a drift in which any look raises an alarm [1].
-    """
-    return float(np.quantile(_smallest(times), level))
-
-
-def power(times: tuple[float, ...], drift: float, level: float) -> Array:
-    """The probability that a drift is seen with each log or an earlier one.
-
-    Parameters
-    ----------
-    times : tuple of float
-    drift : float
-        By time, in standard deviations of an estimate about its line: its error and the scatter together.
-    level : float
-        As `look_level` gives it.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-    """
-    seen = np.minimum.accumulate(_p_values(times, drift, HISTORIES // 4), axis=1) <= level
-    return np.asarray(np.concatenate([np.zeros(MIN_LOGS - 1), seen.mean(axis=0)]))
-
-
-@lru_cache(maxsize=32)
-def _smallest(times: tuple[float, ...]) -> Array:
-    return np.asarray(_p_values(times, 0.0, HISTORIES).min(axis=1))
-
-
-def _p_values(times: tuple[float, ...], drift: float, count: int) -> Array:
-    """The p-values of each look of drawn histories, shape (count, n - 3), by running sums."""
-    x = np.asarray(times) - times[0]
-    y = drift * x + np.random.default_rng(0).standard_normal((count, len(x)))
-    n = np.arange(1, len(x) + 1)
-    sx, sy = np.cumsum(x), np.cumsum(y, axis=1)
-    xx = np.cumsum(x**2) - sx**2 / n
-    xy, yy = np.cumsum(x * y, axis=1) - sx * sy / n, np.cumsum(y**2, axis=1) - sy**2 / n
-    late = slice(MIN_LOGS - 1, None)
-    slope = xy[:, late] / xx[late]
-    left = np.maximum(yy[:, late] - slope * xy[:, late], 0) / (n[late] - 2)
-    return np.asarray(2 * student.sf(np.abs(slope) / np.sqrt(left / xx[late]), n[late] - 2))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -207,17 +77,22 @@ class Tracking(Shown):
         calm = f"no parameter drifts: no look has p <= {self.look_level:.2g}"
         head = [Line(f"drift of {', '.join(self.drifting)}: identify and tune again", Tone.DOUBTFUL)]
         parts: list[Line | Table] = [*(head if self.drifting else [Line(calm, Tone.GOOD)])]
-        parts += [
-            Line(_describe_alarm(str(n), row), indent=2) for n, row in self.table.iterrows() if str(n) in self.drifting
-        ]
+        rows = []
+        for name, row in self.table.iterrows():
+            share = f"{row['percent_a_week']:.2g}"
+            low, high = f"{row['percent_a_week_low']:.2g}", f"{row['percent_a_week_high']:.2g}"
+            if str(name) in self.drifting:
+                seen = f"seen since {row['alarm']:%Y-%m-%d}"
+                parts.append(Line(f"{name} changes by {share} % a week ({low} to {high}), {seen}", indent=2))
+            value, ends = format_number(row["value"], 4), f"{row['ci_low']:.4g} to {row['ci_high']:.4g}"
+            numbers = (format_number(float(row[n]), 2) for n in ("p", "scatter", "logs_90"))
+            rows.append((str(name), value, ends, share, f"{low} to {high}", *numbers, str(row["unit"])))
         level = f"without a drift, {100 * self.level:.2g} % of histories of {self.horizon} logs have an alarm"
         parts.append(Line(level, indent=2))
         seen = f"logs until\n{100 * self.asked:.2g} % a week"
         heads = ("value", "95 % interval", "% a week", "95 % interval", "p", "scatter", f"{seen}\nseen in 90 %")
-        rows = tuple(_row(str(n), row) for n, row in self.table.iterrows())
-        return Report(
-            (*parts, Table((*text_columns("parameter"), *number_columns(*heads), *text_columns("unit")), rows))
-        )
+        columns = (*text_columns("parameter"), *number_columns(*heads), *text_columns("unit"))
+        return Report((*parts, Table(columns, tuple(rows))))
 
 
 def track(
@@ -275,17 +150,113 @@ def track(
     stamps = [stamps[k] for k in order]
     frames = [f.estimates if isinstance(f, IdentificationResult) else f for f in (fits[k] for k in order)]
     wanted = as_tuple("parameters", parameters, str, 'names of parameters, as ["friction.coulomb"]')
-    chosen = _choose_parameters(frames, wanted)
-    weeks = np.array([(s - stamps[0]).total_seconds() / WEEK for s in stamps])
+    known = list(dict.fromkeys(str(n) for frame in frames for n in frame.index))
+    check_names("parameter", wanted, known, "the fits")
+    counts = {n: sum(np.isfinite(_estimate(frame, n)[1]) for frame in frames) for n in wanted or known}
+    enough = [n for n, count in counts.items() if count >= MIN_LOGS]
+    missing = [n for n in wanted if n not in enough]
+    remedy = f"{MIN_LOGS} logs with an interval are needed; log longer runs, or free fewer parameters"
+    require(not missing and bool(enough), f"{', '.join(missing or counts)} cannot be tracked: {remedy}")
+    weeks = np.array([(s - stamps[0]) / timedelta(weeks=1) for s in stamps])
     require(weeks[MIN_LOGS - 2] > 0, f"the first {MIN_LOGS - 1} logs are of one moment, {stamps[0]}; give their dates")
-    planned = _plan_times(weeks, horizon)
-    look = look_level(planned, level / len(chosen))
+    usual = float(np.median(np.diff(weeks))) or float(weeks[-1]) / (len(weeks) - 1)
+    to_come = weeks[-1] + usual * np.arange(1, max(horizon - len(weeks), 0) + 1)
+    planned = tuple(float(w) for w in (*weeks, *to_come))
+    look = look_level(planned, level / len(enough))
     rows, histories = {}, {}
-    for name in chosen:
+    for name in enough:
         rows[name], histories[name] = _track_one(name, frames, stamps, weeks, planned, look, drift)
     table = WideFrame(pd.DataFrame.from_dict(rows, orient="index").astype({"alarm": "datetime64[us]"}))
     history = WideFrame(pd.concat(histories, names=["parameter", "date"]))
     return Tracking(table, history, look, level, len(planned), drift)
+
+
+@dataclass(frozen=True)
+class DriftLine:
+    """A weighted line through estimates."""
+
+    mean: float  # at the weighted mean of the times [unit]
+    slope: float  # [unit/time]
+    centre: float  # weighted mean of the times
+    mean_error: float  # standard error, independent of the slope's
+    slope_error: float  # [unit/time]
+    scatter: float  # standard deviation from log to log [unit]
+    dof: int  # degrees of freedom of Student's t
+    p: float  # probability of so steep a line without a drift, two-sided
+
+    def at(self, times: Array, level: float = 0.95) -> tuple[Array, Array]:
+        """The line at given times, and the half width of its confidence band there."""
+        shift = np.asarray(times, dtype=float) - self.centre
+        error = np.hypot(self.mean_error, self.slope_error * shift)
+        return self.mean + self.slope * shift, float(student.ppf(0.5 + level / 2, self.dof)) * error
+
+
+def fit_line(times: Array, values: Array, errors: Array) -> DriftLine:
+    """Fit the line.
+
+    Examples
+    --------
+    >>> line = fit_line([0, 1, 2, 3], [1.0, 2.1, 2.9, 4.0], [1e-3] * 4)  # errors far below the scatter: least squares
+    >>> round(line.slope, 3), round(line.slope_error, 4), line.dof
+    (0.98, 0.0424, 2)
+    """
+    x, y, s = (np.asarray(v, dtype=float) for v in (times, values, errors))
+    dof = len(x) - 2
+
+    def excess(variance: float) -> float:
+        return _squares(x, y, s**2 + variance) - dof
+
+    top = float(np.ptp(y)) ** 2 + 1e-300
+    while excess(top) > 0:
+        top *= 4
+    variance = float(brentq(excess, 0.0, top)) if excess(0.0) > 0 else 0.0
+    w = 1 / (s**2 + variance)
+    centre, mean = float(np.average(x, weights=w)), float(np.average(y, weights=w))
+    spread = float(w @ (x - centre) ** 2)
+    slope, error = float(w @ ((x - centre) * y)) / spread, spread**-0.5
+    p = 2 * float(student.sf(abs(slope) / error, dof))
+    return DriftLine(mean, slope, centre, float(w.sum()) ** -0.5, error, variance**0.5, dof, p)
+
+
+def _squares(x: Array, y: Array, variance: Array) -> float:
+    """Weighted squares of the residuals of a line."""
+    w = 1 / variance
+    x, y = x - np.average(x, weights=w), y - np.average(y, weights=w)
+    slope = (w @ (x * y)) / (w @ x**2)
+    return float(w @ (y - slope * x) ** 2)
+
+
+def look_level(times: tuple[float, ...], level: float) -> float:
+    """The p-value of a look that raises an alarm, so that a history of such logs has one by chance at `level`."""
+    return float(np.quantile(_smallest(times), level))
+
+
+def power(times: tuple[float, ...], drift: float, level: float) -> Array:
+    """The probability (n,) that a drift is seen with each log or an earlier one, with looks at `level`.
+
+    The drift is by time, in standard deviations of an estimate about its line: its error and the scatter together.
+    """
+    seen = np.minimum.accumulate(_p_values(times, drift, HISTORIES // 4), axis=1) <= level
+    return np.asarray(np.concatenate([np.zeros(MIN_LOGS - 1), seen.mean(axis=0)]))
+
+
+@lru_cache(maxsize=32)
+def _smallest(times: tuple[float, ...]) -> Array:
+    return np.asarray(_p_values(times, 0.0, HISTORIES).min(axis=1))
+
+
+def _p_values(times: tuple[float, ...], drift: float, count: int) -> Array:
+    """The p-values of each look of drawn histories, shape (count, n - 3), by running sums."""
+    x = np.asarray(times) - times[0]
+    y = drift * x + np.random.default_rng(0).standard_normal((count, len(x)))
+    n = np.arange(1, len(x) + 1)
+    sx, sy = np.cumsum(x), np.cumsum(y, axis=1)
+    xx = np.cumsum(x**2) - sx**2 / n
+    xy, yy = np.cumsum(x * y, axis=1) - sx * sy / n, np.cumsum(y**2, axis=1) - sy**2 / n
+    late = slice(MIN_LOGS - 1, None)
+    slope = xy[:, late] / xx[late]
+    left = np.maximum(yy[:, late] - slope * xy[:, late], 0) / (n[late] - 2)
+    return np.asarray(2 * student.sf(np.abs(slope) / np.sqrt(left / xx[late]), n[late] - 2))
 
 
 def _read_date(given: "str | date") -> datetime:
@@ -297,25 +268,6 @@ def _read_date(given: "str | date") -> datetime:
             raise InputError(f"{given!r} is no date; write it as 2026-03-12 or 2026-03-12T10:00") from None
     moment = given if isinstance(given, datetime) else datetime(given.year, given.month, given.day)
     return moment.replace(tzinfo=None)
-
-
-def _choose_parameters(frames: "Sequence[pd.DataFrame]", asked: Sequence[str]) -> list[str]:
-    """The parameters with enough intervals; an error where one that is asked for has not."""
-    known = list(dict.fromkeys(str(n) for frame in frames for n in frame.index))
-    check_names("parameter", asked, known, "the fits")
-    counts = {n: sum(np.isfinite(_estimate(frame, n)[1]) for frame in frames) for n in asked or known}
-    enough = [n for n, count in counts.items() if count >= MIN_LOGS]
-    missing = [n for n in asked if n not in enough]
-    remedy = f"{MIN_LOGS} logs with an interval are needed; log longer runs, or free fewer parameters"
-    require(not missing and bool(enough), f"{', '.join(missing or counts)} cannot be tracked: {remedy}")
-    return enough
-
-
-def _plan_times(weeks: Array, horizon: int) -> tuple[float, ...]:
-    """The times of the logs, and of those to come at their usual distance."""
-    usual = float(np.median(np.diff(weeks))) or float(weeks[-1]) / (len(weeks) - 1)
-    to_come = weeks[-1] + usual * np.arange(1, max(horizon - len(weeks), 0) + 1)
-    return tuple(float(w) for w in (*weeks, *to_come))
 
 
 def _estimate(frame: "pd.DataFrame", name: str) -> tuple[float, float]:
@@ -372,16 +324,3 @@ def _percent_a_week(line: DriftLine) -> dict[str, float]:
     first = abs(float(line.at(np.zeros(1))[0][0]))
     ends = zip(("", "_low", "_high"), (0.0, -width, width), strict=True)
     return {f"percent_a_week{end}": 100 * (line.slope + d) / first for end, d in ends}
-
-
-def _describe_alarm(name: str, row: "pd.Series[Any]") -> str:
-    low, high = row["percent_a_week_low"], row["percent_a_week_high"]
-    since = f"{row['alarm']:%Y-%m-%d}"
-    return f"{name} changes by {row['percent_a_week']:.2g} % a week ({low:.2g} to {high:.2g}), seen since {since}"
-
-
-def _row(name: str, row: "pd.Series[Any]") -> tuple[str, ...]:
-    ends = f"{row['ci_low']:.4g} to {row['ci_high']:.4g}"
-    rate = f"{row['percent_a_week_low']:.2g} to {row['percent_a_week_high']:.2g}"
-    numbers = (format_number(float(row[n]), 2) for n in ("p", "scatter", "logs_90"))
-    return name, format_number(row["value"], 4), ends, f"{row['percent_a_week']:.2g}", rate, *numbers, str(row["unit"])

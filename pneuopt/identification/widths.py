@@ -25,8 +25,8 @@ from pneuopt.identification.tolerances import (
     FORESEEN_RATIO,
     MAX_HIDING_SHARE,
     MAX_TRIAL_SAMPLES,
-    MAX_WIDENED_MISFIT,
     MIN_RELATIVE_FALL,
+    MODEL_ERROR_LEVEL,
     SIGNIFICANT_FALL,
 )
 from pneuopt.logs.experiment import Experiment
@@ -77,24 +77,7 @@ class _Trial:
 
 
 def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[ChosenWidth, ...]]:
-    """Choose the widths that nobody has stated.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With these widths.
-    chosen : tuple of ChosenWidth
-        Empty where all are stated, the model has none, or the CPU budget ends before that.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If a trial is interrupted.
-    """
+    """Choose the widths that nobody has stated."""
     open_names = {n for w in _present(problem) if _is_open(problem, w.name) for n in _names(w) if _is_open(problem, n)}
     if not open_names:
         return problem, ()
@@ -148,7 +131,7 @@ def _names(width: Width) -> tuple[str, ...]:
 
 def _present(problem: EstimationProblem) -> list[Width]:
     """The widths of the model, of which each is a parameter."""
-    return [w for w in problem.system.plant.excitation.widths if w.name in problem.parameters]
+    return [w for w in problem.system.plant.identification_hints.widths if w.name in problem.parameters]
 
 
 def _is_open(problem: EstimationProblem, name: str) -> bool:
@@ -160,14 +143,7 @@ def _is_open(problem: EstimationProblem, name: str) -> bool:
 
 
 def _search_width(race: "_Race", width: Width, best: _Trial) -> tuple[_Trial, bool]:
-    """Narrow a width as long as that lowers the cost, or shows what it hides; else widen it as long.
-
-    Returns
-    -------
-    best : Trial
-    too_stiff : bool
-        Whether a narrower one takes too many integration steps.
-    """
+    """Narrow a width as long as that lowers the cost, or shows what it hides; else widen it as long."""
     given, too_stiff = best, False
     for factor in (1 / width.factor, 1 / sqrt(width.factor)):
         best, too_stiff = _follow(race, width, best, factor)
@@ -195,7 +171,7 @@ def _is_confirmed(race: "_Race", width: Width, given: _Trial, best: _Trial) -> b
         return True
     trial, other = (race.run(t.widths, confirms=True) for t in (best, given))
     is_wider = trial.widths[width.name] > other.widths[width.name]
-    if is_wider and other.cost < inf and trial.misfit > MAX_WIDENED_MISFIT:
+    if is_wider and other.cost < inf and trial.misfit > MODEL_ERROR_LEVEL**2:
         return False
     return _is_better(width, trial, other)
 
@@ -205,15 +181,15 @@ def _is_foreseen(width: Width, given: _Trial, best: _Trial) -> bool:
     if not (best.widths[width.name] < given.widths[width.name] and 0 < best.foreseen < inf):
         return False
     tight, other = (replace(t, cost=t.foreseen) for t in (best, given))
-    return tight.cost < FORESEEN_RATIO * other.cost or _shows_more(width, tight, other)
+    return tight.cost < FORESEEN_RATIO * other.cost or _is_too_wide(width, tight, other)
 
 
 def _is_better(width: Width, trial: _Trial, other: _Trial) -> bool:
     """Whether a trial follows the logs better than another, or as well while it shows what the other hides."""
-    return trial.is_better_than(other) or _shows_more(width, trial, other)
+    return trial.is_better_than(other) or _is_too_wide(width, trial, other)
 
 
-def _shows_more(width: Width, trial: _Trial, best: _Trial) -> bool:
+def _is_too_wide(width: Width, trial: _Trial, best: _Trial) -> bool:
     """Whether a width is too wide for what it hides, and a narrower one follows the logs as well."""
     is_narrower = trial.widths[width.name] < best.widths[width.name]
     if width.hides not in best.parameters or not (is_narrower and trial.cost <= best.cost + best.significant_fall):
@@ -272,19 +248,7 @@ def _foresee(fit: Fit, gap: float) -> float:
 
 
 def is_too_stiff(transcription: Transcription, method: LeastSquares, *, implicit: bool = True) -> bool:
-    """Whether a start takes more integration steps than a search allows.
-
-    Parameters
-    ----------
-    transcription : Transcription
-    method : LeastSquares
-    implicit : bool
-        Whether steps may be implicit in a state, as a search's may; those of simulation and tuning are Runge-Kutta's.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a start takes more integration steps than a search allows."""
     segments = segment(transcription)
     nodes, q = start_nodes(segments), np.array([p.value for p in segments.transcription.parameters.values()])
     if implicit:

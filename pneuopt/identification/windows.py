@@ -1,11 +1,10 @@
 """`fit_in_windows`: a long log that the model does not follow from end to end, fitted in windows that it follows.
 
 A plant that integrates adds up whatever its model misses: the position runs away from the log, and the gaps of a fit
-that links its segments take the misfit in their place. In windows with a start state each, the model runs freely for a
+that links its segments take the misfit in their place. In windows with a start state each the model runs freely for a
 limited time only. Short windows show little of slow terms, long ones gather what the model misses; the length is that
-at which the estimates have the narrowest intervals, which count how parts of the log disagree, among those that agree
-with all shorter ones (the rule of Lepski, Theory of Probability and its Applications 35(3), 1991;
-problems/identify/windows.py holds its estimates to the truth).
+with the narrowest intervals among those that agree with all shorter ones (the rule of Lepski, Theory of Probability and
+its Applications 35(3), 1991; problems/identify/windows.py holds its estimates to the truth).
 """
 
 import math
@@ -18,7 +17,7 @@ from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, t_quantile
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.result import ChosenWindow
-from pneuopt.identification.search import fit_holding_unidentifiable
+from pneuopt.identification.search import fit_fixing_unidentifiable
 from pneuopt.identification.tolerances import (
     FIRST_ITERATIONS,
     MIN_KNOWN_SHARE,
@@ -82,13 +81,7 @@ class _Trial(NamedTuple):
 
 
 def check_window(problem: EstimationProblem) -> None:
-    """Refuse a window that no log of a problem can be cut into; an infinite one cuts none.
-
-    Raises
-    ------
-    InputError
-        If it holds fewer than two samples, is longer than every log, or cuts a loop whose controller goes on.
-    """
+    """Refuse a window of fewer than two samples, longer than every log, or in a loop whose controller goes on."""
     if problem.window == math.inf:
         return
     logs = [e.trajectory for e in problem.experiments]
@@ -104,22 +97,7 @@ def check_window(problem: EstimationProblem) -> None:
 
 
 def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
-    """The fit in windows of the length with the narrowest intervals, where a fit of whole logs has failed by its gaps.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-        Of whole logs, or of windows whose segments are linked.
-
-    Returns
-    -------
-    problem : EstimationProblem
-        With one segment a window.
-    fit : Fit
-    window : ChosenWindow
-        None in place of all three where the fit has not failed by its gaps, and where no window gives an answer.
-    """
+    """The fit in windows of the length with the narrowest intervals; None unless whole logs failed by their gaps."""
     if not _has_failed_by_gaps(problem, fit):
         return None
     lengths = [problem.window] if math.isfinite(problem.window) else _lengths(problem)
@@ -139,17 +117,9 @@ def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
 
 
 def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
-    """Each log simulated from its fitted start to its end, without gaps; only a hole in its inputs starts anew.
+    """Each log simulated from its fitted start to its end without gaps; only a hole in its inputs starts anew.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-    fit : Fit
-
-    Returns
-    -------
-    tuple of Trajectory
-        The outputs, and the states where the run took all samples in a row; not finite where the model diverges.
+    Not finite where the model diverges.
     """
     if not problem.system.states:
         return fit.trajectories
@@ -185,7 +155,7 @@ def _try_length(problem: EstimationProblem, start: Start, length: float, iterati
     # without gaps all stages are alike; steps are refined where the search has converged
     last = replace(problem.method.stages[-1], iterations=iterations, refine=1)
     cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=(last,)))
-    held, found = fit_holding_unidentifiable(cut, start)
+    held, found = fit_fixing_unidentifiable(cut, start)
     held = replace(held, method=replace(held.method, stages=problem.method.stages))
     freedom = degrees_of_freedom(held, found)
     return _Trial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))

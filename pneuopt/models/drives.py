@@ -15,7 +15,7 @@ import casadi as ca
 from pneuopt.dynamics.hooks import Axis, Log, Rest, Start
 from pneuopt.dynamics.system import Symbols, System, define, names, stack
 from pneuopt.models.declaration import DriveKind, FirstFiles
-from pneuopt.models.friction import LOAD_EXCITATION, RIG_EXCITATION, Coulomb, FrictionModel, law_inputs, load_excitation
+from pneuopt.models.friction import LOAD_HINTS, RIG_HINTS, Coulomb, FrictionModel, law_inputs, load_hints
 from pneuopt.models.friction_laws import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.starts.friction import force_starts, motion_starts
@@ -62,8 +62,8 @@ class ForceDrive:
         inputs = (FORCE, *_pressure_inputs(self.friction))
         starts = partial(force_starts, self.friction)
         system = define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, starts)
-        excitation = self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION
-        return with_rest(replace(system, excitation=excitation, meter=_power_meter(system)), FORCE, Axis())
+        hints = self.friction.identification_hints.with_prefix("friction") | LOAD_HINTS
+        return with_rest(replace(system, identification_hints=hints, meter=_power_meter(system)), FORCE, Axis())
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,8 @@ class MotionDrive:
             pressures = (_PRESSURE_A, *pressures)
         starts = partial(motion_starts, self.friction)
         system = define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, starts)
-        return replace(system, excitation=self.friction.excitation.with_prefix("friction") | RIG_EXCITATION)
+        hints = self.friction.identification_hints.with_prefix("friction") | RIG_HINTS
+        return replace(system, identification_hints=hints)
 
 
 FORCE_KIND = DriveKind(
@@ -215,7 +216,7 @@ INERTIA = Parameter(
     meaning="moment of inertia that turns, the motor's included",
 )
 LOAD_TORQUE = Parameter(0.0, "N*m", lower=-1e5, upper=1e5, meaning="constant torque against positive motion")
-_LOAD_EXCITATION = load_excitation(
+_LOAD_HINTS = load_hints(
     "load.inertia", "load.torque", "torque", "take the inertia from drawings or data sheets and fix it"
 )
 
@@ -267,9 +268,9 @@ class RotaryDrive:
 
         starts = _RotaryStarts(self.friction)
         system = define(states, (TORQUE,), (ANGLE, ANGULAR_SPEED), self.parameters, rhs, starts)
-        excitation = self.friction.excitation.with_prefix("friction") | _LOAD_EXCITATION
+        hints = self.friction.identification_hints.with_prefix("friction") | _LOAD_HINTS
         axis = Axis("angle", "speed", "load.inertia", "N*m", "axis")
-        return with_rest(replace(system, excitation=excitation), TORQUE, axis)
+        return with_rest(replace(system, identification_hints=hints), TORQUE, axis)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import casadi as ca
 import numpy as np
 
-from pneuopt.dynamics.hooks import DEFAULT_WIDTH, Excitation, Lack, LoggedMotion, Need, SeparatingRun, Width
+from pneuopt.dynamics.hooks import DEFAULT_WIDTH, IdentificationHints, Lack, LoggedMotion, Need, SeparatingRun, Width
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
@@ -177,7 +177,7 @@ def lacks_acceleration(inertia: str, remedy: str, seen: LoggedMotion) -> Lack | 
     return None
 
 
-VISCOUS_EXCITATION = Excitation(
+VISCOUS_HINTS = IdentificationHints(
     {"viscous": Need(lacks_speed_range, FRICTION_LEVELS)},
     (
         SeparatingRun(
@@ -187,15 +187,15 @@ VISCOUS_EXCITATION = Excitation(
         ),
     ),
 )
-COULOMB_EXCITATION = (
-    Excitation(
+COULOMB_HINTS = (
+    IdentificationHints(
         {},
         (SeparatingRun(CONSTANT_FORCES, FRICTION_LEVELS, "log both directions"),),
         (Width("smoothing", SMOOTHING_FACTOR),),
     )
-    | VISCOUS_EXCITATION
+    | VISCOUS_HINTS
 )
-STRIBECK_EXCITATION = COULOMB_EXCITATION | Excitation(
+STRIBECK_HINTS = COULOMB_HINTS | IdentificationHints(
     {
         "stribeck_velocity": Need(lacks_stribeck_curve, FRICTION_LEVELS),
         "static": Need(lacks_stribeck_curve, STRIBECK_CURVE),
@@ -209,7 +209,7 @@ STRIBECK_EXCITATION = COULOMB_EXCITATION | Excitation(
     ),
     at_least={"static": "coulomb"},
 )
-BRISTLE_EXCITATION = STRIBECK_EXCITATION | Excitation(
+BRISTLE_HINTS = STRIBECK_HINTS | IdentificationHints(
     dict.fromkeys(sorted(BRISTLES), Need(lacks_presliding)),
     (
         SeparatingRun(
@@ -219,7 +219,7 @@ BRISTLE_EXCITATION = STRIBECK_EXCITATION | Excitation(
         ),
     ),
 )
-ASYMMETRY_EXCITATION = Excitation(
+ASYMMETRY_HINTS = IdentificationHints(
     {
         "coulomb_asymmetry": Need(lacks_directions, FRICTION_LEVELS),
         "viscous_asymmetry": Need(lacks_directions, frozenset({"viscous"})),
@@ -236,8 +236,8 @@ ASYMMETRY_EXCITATION = Excitation(
 _LEVELS = frozenset(f"friction.{n}" for n in FRICTION_LEVELS)
 
 
-def load_excitation(inertia: str, force: str, push: str, remedy: str) -> Excitation:
-    """Excitation that the load of a drive needs.
+def load_hints(inertia: str, force: str, push: str, remedy: str) -> IdentificationHints:
+    """Identification hints of a drive's load.
 
     Parameters
     ----------
@@ -258,11 +258,11 @@ def load_excitation(inertia: str, force: str, push: str, remedy: str) -> Excitat
         SeparatingRun(frozenset({force}), asymmetry, ALIKE_AT_EVERY_SPEED),
         SeparatingRun(frozenset({force}), _LEVELS, "log both directions"),
     )
-    return Excitation({force: Need(lacks_directions, _LEVELS), inertia: Need(lacks)}, runs)
+    return IdentificationHints({force: Need(lacks_directions, _LEVELS), inertia: Need(lacks)}, runs)
 
 
-LOAD_EXCITATION = load_excitation("load.mass", "load.force", "force", "weigh the load and fix its mass")
-RIG_EXCITATION = Excitation({"rig.force_offset": Need(lacks_directions, _LEVELS)})
+LOAD_HINTS = load_hints("load.mass", "load.force", "force", "weigh the load and fix its mass")
+RIG_HINTS = IdentificationHints({"rig.force_offset": Need(lacks_directions, _LEVELS)})
 
 
 def _largest_known(name: str, default: float, *known: ParameterSet) -> float:
@@ -321,7 +321,7 @@ class FrictionModel(Protocol):
         ...
 
     @property
-    def excitation(self) -> Excitation:
+    def identification_hints(self) -> IdentificationHints:
         """Motion that a log must show for each parameter to be identifiable, by the law's parameter names."""
         ...
 
@@ -339,7 +339,7 @@ class FrictionModel(Protocol):
 class Viscous:
     """F = viscous * v."""
 
-    excitation: ClassVar[Excitation] = VISCOUS_EXCITATION
+    identification_hints: ClassVar[IdentificationHints] = VISCOUS_HINTS
     states: tuple[Quantity, ...] = ()
     inputs: tuple[Quantity, ...] = ()
 
@@ -362,7 +362,7 @@ class Viscous:
 class Coulomb:
     """F = coulomb * tanh(v / smoothing) + viscous * v."""
 
-    excitation: ClassVar[Excitation] = COULOMB_EXCITATION
+    identification_hints: ClassVar[IdentificationHints] = COULOMB_HINTS
     states: tuple[Quantity, ...] = ()
     inputs: tuple[Quantity, ...] = ()
 
@@ -388,7 +388,7 @@ class Coulomb:
 class Stribeck:
     """F = g(v) tanh(v / smoothing) + viscous * v, with `stribeck_curve` g."""
 
-    excitation: ClassVar[Excitation] = STRIBECK_EXCITATION
+    identification_hints: ClassVar[IdentificationHints] = STRIBECK_HINTS
     states: tuple[Quantity, ...] = ()
     inputs: tuple[Quantity, ...] = ()
 
@@ -419,7 +419,7 @@ class LuGre:
     ``v zdot = v^2 - sigma_0 |v| v z/g`` the deflection may reach F_s/sigma_0 while g has fallen to F_c.
     """
 
-    excitation: ClassVar[Excitation] = BRISTLE_EXCITATION
+    identification_hints: ClassVar[IdentificationHints] = BRISTLE_HINTS
     inputs: tuple[Quantity, ...] = ()
 
     @property
@@ -491,9 +491,9 @@ class Asymmetric:
         return self.base.parameters | ParameterSet({**coulomb, **added})
 
     @property
-    def excitation(self) -> Excitation:
-        """Excitation of the base model, and motion in both directions."""
-        return ASYMMETRY_EXCITATION | self.base.excitation
+    def identification_hints(self) -> IdentificationHints:
+        """Those of the base model, and motion in both directions."""
+        return ASYMMETRY_HINTS | self.base.identification_hints
 
     @property
     def start(self) -> FrictionStart:
@@ -542,9 +542,9 @@ class PressureDependent:
         return self.base.parameters | ParameterSet({f"coulomb_{name}": slope for name in self.chambers})
 
     @property
-    def excitation(self) -> Excitation:
-        """Excitation that the base model needs."""
-        return self.base.excitation
+    def identification_hints(self) -> IdentificationHints:
+        """Those of the base model."""
+        return self.base.identification_hints
 
     @property
     def start(self) -> FrictionStart:
@@ -656,7 +656,7 @@ SLOW_REVERSALS = SeparatingRun(
     frozenset({"static", "stribeck_velocity", "bristle_stiffness", "bristle_damping", "coulomb", "viscous"}),
     "log slow reversals, with many samples while the speed changes its sign",
 )
-PRESLIDING_EXCITATION = replace(COULOMB_EXCITATION, runs=(SLOW_REVERSALS, *COULOMB_EXCITATION.runs), widths=())
+PRESLIDING_HINTS = replace(COULOMB_HINTS, runs=(SLOW_REVERSALS, *COULOMB_HINTS.runs), widths=())
 
 
 @dataclass(frozen=True)
@@ -667,7 +667,7 @@ class Presliding:
     sensor beside the contact. In `Coulomb` it is a means of integration, and as small as that allows.
     """
 
-    excitation: ClassVar[Excitation] = PRESLIDING_EXCITATION
+    identification_hints: ClassVar[IdentificationHints] = PRESLIDING_HINTS
     states: tuple[Quantity, ...] = ()
     inputs: tuple[Quantity, ...] = ()
 
@@ -735,11 +735,12 @@ class LoadDependent:
         return self.base.parameters | ParameterSet(added)
 
     @property
-    def excitation(self) -> Excitation:
-        """Excitation of the base model, and loads that differ."""
+    def identification_hints(self) -> IdentificationHints:
+        """Those of the base model, and loads that differ."""
         words = "log sliding under a load that is known and large: a weight lifted and lowered, or a spring"
         others = FRICTION_LEVELS | {"viscous", "load.mass", "load.inertia"}
-        return Excitation(runs=(SeparatingRun(frozenset({"coulomb_load"}), others, words),)) | self.base.excitation
+        loads_differ = SeparatingRun(frozenset({"coulomb_load"}), others, words)
+        return IdentificationHints(runs=(loads_differ,)) | self.base.identification_hints
 
     @property
     def start(self) -> FrictionStart:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from pneuopt.dynamics.hooks import Excitation
+from pneuopt.dynamics.hooks import IdentificationHints
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.friction import Force, FrictionModel, FrictionStart
 from pneuopt.quantities.errors import ModelError, require
@@ -61,9 +61,9 @@ class Karnopp:
         return ParameterSet({**kept, "direction": Parameter(0.0, "1", -1.0, 1.0, source="switched by simulate")})
 
     @property
-    def excitation(self) -> Excitation:
-        """Excitation that the base model needs."""
-        return self.base.excitation
+    def identification_hints(self) -> IdentificationHints:
+        """Those of the base model."""
+        return self.base.identification_hints
 
     @property
     def start(self) -> FrictionStart:

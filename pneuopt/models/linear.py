@@ -134,7 +134,9 @@ class SecondOrder:
             tuple(shaping)[:2], _second_order_polynomials, None if friction is None else _friction_polynomials
         )
         plant = _assemble_plant(self, states, _gain_parameter(self.input, self.output, ""), shaping, dynamics, shape)
-        return plant if friction is None else replace(plant, excitation=friction.excitation.with_prefix("friction"))
+        if friction is None:
+            return plant
+        return replace(plant, identification_hints=friction.identification_hints.with_prefix("friction"))
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def with_sensors(
         rest_hook=finder,
         hardware_check_hook=system.hardware_check_hook,
         validity_limits=system.validity_limits,
-        excitation=system.excitation,
+        identification_hints=system.identification_hints,
         axis=system.axis,
     )
 

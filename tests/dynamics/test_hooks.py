@@ -10,7 +10,7 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.hooks import Contact, Excitation, Log, Start, Starts, ValidityLimit
+from pneuopt.dynamics.hooks import Contact, IdentificationHints, Log, Start, Starts, ValidityLimit
 from pneuopt.dynamics.simulate import contacts, simulate
 from pneuopt.dynamics.system import System, define, names
 from pneuopt.evaluation.requirements import SettlingTime
@@ -219,7 +219,7 @@ def test_a_drive_regresses_the_candidates_of_friction_one_by_one(monkeypatch: py
 
 
 def test_parameters_in_order_keep_their_order_in_a_plant() -> None:
-    own = Excitation(at_least={"static": "coulomb"}) | Excitation(at_least={"second": "load.force"})
+    own = IdentificationHints(at_least={"static": "coulomb"}) | IdentificationHints(at_least={"second": "load.force"})
     assert own.with_prefix("friction").at_least == {
         "friction.static": "friction.coulomb",
         "friction.second": "load.force",

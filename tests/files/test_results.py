@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pandas.testing import assert_frame_equal
 
-from pneuopt.dynamics.hooks import Excitation, SeparatingRun
+from pneuopt.dynamics.hooks import IdentificationHints, SeparatingRun
 from pneuopt.evaluation.certificate import Certificate, Defect, Finding
 from pneuopt.evaluation.plants import PlantAxis
 from pneuopt.evaluation.scenarios import Factor
@@ -74,7 +74,7 @@ def fits(draw: st.DrawFn) -> IdentificationResult:
         Status(draw(st.sampled_from(Code)), tuple(draw(st.lists(TEXT, max_size=3)))),
         {n: draw(NUMBER) for n in draw(st.lists(NAME, max_size=3, unique=True))},
         draw(st.dictionaries(NAME, TEXT, max_size=3)),
-        Verdict(known, (tuple(names),), {names[0]: "why"}, (names[1],), Excitation(runs=(run,))),
+        Verdict(known, (tuple(names),), {names[0]: "why"}, (names[1],), IdentificationHints(runs=(run,))),
         (ChosenWidth("w", draw(NUMBER), "m", 1.0),),
         draw(st.none() | st.just(ChosenWindow(1.0, 0.5, math.inf, 0.1))),
     )
@@ -85,7 +85,7 @@ def same(a: Any, b: Any) -> bool:
     if isinstance(a, pd.DataFrame):
         assert_frame_equal(a, b, check_exact=True, check_frame_type=False)
         return True
-    if isinstance(a, Excitation):
+    if isinstance(a, IdentificationHints):
         return (a.runs, a.widths, dict(a.at_least)) == (b.runs, b.widths, dict(b.at_least))
     if isinstance(a, np.ndarray):
         return np.array_equal(a, b, equal_nan=True)

@@ -10,7 +10,6 @@ from pneuopt.identification.identify import identify
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
-from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -72,8 +71,3 @@ def test_what_no_two_logs_identify_is_not_compared() -> None:
     found = compare_logs(DRIVE, logs, known)
     assert found.agree
     assert found.reason.startswith("nothing could be compared")
-
-
-def test_one_log_is_not_to_be_compared() -> None:
-    with pytest.raises(LogError, match="at least two"):
-        compare_logs(DRIVE, [pushed("a", 1)], FREE)

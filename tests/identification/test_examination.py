@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pneuopt.identification.examination import examine_logs, stated_axis
+from pneuopt.identification.examination import axis_from_model, examine_logs
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive, RotaryDrive
 from pneuopt.models.friction import Asymmetric, Coulomb
@@ -22,7 +22,7 @@ def test_what_is_stated_of_a_pushed_load() -> None:
     drive = ForceDrive(Coulomb(), Load(spring=True, inclined=True))
     values = {"load.mass": 3.0, "load.force": 4.0, "load.stiffness": 50.0, "load.rest_position": 0.2}
     given = drive.parameters.with_values({**values, "load.inclination": math.asin(0.5)})
-    axis = stated_axis(drive.system(), LOG, given)
+    axis = axis_from_model(drive.system(), LOG, given)
     assert axis.forces == pytest.approx({"position": -50.0, "force": 1.0})
     assert axis.constant == pytest.approx(-4.0 + 50.0 * 0.2 - 3.0 * 9.80665 * 0.5)
     assert (axis.inertia, axis.inertia_name, axis.offset_parameter) == (3.0, "load.mass", "load.force")
@@ -34,39 +34,39 @@ def test_what_is_stated_of_a_pushed_load() -> None:
 )
 def test_what_is_free_is_not_stated(free: str, inertia: float, is_constant: bool, has_forces: bool) -> None:
     drive = ForceDrive(Coulomb())
-    axis = stated_axis(drive.system(), LOG, drive.parameters.freed(free))
+    axis = axis_from_model(drive.system(), LOG, drive.parameters.freed(free))
     assert axis.inertia == pytest.approx(inertia, nan_ok=True)
     assert math.isfinite(axis.constant) == is_constant
     assert bool(axis.forces) == has_forces
     known = LOG.with_conditions({"load.mass": 2.0, "load.force": 1.0})
-    own = stated_axis(drive.system(), known, drive.parameters.freed(free))
+    own = axis_from_model(drive.system(), known, drive.parameters.freed(free))
     assert (own.inertia, own.constant) == (2.0, -1.0)
 
 
 def test_friction_that_differs_by_direction_leaves_no_offset_to_be_seen() -> None:
     drive = ForceDrive(Asymmetric(Coulomb()))
-    assert math.isnan(stated_axis(drive.system(), LOG, drive.parameters.freed("friction.*")).constant)
+    assert math.isnan(axis_from_model(drive.system(), LOG, drive.parameters.freed("friction.*")).constant)
 
 
 def test_a_cylinder_has_its_areas_its_ambient_pressure_and_its_stops() -> None:
     drive = PneumaticDrive()
     truth = drive.parameters
-    axis = stated_axis(drive.system(), LOG, truth)
+    axis = axis_from_model(drive.system(), LOG, truth)
     area = math.pi / 4 * truth.value("cylinder.bore") ** 2
     rod = math.pi / 4 * truth.value("cylinder.rod") ** 2
     assert axis.forces == pytest.approx({"pressure_a": area, "pressure_b": rod - area}, rel=1e-6)
     assert axis.constant == pytest.approx(-rod * truth.value("ambient.pressure") - truth.value("load.force"), rel=1e-2)
     assert axis.stops == pytest.approx((0.0, truth.value("cylinder.stroke")), abs=2e-4)
-    assert stated_axis(drive.system(), LOG, truth.freed("cylinder.bore")).forces == {}
+    assert axis_from_model(drive.system(), LOG, truth.freed("cylinder.bore")).forces == {}
 
 
 def test_other_plants_name_their_own_channels_or_none() -> None:
     rotary = RotaryDrive(Coulomb())
-    axis = stated_axis(rotary.system(), LOG, rotary.parameters)
+    axis = axis_from_model(rotary.system(), LOG, rotary.parameters)
     assert (axis.position, axis.push) == ("angle", "torque")
     assert axis.forces == pytest.approx({"torque": 1.0})
     system = FirstOrder().system()
-    assert stated_axis(system, LOG, system.parameters).forces == {}
+    assert axis_from_model(system, LOG, system.parameters).forces == {}
 
 
 def test_a_stated_mass_is_held_against_the_log_and_a_free_one_is_not() -> None:

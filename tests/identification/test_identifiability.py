@@ -1,23 +1,41 @@
-"""Verdicts before and after a fit, in words."""
+"""What logs identify: before a fit and after it, in words; what they do not identify has no number."""
 
 import math
 from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identification.identifiability import identifiability
+from pneuopt.dynamics.system import Symbols, define, discretise
+from pneuopt.files.drive import read_drive, write_fit
+from pneuopt.files.toml import read_toml
+from pneuopt.identification import identify as identify_module
+from pneuopt.identification.examination import pose_problem
+from pneuopt.identification.identifiability import (
+    _log_root_information,
+    foresee_unidentifiable,
+    identifiability,
+    prior_dominated,
+    prior_influenced,
+)
 from pneuopt.identification.identify import identify
+from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ConvergenceError, InputError
-from pneuopt.quantities.parameters import Intersample, ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
+from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
+from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, Stage
+from pneuopt.shooting.segments import segment, start_nodes
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 TIME = np.arange(0, 1.5, 1e-3)
 SWING = 60 * np.sin(2 * np.pi * 2 * TIME) + 40 * np.sin(2 * np.pi * 5 * TIME)
@@ -138,3 +156,238 @@ def test_a_failure_names_the_worst_place() -> None:
     assert isinstance(result, IdentificationResult)
     assert result.estimates[["stderr", "ci_low", "ci_high"]].isna().all(axis=None)
     assert math.isfinite(result.estimates["value"].iloc[0])
+
+
+DRIVE = ForceDrive(Stribeck())
+LEVELS = ("friction.coulomb", "friction.viscous", "friction.static", "friction.stribeck_velocity")
+SWING_TIME = np.arange(0, 1.5, 2e-3)
+SWINGING = 60 * np.sin(2 * np.pi * SWING_TIME) + 40 * np.sin(
+    2 * np.pi * 2.3 * SWING_TIME
+)  # [N] slides, sticks and turns
+ONE_WAY = 150 + 40 * np.sin(2 * np.pi * 2 * SWING_TIME)  # [N] slides forwards, never slowly
+
+
+def swinging_log(force: Array, first: int = 0) -> Experiment:
+    """The drive's position under a force, with 20 um of noise, from a sample on."""
+    held = {"force": Intersample.HELD}
+    run = simulate(DRIVE.system(), Trajectory(SWING_TIME, {"force": force}), DRIVE.parameters, intersample=held)
+    noisy = run["position"] + 2e-5 * np.random.default_rng(0).standard_normal(SWING_TIME.size)
+    table = Trajectory(SWING_TIME, {"force": force, "position": noisy}).rows(first, SWING_TIME.size)
+    return Experiment(table, {"position": 2e-5}, name="run").with_intersample(held)
+
+
+def foreseen(run: Experiment, *free: str) -> tuple[str, ...]:
+    return foresee_unidentifiable(pose_problem(DRIVE, run, DRIVE.parameters.freed(*free), LeastSquares()))
+
+
+def test_nothing_is_said_of_a_log_that_shows_all() -> None:
+    assert foreseen(swinging_log(SWINGING), *LEVELS, "load.mass", "load.force") == ()
+
+
+def test_a_log_that_moves_one_way_does_not_tell_friction_from_a_constant_force() -> None:
+    said = foreseen(swinging_log(ONE_WAY, 100), "friction.coulomb", "friction.viscous", "load.mass", "load.force")
+    lack = "before the search: the logs do not identify load.force: the drive moves forwards only; log both directions"
+    assert said == (lack,)
+
+
+def test_a_log_that_never_slides_slowly_does_not_tell_static_friction() -> None:
+    said = foreseen(swinging_log(ONE_WAY, 100), *LEVELS)
+    assert any("friction.static" in sentence for sentence in said)
+    assert all("slower than the Stribeck velocity" in s or "where friction is one level" in s for s in said), said
+    assert not any("friction.coulomb" in sentence.partition(": the logs do not identify")[2] for sentence in said)
+
+
+def test_what_is_known_is_not_doubted() -> None:
+    """One way, too, Coulomb friction and mass are identified where no constant force is free."""
+    assert foreseen(swinging_log(ONE_WAY, 100), "friction.coulomb", "load.mass") == ()
+
+
+def test_a_static_map_is_fitted_as_soon_as_it_is_doubted() -> None:
+    rig = MotionDrive(Stribeck(), chamber=False)
+    speed = np.full(100, 0.3)
+    force = 50 + 0.5 * np.random.default_rng(0).standard_normal(100)
+    run = Experiment(Trajectory(SWING_TIME[:100], {"speed": speed, "force": force}), {"force": 0.5}, accept=("motion",))
+    assert foresee_unidentifiable(pose_problem(rig, run, rig.parameters.freed(*LEVELS), LeastSquares())) == ()
+
+
+def test_identify_warns_before_it_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    def search(*_: object, **__: object) -> None:
+        raise RuntimeError("the search has begun")
+
+    monkeypatch.setattr(identify_module, "choose_widths", search)
+    given = DRIVE.parameters.freed("friction.coulomb", "load.force")
+    with (
+        pytest.warns(PhysicsWarning, match=r"before the search: .*load\.force: the drive moves forwards only"),
+        pytest.raises(RuntimeError, match="has begun"),
+    ):
+        identify_module.identify(DRIVE, swinging_log(ONE_WAY, 100), given)
+
+
+N, H, NOISE, RATE = 40, 0.1, 0.05, 0.3
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_information_about_a_rate_counts_whether_the_start_is_known(known: bool) -> None:
+    """Of y = x0 + rate t the sum of t^2 with x0 known, and of (t - mean t)^2 without."""
+
+    def rhs(t: object, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
+        return {"x": p["rate"] + u["push"]}, {"x": x["x"]}
+
+    x, free = [Quantity("x", "m")], ParameterSet({"rate": Parameter(RATE, "m/s", -5.0, 5.0, free=True)})
+    system, t = discretise(define(x, [Quantity("push", "m/s")], x, free, rhs), 1), H * np.arange(N, dtype=float)
+    start, guess = np.array([0.0]) if known else None, RATE * t[:, None]
+    phase = Phase("log", t, np.full(N, H), np.zeros((N, 1)), regular_nodes(N, 8), start, guess=guess)
+    residuals = Residuals(0, ("x",), guess, np.array([NOISE]))
+    segments = segment(Transcription(system, system.parameters, (phase,), (residuals,)))
+    run = segments.run(start_nodes(segments), np.array([RATE]), 1, sensitivities=True)
+    assert run.dy is not None
+    assert run.dx_end is not None
+    root = _log_root_information(segments, run.dy / NOISE, run.dx_end, 0, np.ones(1))
+    expected = np.sum(t**2) if known else np.sum((t - t.mean()) ** 2)
+    assert_allclose(root.T @ root, [[expected / NOISE**2]], rtol=1e-9)
+
+
+BRISTLE_FILE = """
+[drive]
+kind = "force"
+[load]
+mass = { value = "5 kg", free = true }
+[friction]
+model = "lugre"
+coulomb = { value = "30 N", free = true }
+viscous = { value = "70 N*s/m", free = true }
+bristle_stiffness = { value = "20 N/mm", free = true }  # a guess
+bristle_damping = { value = "100 N*s/m", free = true }
+"""
+SLIDE_TIME = np.arange(0, 1.0, 1e-3)
+FORCE = 150 + 60 * np.sin(2 * np.pi * 2 * SLIDE_TIME) + 40 * np.sin(2 * np.pi * 5 * SLIDE_TIME)
+BRISTLES = ("friction.bristle_stiffness", "friction.bristle_damping")
+SLIDING = ("friction.coulomb", "friction.viscous", "load.mass")
+BRISTLE_DRIVE = ForceDrive(LuGre())
+
+
+@cache
+def slide(seed: int = 0) -> Experiment:
+    """A LuGre drive that slides one way, always fast, with 20 um of noise on its position."""
+    run = simulate(
+        BRISTLE_DRIVE.system(),
+        Trajectory(SLIDE_TIME, {"force": FORCE}),
+        BRISTLE_DRIVE.parameters,
+        intersample={"force": Intersample.LINEAR},
+    )
+    noisy = run["position"] + 2e-5 * np.random.default_rng(seed).standard_normal(SLIDE_TIME.size)
+    log = Trajectory(SLIDE_TIME, {"force": FORCE, "position": noisy})
+    return Experiment(log.rows(300, SLIDE_TIME.size), {"position": 2e-5}, name="slide")
+
+
+def bristles(stiffness: float, damping: float) -> ParameterSet:
+    return BRISTLE_DRIVE.parameters.with_values(dict(zip(BRISTLES, (stiffness, damping), strict=True)))
+
+
+@cache
+def fitted_slide(stiffness: float = 2e4, damping: float = 100.0, seed: int = 0) -> IdentificationResult:
+    return identify(BRISTLE_DRIVE.system(), [slide(seed)], bristles(stiffness, damping).freed(*SLIDING, *BRISTLES))
+
+
+def test_bristles_without_presliding_are_no_numbers_and_keep_their_given_values() -> None:
+    result = fitted_slide()
+    assert result.status.code is Code.PARTIAL
+    said, held = result.status.sentences[:2]
+    assert said == "the logs do not identify friction.bristle_stiffness and friction.bristle_damping"
+    assert held.startswith("held: friction.bristle_stiffness at 2e+04 N/m and friction.bristle_damping at 100 N*s/m;")
+    rows = result.estimates
+    assert rows.index[rows["note"] == "unidentifiable"].tolist() == list(BRISTLES)
+    assert np.isnan(rows.loc[[*BRISTLES], ["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
+    assert np.isnan(result.covariance[BRISTLES[0]]).all()
+    assert [result.parameters.value(n) for n in BRISTLES] == [2e4, 100.0]
+    assert [result.parameters[n].upper for n in BRISTLES] == [BRISTLE_DRIVE.parameters[n].upper for n in BRISTLES]
+    assert result.verdict is not None
+    assert result.verdict.unchanged == BRISTLES
+    assert "(2e+04) and friction.bristle_damping (100) keep their given values" in " ".join(result.verdict.sentences)
+    assert "the motion never reverses" in result.verdict.reasons[BRISTLES[0]]
+
+
+@pytest.mark.parametrize("times", [1 / 3, 1.0, 3.0])
+def test_identifiable_estimates_do_not_depend_on_unidentifiable_ones(times: float) -> None:
+    """Wherever the bristles are fixed, within a decade of the truth, the others stay within their own deviations."""
+    rows = fitted_slide().estimates.loc[[*SLIDING]]
+    fixed = bristles(5e4 * times, 300 * times).freed(*SLIDING)
+    known = identify(BRISTLE_DRIVE.system(), [slide()], fixed).estimates.loc[[*SLIDING]]
+    assert ((rows["value"] - known["value"]).abs() < 0.3 * rows["stderr"]).all()
+    assert_allclose(rows["stderr"], known["stderr"], rtol=0.1)
+    truth = np.array([BRISTLE_DRIVE.parameters.value(n) for n in SLIDING])
+    assert ((rows["value"] - truth).abs() < 4 * rows["stderr"]).all()
+
+
+def test_a_profile_of_an_identifiable_parameter_is_its_interval() -> None:
+    result = fitted_slide()
+    found = profile(BRISTLE_DRIVE.system(), [slide()], result, "friction.coulomb")
+    row = result.estimates.to_dict(orient="index")["friction.coulomb"]
+    ends = np.array([row["ci_low"], row["ci_high"]])
+    assert_allclose(np.array([found.low, found.high]), ends, rtol=0, atol=0.2 * row["stderr"])
+
+
+def test_the_file_of_the_fit_says_why_and_keeps_what_is_unidentifiable(tmp_path: Path) -> None:
+    source, fit = tmp_path / "drive.toml", tmp_path / "fit.toml"
+    source.write_text(BRISTLE_FILE, encoding="utf-8")
+    write_fit(fit, source, fitted_slide())
+    said, text = read_toml(fit).unwrap(), fit.read_text(encoding="utf-8")
+    assert said["status"]["code"] == "converged for a part of the parameters"
+    assert said["verdict"]["unidentifiable"] == said["verdict"]["unchanged"] == list(BRISTLES)
+    assert "the motion never reverses" in said["verdict"]["reasons"][BRISTLES[0]]
+    assert any("keep their given values" in sentence for sentence in said["verdict"]["sentences"])
+    assert np.isnan(said["estimates"][BRISTLES[0]]["value"])
+    assert 'bristle_stiffness = { value = "20 N/mm", free = true }  # a guess' in text
+    _, parameters = read_drive(fit)
+    assert [parameters.value(n) for n in BRISTLES] == [2e4, 100.0]
+    for name in SLIDING:  # written with nine digits
+        assert parameters.value(name) == pytest.approx(fitted_slide().parameters.value(name), rel=1e-8)
+
+
+@pytest.mark.slow
+def test_the_identifiable_ones_are_covered() -> None:
+    """Over 40 noise draws 95 % of the intervals hold the truth: binomial, the three of a draw correlated."""
+    inside = []
+    for seed in range(40):
+        rows = fitted_slide(seed=seed).estimates.loc[[*SLIDING]]
+        truth = np.array([BRISTLE_DRIVE.parameters.value(n) for n in SLIDING])
+        inside.append((rows["ci_low"] <= truth) & (truth <= rows["ci_high"]))
+    assert 0.88 <= np.mean(inside) <= 1.0, np.mean(inside)
+
+
+def rubbed_slowly(*speeds: float) -> Experiment:
+    """A rig at constant speeds, a second each, with 0.2 N of noise on its force."""
+    speed = np.repeat(np.asarray(speeds), 100)
+    t, rng = np.arange(speed.size) * 1e-2, np.random.default_rng(0)
+    force = 30 * np.sign(speed) + 50 * speed + 0.2 * rng.standard_normal(speed.size)
+    return Experiment(Trajectory(t, {"speed": speed, "force": force}), {"force": 0.2}, name="rig")
+
+
+def test_a_curve_that_no_speed_reaches_keeps_its_given_values() -> None:
+    """All speeds are ten Stribeck velocities and more: static friction and that velocity are not felt."""
+    rig = MotionDrive(Stribeck(), chamber=False)
+    curve = ("friction.static", "friction.stribeck_velocity")
+    free = rig.parameters.with_values({curve[1]: 0.01}).freed("friction.coulomb", "friction.viscous", *curve)
+    result = identify(rig.system(), [rubbed_slowly(0.3, -0.3, 0.6, -0.9, 1.5)], free)
+    assert result.estimates["note"].to_dict() == {n: "unidentifiable" if n in curve else "" for n in free.free_names}
+    assert {n: result.parameters.value(n) for n in curve} == {n: free.value(n) for n in curve}
+    rows = result.estimates.drop([*curve])
+    assert ((rows["value"] - np.array([30.0, 50.0])).abs() < 4 * rows["stderr"]).all()
+
+
+def test_what_leans_on_a_held_parameter_and_is_known_well_even_so_is_handed_out() -> None:
+    """A true stick-slip log whose Stribeck velocity did not settle: Coulomb within .6 %, static within 200 %."""
+    values, deviations = np.array([30.0, 97.0, 80.0]), np.array([0.17, 209.0, 0.01])
+    prior = np.diag(np.array([0.99, 0.99, 0.05]) * deviations**2)
+    assert prior_influenced(np.diag(deviations**2), prior).tolist() == [True, True, False]
+    assert prior_dominated(np.diag(deviations**2), prior, values, [0.01]).tolist() == [False, True, False]
+    assert prior_dominated(np.diag(deviations**2), prior, values, [0.0]).tolist() == [True, True, False]
+
+
+def test_a_log_that_identifies_nothing_does_not_converge() -> None:
+    """At one speed there is one level: neither of its two parts is identifiable."""
+    rig = MotionDrive(Stribeck(), chamber=False)
+    free = rig.parameters.freed("friction.coulomb", "friction.viscous")
+    result = identify(rig.system(), [rubbed_slowly(0.5)], free, throw=False)
+    assert not result.status.converged
+    assert "the logs identify none of the free parameters by itself" in result.status.message

@@ -1,27 +1,51 @@
+"""From logs to estimates: whole fits, their options and budgets, what is printed; a drive from whatever was logged."""
+
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.stats import binom
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+import pneuopt as po
+from pneuopt.dynamics.compiled.rollout import Gram, Pieces, Rollout
+from pneuopt.dynamics.hooks import Log
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.select_model import select_model
 from pneuopt.logs.experiment import Experiment
+from pneuopt.models.catalog import b32
 from pneuopt.models.drives import ForceDrive, MotionDrive
-from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
+from pneuopt.models.friction import (
+    Asymmetric,
+    Coulomb,
+    FrictionModel,
+    LoadDependent,
+    LuGre,
+    PressureDependent,
+    Stribeck,
+)
+from pneuopt.models.linear import FirstOrder, SecondOrder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, LogError
-from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, usual_intersample
-from pneuopt.quantities.status import Code
+from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity, usual_intersample
+from pneuopt.quantities.status import Code, Progress
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
+from problems.shared.b32 import FREE as RIG_FREE
+from problems.shared.b32 import LOGGED, VALVE, generate
 
 TRUTH = {
     "load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0, "friction.static": 42.0,
@@ -385,3 +409,321 @@ def test_validation_reads_conditions_and_defaults() -> None:
     good = validate(system, [log.with_conditions({"load.mass": 7.0})], partly)["rmse"].iloc[0]
     assert good < 1.5 * NOISE["position"]
     assert validate(system, [log], partly)["rmse"].iloc[0] > 10 * good
+
+
+def blas_threads() -> set[int]:
+    return {int(library["num_threads"]) for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_blas_has_one_thread_during_a_fit_and_its_own_again_after_it() -> None:
+    drive, t = po.ForceDrive(po.Coulomb()), np.arange(1000) * 1e-3
+    truth = drive.parameters.with_values({"load.mass": 3.0, "friction.coulomb": 30.0, "friction.viscous": 60.0})
+    force = po.Trajectory(t, {"force": 50 * np.sin(2 * np.pi * t) + 40 * np.sin(2 * np.pi * 2.3 * t)})
+    run, noise = po.simulate(drive.system(), force, truth), np.random.default_rng(0).standard_normal(t.size)
+    log = po.Experiment(force.with_columns({"position": run["position"] + 2e-5 * noise}), name="run")
+    used = set[int]()
+    with threadpool_limits(3, user_api="blas"):
+        before = blas_threads()
+        po.identify(drive.system(), [log], truth.freed("friction.*"), progress=lambda _: used.update(blas_threads()))
+        assert used == {1}
+        assert blas_threads() == before
+        assert 1 not in before
+
+
+DRIVE = ForceDrive(Coulomb())
+PARAMETERS = DRIVE.parameters.freed(*FREE)
+
+
+def fit_within(budget: float, parameters: ParameterSet = PARAMETERS) -> IdentificationResult:
+    return identify(DRIVE, [pushed(Coulomb())], parameters, cpu_seconds=budget, throw=False)
+
+
+def test_a_spent_budget_leaves_the_best_values_and_says_so_first() -> None:
+    result = fit_within(1e-9)
+    assert result.status.code is Code.BUDGET
+    assert not result.status.converged
+    assert result.status.verdict.startswith("the CPU budget of 1e-09 s is spent")
+    assert str(result.status).startswith("NOT converged (the CPU budget is spent)")
+    assert np.isfinite(result.estimates["value"]).all()
+    assert result.estimates["ci_low"].isna().all()
+    assert result.widths == ()
+
+
+def test_a_search_begins_again_where_a_budget_has_ended_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    gram, evaluations = Rollout.gram, list[Gram]()
+
+    def evaluate(*given: Any, **options: Any) -> Gram:
+        evaluations.append(gram(*given, **options))  # each takes a second
+        return evaluations[-1]
+
+    monkeypatch.setattr(Rollout, "gram", evaluate)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.time.process_time", lambda: float(len(evaluations)))
+    stated = PARAMETERS.with_values({"friction.smoothing": 1.1e-3})  # no width is left to choose before the search
+    ended = fit_within(4.0, stated)
+    monkeypatch.undo()
+    assert ended.status.code is Code.BUDGET
+    assert ended.stats["iterations"] == 2
+    again = identify(DRIVE, [pushed(Coulomb())], stated, start=ended, throw=False)
+    assert again.status.converged
+    assert again.estimates["value"]["friction.coulomb"] == pytest.approx(30, rel=0.05)
+
+
+def test_a_budget_that_suffices_changes_nothing() -> None:
+    with_budget, without = fit_within(1e3), fit_within(math.inf)
+    assert with_budget.status == without.status
+    assert (with_budget.estimates["value"] == without.estimates["value"]).all()
+
+
+def test_a_spent_budget_is_no_convergence() -> None:
+    with pytest.raises(ConvergenceError, match="CPU budget of 1e-09 s") as caught:
+        identify(DRIVE, [pushed(Coulomb())], PARAMETERS, cpu_seconds=1e-9)
+    assert isinstance(caught.value.solution, IdentificationResult)
+
+
+def step_log() -> Experiment:
+    t = np.arange(0, 0.5, 2e-3)
+    noise = np.random.default_rng(0).normal(0, 1e-3, len(t))
+    moves = t >= 0.05
+    speed = np.where(moves, 2.0 * (1 - np.exp(-(t - 0.05) / 0.08)), 0.0) + noise
+    command = moves.astype(float)
+    return Experiment(Trajectory(t, {"valve_voltage": command, "speed": speed}), {"speed": 1e-3}, name="step")
+
+
+@pytest.fixture(scope="module")
+def step_fit() -> IdentificationResult:
+    plant = FirstOrder()
+    heard: list[Progress] = []
+    free = plant.system().parameters.freed("plant.gain", "plant.time_constant")
+    found = identify(plant, step_log(), free, progress=heard.append)
+    assert heard
+    assert {report.job for report in heard} == {"identify"}
+    assert all(a.seconds <= b.seconds for a, b in pairwise(heard))
+    return found
+
+
+@pytest.mark.parametrize("columns", ["60", "80"])
+def test_a_fit_is_printed_verdict_first_with_intervals_and_marks(
+    step_fit: IdentificationResult, columns: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    text = str(step_fit)
+    assert text == repr(step_fit) == step_fit.summary().to_text()
+    assert text.startswith("converged: ")
+    assert max(map(len, text.splitlines())) <= int(columns)
+    (line,) = [line for line in text.splitlines() if line.startswith("plant.gain")]
+    assert re.search(r" [\d.]+ to ", line)
+    assert line.endswith(str(step_fit.estimates["mark"]["plant.gain"]))
+    page = step_fit._repr_html_()
+    assert page.count("<table>") == 2
+    assert "plant.time_constant" in page
+
+
+def test_predictions_and_selections_tell_how_far_they_are(step_fit: IdentificationResult) -> None:
+    heard: list[Progress] = []
+    validate(FirstOrder(), step_log(), step_fit.parameters, progress=heard.append)
+    predict(FirstOrder(), step_log(), step_fit.parameters, progress=heard.append)
+    models: dict[str, FirstOrder | SecondOrder] = {"first": FirstOrder(), "second": SecondOrder()}
+    free = ["plant.gain", "plant.time_constant", "plant.damping", "plant.natural_frequency"]
+    found = select_model(models, step_log(), ParameterSet(), free=free, progress=heard.append)
+    assert list(dict.fromkeys(report.job for report in heard)) == ["validate", "predict", "select_model"]
+    assert "fitting first, 1 of 2 candidates" in heard
+    text = found.summary().to_text(80)
+    assert text.startswith("first, of ")
+    assert max(map(len, text.splitlines())) <= 80
+
+
+WRONG = {"valve.conductance": 5e-8, "valve.leak": 0.0, "load.mass": 4.0, "supply.pressure": 6.5e5}
+WRONG |= {"valve.critical_ratio": 0.3, "valve.dead_zone": 0.0}
+RIG_TRUTH = {"supply.pressure": 6e5, "load.mass": 3.0}
+
+
+@pytest.fixture(scope="module")
+def drive_log() -> po.Experiment:
+    drive, truth = b32()
+    return generate(drive, truth, seconds=2.0)
+
+
+def blind(drive: PneumaticDrive, truth: po.ParameterSet, *free: str) -> po.ParameterSet:
+    """Free parameters start from the drive's defaults or from wrong values; no start finder reads friction's."""
+    return truth.with_values({n: WRONG.get(n, drive.parameters.value(n)) for n in free}).freed(*free)
+
+
+def check_estimates(fit: po.IdentificationResult, truth: Mapping[str, float], near: float) -> None:
+    """Within some percent, and within four deviations."""
+    for name, row in fit.estimates.iterrows():
+        true = truth[str(name)]
+        assert row["value"] == pytest.approx(true, rel=near), name
+        assert abs(row["value"] - true) < 4 * row["stderr"], name
+
+
+def numbers(truth: po.ParameterSet) -> dict[str, float]:
+    return {n: p.value for n, p in truth.items()}
+
+
+@pytest.mark.parametrize(
+    ("channels", "free"),
+    [
+        (("position", "pressure_a"), (*RIG_FREE, *VALVE)),
+        (("position", "pressure_b"), (*RIG_FREE, *VALVE)),
+        (("position",), RIG_FREE),
+        (("position",), (*RIG_FREE, *VALVE)),
+    ],
+)
+def test_fewer_channels_still_tell(drive_log: po.Experiment, channels: tuple[str, ...], free: tuple[str, ...]) -> None:
+    drive, truth = b32()
+    fit = po.identify(drive.system(), [drive_log.select(("valve_voltage", *channels))], blind(drive, truth, *free))
+    check_estimates(fit, numbers(truth), 0.05)
+
+
+@pytest.mark.parametrize("off", [0.0, -0.02])
+def test_speed_alone_identifies_friction_and_where_it_began(drive_log: po.Experiment, off: float) -> None:
+    """The air in both chambers identifies the position, if the log begins elsewhere than it is said to."""
+    drive, truth = b32()
+    true = float(drive_log.trajectory["position"][0])
+    begin = {"cylinder.start": (true + off) / truth.value("cylinder.stroke")}
+    speed = drive_log.select(("valve_voltage", "speed")).with_conditions(begin)
+    fit = po.identify(drive.system(), [speed], blind(drive, truth, *RIG_FREE))
+    check_estimates(fit, numbers(truth), 0.15)
+    assert fit.trajectories["b32"]["position"][0] == pytest.approx(true, abs=1e-3)
+
+
+def test_supply_and_load_are_known_of_each_log_or_found_for_each(drive_log: po.Experiment) -> None:
+    drive, truth = b32()
+    other = replace(generate(drive, truth.with_values(RIG_TRUTH), seconds=2.0).select(LOGGED), name="other")
+    logs = [replace(drive_log.select(LOGGED), name="first"), other]
+    known = [logs[0], other.with_conditions(RIG_TRUTH)]
+    check_estimates(po.identify(drive.system(), known, blind(drive, truth, *RIG_FREE, *VALVE)), numbers(truth), 0.02)
+    own = blind(drive, truth, *RIG_FREE, *VALVE, *RIG_TRUTH).per_log(*RIG_TRUTH)
+    each = {f"{n}[first]": truth.value(n) for n in RIG_TRUTH} | {f"{n}[other]": v for n, v in RIG_TRUTH.items()}
+    fit = po.identify(drive.system(), logs, own)
+    assert set(each) <= set(fit.estimates.index)
+    check_estimates(fit, numbers(truth) | each, 0.02)
+
+
+def test_dead_zone_and_critical_ratio_are_found_with_friction() -> None:
+    drive, truth = b32()
+    truth = truth.with_values({"valve.dead_zone": 0.05, "valve.critical_ratio": 0.4})
+    free = (*RIG_FREE, *VALVE, "valve.dead_zone", "valve.critical_ratio")
+    drive_log = generate(drive, truth, seconds=2.0).select(LOGGED)
+    check_estimates(po.identify(drive.system(), [drive_log], blind(drive, truth, *free)), numbers(truth), 0.05)
+
+
+def test_friction_from_the_force_of_the_logged_pressures_comes_near(drive_log: po.Experiment) -> None:
+    drive, truth = b32()
+    force = drive.air_force(drive_log.trajectory, truth)
+    p = numbers(truth)
+    areas = np.pi / 4 * p["cylinder.bore"] ** 2 * np.array([1, 1 - (p["cylinder.rod"] / p["cylinder.bore"]) ** 2])
+    gauge = drive_log.trajectory.matrix(["pressure_a", "pressure_b"]) - p["ambient.pressure"]
+    assert force == pytest.approx(gauge @ (areas * [1, -1]))
+    load = po.ForceDrive(drive.friction, drive.load)
+    pushed = replace(drive_log, trajectory=drive_log.trajectory.with_columns({"force": force})).select(
+        ["force", "position"]
+    )
+    known = truth.select(load.parameters)
+    free = {n: load.parameters.value(n) for n in RIG_FREE}
+    fit = po.identify(load.system(), [pushed], known.with_values(free).freed(*RIG_FREE), throw=False)
+    for name in ("friction.coulomb", "friction.static", "friction.viscous"):
+        assert fit.parameters.value(name) == pytest.approx(truth.value(name), rel=0.1), name
+
+
+MASS, COULOMB, VISCOUS, SMOOTHING, FORCE_NOISE = 5.0, 20.0, 80.0, 5e-3, 5e-6
+FORCE_TRUTH = {"load.mass": MASS, "friction.coulomb": COULOMB, "friction.viscous": VISCOUS}
+HELD = {"force": Intersample.HELD}
+
+
+def push(t: Array) -> Array:
+    """A force of up to 6 Hz [N], continuous."""
+    turns = 2 * math.pi * np.asarray(t)
+    return np.asarray(60 * np.sin(1.3 * turns) + 25 * np.sin(3.1 * turns + 1) + 10 * np.sin(5.7 * turns + 2))
+
+
+@cache
+def response(rate: float, seconds: float, load: float) -> Array:
+    """The position that SciPy finds at the samples, friction rising by `load` times the force."""
+
+    def slope(t: float, x: Array) -> list[float]:
+        force = float(push(np.array(t)))
+        friction = (COULOMB + load * abs(force)) * math.tanh(x[1] / SMOOTHING) + VISCOUS * x[1]
+        return [x[1], (force - friction) / MASS]
+
+    t = np.arange(round(seconds * rate) + 1) / rate
+    run = solve_ivp(slope, (0, t[-1]), [0.1, 0.0], "LSODA", t, rtol=1e-9, atol=1e-12, max_step=2e-3)
+    return np.asarray(run.y[0])
+
+
+def logged(rate: float, seconds: float = 6.0, load: float = 0.0, **others: object) -> Experiment:
+    t = np.arange(round(seconds * rate) + 1) / rate
+    x = response(rate, seconds, load) + FORCE_NOISE * np.random.default_rng(1).standard_normal(t.size)
+    return Experiment(Trajectory(t, {"force": push(t), "position": x}), {"position": FORCE_NOISE}, name="run", **others)  # type: ignore[arg-type]
+
+
+def fitted_force_log(log: Experiment, load: float = 0.0, *, throw: bool = True) -> IdentificationResult:
+    drive = ForceDrive(LoadDependent(Coulomb()) if load else Coulomb())
+    free = drive.parameters.with_values({"friction.smoothing": SMOOTHING}).freed(*FORCE_TRUTH)
+    return identify(drive, log, free.freed("friction.coulomb_load") if load else free, throw=throw)
+
+
+def errors(result: IdentificationResult) -> dict[str, float]:
+    found: pd.Series = result.estimates["value"]
+    return {n: float(found[n]) / true - 1 for n, true in FORCE_TRUTH.items()}
+
+
+@pytest.mark.parametrize(("rate", "off"), [(50.0, 0.02), (100.0, 0.005), (500.0, 0.001)])
+def test_a_measured_force_is_not_held_over_the_sample(rate: float, off: float) -> None:
+    found = errors(fitted_force_log(logged(rate)))
+    assert max(map(abs, found.values())) < off, found
+
+
+def test_held_over_the_sample_the_same_log_gives_another_mass() -> None:
+    assert errors(fitted_force_log(logged(50.0, intersample=HELD), throw=False))["load.mass"] < -0.1
+
+
+def test_load_dependent_friction_from_four_seconds_at_100_hz() -> None:
+    found = errors(fitted_force_log(logged(100.0, 4.0, load=0.1), load=0.1))
+    assert max(abs(found["load.mass"]), abs(found["friction.coulomb"])) < 0.05, found
+
+
+def test_a_third_of_the_rows_missing_does_not_move_the_mass() -> None:
+    log = logged(500.0)
+    kept = np.random.default_rng(0).random(len(log.trajectory)) > 1 / 3
+    part = Trajectory(log.trajectory.t[kept], {n: log.trajectory[n][kept] for n in log.trajectory})
+    found = errors(fitted_force_log(Experiment(part, log.noise, name="run")))
+    assert max(map(abs, found.values())) < 0.003, found
+
+
+def test_a_prediction_reads_the_inputs_as_the_fit_does() -> None:
+    log, drive = logged(50.0), ForceDrive(Coulomb())
+    known = drive.parameters.with_values({**FORCE_TRUTH, "friction.smoothing": SMOOTHING})
+    linear, held = (float(validate(drive, e, known)["rmse"].iloc[0]) for e in (log, log.with_intersample(HELD)))
+    assert linear < 0.15 * held
+    run = predict(drive, log, known)
+    assert float(np.sqrt(np.mean((run["position"] - log.trajectory["position"]) ** 2))) == pytest.approx(linear)
+
+
+def test_two_logs_of_one_fit_may_differ_in_what_they_hold() -> None:
+    measured, drive = logged(100.0), ForceDrive(Coulomb()).system()
+    t, force = measured.trajectory.t, measured.trajectory["force"]
+    known = drive.parameters.with_values({**FORCE_TRUTH, "friction.smoothing": SMOOTHING})
+    held = simulate(drive, Trajectory(t, {"force": force}), known, initial={"position": 0.1}, rtol=1e-8)["position"]
+    noisy = held + FORCE_NOISE * np.random.default_rng(2).standard_normal(t.size)
+    commanded = Experiment(
+        Trajectory(t, {"force": force, "position": noisy}), measured.noise, name="commanded", intersample=HELD
+    )
+    found = errors(identify(drive, [measured, commanded], known.freed(*FORCE_TRUTH)))
+    assert max(map(abs, found.values())) < 0.005, found
+
+
+def test_a_linear_plant_starts_from_a_measured_input() -> None:
+    plant = FirstOrder(input=Quantity("force", "N")).system()
+    true = plant.parameters.with_values({"plant.time_constant": 0.08, "plant.gain": 0.02})
+    t = np.arange(0, 4, 0.02)
+    x = solve_ivp(lambda s, v: (0.02 * push(np.array(s)) - v) / 0.08, (0, 4), [0.0], t_eval=t, rtol=1e-9, atol=1e-12).y[
+        0
+    ]
+    log = Trajectory(t, {"force": push(t), "speed": x})
+    start = {
+        kind: plant.starts({"run": Log(log, true.freed("plant.*"), {"force": kind})})[0].parameters
+        for kind in Intersample
+    }
+    off = {kind: abs(values["plant.time_constant"] / 0.08 - 1) for kind, values in start.items()}
+    assert off[Intersample.LINEAR] < 0.05 < off[Intersample.HELD]

@@ -12,7 +12,6 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -94,9 +93,3 @@ def test_estimated_noise_does_not_hide_a_wrong_model() -> None:
     wrong = FREE.with_values({"friction.coulomb": 45.0}).fixed("friction.coulomb")
     fit = identify(DRIVE, [noisy(1)], wrong, estimate_noise=True, throw=False)
     assert "does not explain" in fit.status.message or not fit.status.converged
-
-
-def test_a_threshold_is_positive() -> None:
-    for loss in (Huber, SoftL1):
-        with pytest.raises(InputError, match="threshold must be positive"):
-            loss(0.0)

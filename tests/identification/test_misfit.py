@@ -22,7 +22,7 @@ from scipy.stats import ttest_1samp
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_fit, write_fit
 from pneuopt.identification import identify as identification
-from pneuopt.identification import misfit as width_bias
+from pneuopt.identification import misfit
 from pneuopt.identification.identify import identify
 from pneuopt.identification.misfit import (
     Clusters,
@@ -288,7 +288,7 @@ def cut(logs: Rows, blocks: int = TIME_BLOCKS) -> tuple[Rows, list[int]]:
     return rows, own
 
 
-def fit_of_clusters(rows: Rows) -> Array:
+def solve_rows(rows: Rows) -> Array:
     X, y = (np.concatenate(a) for a in zip(*rows, strict=True))
     return np.asarray(np.linalg.lstsq(X, y, rcond=None)[0])
 
@@ -302,7 +302,7 @@ def clusters_of(rows: Rows, logs: list[int], estimate: Array) -> Clusters:
 def solve(logs: Rows) -> tuple[Array, Array, RobustCovariance]:
     """Estimates, their covariance for white residuals, and the robust one."""
     rows, own = cut(logs)
-    estimate = fit_of_clusters(rows)
+    estimate = solve_rows(rows)
     X, y = (np.concatenate(a) for a in zip(*rows, strict=True))
     variance = float(np.sum((y - X @ estimate) ** 2)) / (len(y) - 3)
     white = variance * np.linalg.inv(X.T @ X)
@@ -315,12 +315,12 @@ def uneven() -> tuple[Rows, list[int], Clusters]:
     rng = np.random.default_rng(3)
     logs = [(friction_columns(n, rng), autoregression(n, 5, rng)) for n in (60, 100, 140)]
     rows, own = cut(logs)
-    return rows, own, clusters_of(rows, own, fit_of_clusters(rows))
+    return rows, own, clusters_of(rows, own, solve_rows(rows))
 
 
 def test_jackknife_is_that_of_literal_refits(uneven: tuple[Rows, list[int], Clusters]) -> None:
     rows, _, clusters = uneven
-    moved = np.array([fit_of_clusters(rows[:g] + rows[g + 1 :]) - fit_of_clusters(rows) for g in range(len(rows))])
+    moved = np.array([solve_rows(rows[:g] + rows[g + 1 :]) - solve_rows(rows) for g in range(len(rows))])
     found = jackknife(clusters)
     size = np.abs(moved).max(axis=0)  # within the regularisation, a thousandth of the information
     assert_allclose(found.changes / size, moved / size, rtol=0.01, atol=0.005)
@@ -367,7 +367,7 @@ def test_disagreement_of_white_residuals_is_uniform() -> None:
     for seed in range(200):
         rng = np.random.default_rng(seed)
         rows, own = cut([(friction_columns(480, rng), rng.standard_normal(480))])
-        found.append(disagreement_p(clusters_of(rows, own, fit_of_clusters(rows)), 1.0))
+        found.append(disagreement_p(clusters_of(rows, own, solve_rows(rows)), 1.0))
     assert np.mean(found) == pytest.approx(0.5, abs=0.07)
     assert np.mean(np.array(found) < 0.1) == pytest.approx(0.1, abs=0.06)
 
@@ -376,7 +376,7 @@ def white(n: int, rng: np.random.Generator) -> Array:
     return rng.standard_normal(n)
 
 
-def slow_of_clusters(share: float) -> Callable[[int, np.random.Generator], Array]:
+def slowly(share: float) -> Callable[[int, np.random.Generator], Array]:
     return lambda n, rng: rng.standard_normal(n) + share * autoregression(n, n / 25, rng)
 
 
@@ -414,8 +414,8 @@ def test_white_residuals_keep_their_intervals(logs: int) -> None:
 @pytest.mark.parametrize(
     ("logs", "n", "residuals", "bad", "scatter"),
     [
-        (1, 3000, slow_of_clusters(0.15), 0, 0.0),
-        (1, 3000, slow_of_clusters(0.2), 0, 0.0),
+        (1, 3000, slowly(0.15), 0, 0.0),
+        (1, 3000, slowly(0.2), 0, 0.0),
         (1, 2000, coloured(5), 0, 0.0),
         (1, 2000, coloured(20), 0, 0.0),
         (1, 3000, coloured(60), 0, 0.0),
@@ -436,8 +436,8 @@ def test_intervals_hold_where_those_of_white_residuals_do_not(
 
 
 WIDTH = "friction.smoothing"
-FREE_WIDTH_BIAS = ("friction.coulomb", "friction.viscous")
-NOISE_WIDTH_BIAS = 2e-6  # of the position [m]
+SLIDING = ("friction.coulomb", "friction.viscous")
+FINE_NOISE = 2e-6  # of the position [m]
 
 
 def fitted(friction: FrictionModel, width: float = 1.0) -> tuple[EstimationProblem, Fit]:
@@ -448,8 +448,8 @@ def fitted(friction: FrictionModel, width: float = 1.0) -> tuple[EstimationProbl
     force = Trajectory(t, {"force": 60 * np.sin(2 * np.pi * 4 * t)})
     behaviour = input_behaviour(system, Experiment(force.with_columns({"position": t}), {}, name="run"))
     run = simulate(system, force, own, initial={"position": 0.0, "speed": 0.0}, intersample=behaviour)
-    position = run["position"] + NOISE_WIDTH_BIAS * np.random.default_rng(3).standard_normal(1000)
-    log = Experiment(force.with_columns({"position": position}), {"position": NOISE_WIDTH_BIAS}, name="run")
+    position = run["position"] + FINE_NOISE * np.random.default_rng(3).standard_normal(1000)
+    log = Experiment(force.with_columns({"position": position}), {"position": FINE_NOISE}, name="run")
     given = own.freed(*truth)
     if WIDTH in given:
         given = given.with_values({WIDTH: width * own.value(WIDTH)})
@@ -471,9 +471,9 @@ def test_the_fall_and_the_shifts_are_those_of_a_fit_that_estimates_the_width() -
     assert refit.parameters.value(WIDTH) == pytest.approx(problem.system.parameters.value(WIDTH), rel=0.02)
     assert found.fall > 10.8
     assert found.fall == pytest.approx(2 * (fit.stats["cost"] - refit.stats["cost"]), rel=0.2)
-    shifts = [refit.parameters.value(n) - fit.parameters.value(n) for n in FREE_WIDTH_BIAS]
-    assert dict(zip(FREE_WIDTH_BIAS, found.shifts, strict=True)) == pytest.approx(
-        dict(zip(FREE_WIDTH_BIAS, shifts, strict=True)), rel=0.2
+    shifts = [refit.parameters.value(n) - fit.parameters.value(n) for n in SLIDING]
+    assert dict(zip(SLIDING, found.shifts, strict=True)) == pytest.approx(
+        dict(zip(SLIDING, shifts, strict=True)), rel=0.2
     )
 
 
@@ -504,7 +504,7 @@ def test_a_rejected_width_marks_the_estimates_that_it_moves(
     spread = np.sqrt(np.diag(plain.covariance))
     suspect = replace(plain, widened=True, signals=(), inflation=inflation)
     moved = RejectedWidth(WIDTH, fall, np.array([shift, 0.1]) * spread)
-    monkeypatch.setattr(width_bias, "score_widths", lambda *_: iter([moved]))
+    monkeypatch.setattr(misfit, "score_widths", lambda *_: iter([moved]))
     found = suspect_widths(suspect, problem, fit, 1.0)
     assert (found.rejected_widths == (WIDTH,)) is marked
     assert (None if found.biased is None else found.biased.tolist()) == ([True, False] if marked else None)
@@ -517,7 +517,7 @@ def test_widths_are_asked_for_where_parts_of_the_logs_disagree_and_no_signal_is_
 ) -> None:
     problem, fit = fitted(Coulomb())
     agreeing: Misfit = replace(diagnose_misfit(problem, fit, 1.0, 900.0), widened=False, signals=())
-    monkeypatch.setattr(width_bias, "score_widths", lambda *_: pytest.fail("asked"))
+    monkeypatch.setattr(misfit, "score_widths", lambda *_: pytest.fail("asked"))
     assert suspect_widths(agreeing, problem, fit, 1.0) is agreeing
     signalled = replace(agreeing, widened=True, signals=("speed",))
     assert suspect_widths(signalled, problem, fit, 1.0) is signalled

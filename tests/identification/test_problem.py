@@ -23,7 +23,6 @@ from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.losses import Huber
 from pneuopt.identification.problem import (
-    NEEDED,
     EstimationProblem,
     check_logs,
     find_centre,
@@ -39,8 +38,8 @@ from pneuopt.logs.read_log import read_log
 from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, Viscous
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, UnknownNameError
-from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet
+from pneuopt.quantities.errors import InputError, LogError, PhysicsWarning, UnknownNameError
+from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 from pneuopt.tuning.racing import Racing
@@ -79,7 +78,7 @@ def test_a_result_without_a_value_starts_at_the_given_one() -> None:
     result = IdentificationResult(fit.parameters, estimates, table, table, runs, fit.status, fit.stats, {})
     given = posed.parameters.value("friction.viscous")
     assert posed.start_from(result).parameters == {"load.mass": 4.5, "friction.viscous": given}
-    held = replace(posed, held={"friction.viscous": 7.0})
+    held = replace(posed, fixed={"friction.viscous": 7.0})
     assert held.transcription(held.start_from(result)).parameters.value("friction.viscous") == 7.0
 
 
@@ -94,74 +93,6 @@ def log_with(**columns: Array | None) -> Experiment:
     position = 0.01 * t + NOISE * np.random.default_rng(0).standard_normal(100)
     given = {"force": np.zeros(100), "position": position, **columns}
     return Experiment(Trajectory(t, {n: c for n, c in given.items() if c is not None}), name="run 0")
-
-
-BAD_LOGS = {
-    "no input": (
-        log_with(force=None),
-        LogError,
-        r"run 0: the model needs the channel 'force' \[N\] as input; the log has position",
-    ),
-    "input without a run": (
-        log_with(force=np.where(np.arange(100) % 20 < 5, 0.0, math.nan)),
-        LogError,
-        "run 0: no part holds force and 10 samples of an output; log them together",
-    ),
-    "foreign channel": (
-        log_with(pressure_a=np.ones(100)),
-        LogError,
-        "cannot use channel 'pressure_a', it reads force, position, speed",
-    ),
-    "no output": (log_with(position=None), LogError, "run 0: none of the outputs is logged: position, speed"),
-    "empty output": (
-        log_with(position=np.full(100, math.nan)),
-        LogError,
-        "run 0: channel 'position' holds no sample; leave it out",
-    ),
-    "constant output": (
-        log_with(position=np.full(100, 3.0)),
-        LogError,
-        "run 0: channel 'position' is constant; leave it out",
-    ),
-    "too short": (
-        replace(log_with(), trajectory=log_with().trajectory.rows(0, 9)),
-        LogError,
-        "9 samples are too short a log; at least 10",
-    ),
-    "unknown condition": (
-        log_with().with_conditions({"load.mas": 1.0}),
-        UnknownNameError,
-        r"run 0: condition: unknown parameter 'load\.mas'; did you mean 'load\.mass'",
-    ),
-    "condition out of bounds": (
-        log_with().with_conditions({"load.mass": -1.0}),
-        InputError,
-        r"run 0: condition load\.mass: value -1 kg lies outside",
-    ),
-    "condition on what is free": (
-        log_with().with_conditions({"friction.coulomb": 9.0}),
-        ModelError,
-        r"friction\.coulomb is free, but every log's conditions give its value",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BAD_LOGS)
-def test_a_bad_log_is_refused_with_the_remedy(name: str) -> None:
-    log, error, message = BAD_LOGS[name]
-    with pytest.raises(error, match=message):
-        identify(RIG.system(), [log], RIG.parameters.freed("friction.coulomb"))
-
-
-def test_bad_parameters_are_refused() -> None:
-    system, log = RIG.system(), log_with()
-    with pytest.raises(LogError, match="no experiments: give at least one log"):
-        identify(system, [], system.parameters.freed("load.mass"))
-    with pytest.raises(ModelError, match="no parameter is free; mark what to estimate"):
-        identify(system, [log], system.parameters)
-    stranger = ParameterSet({"load.mess": Parameter(1.0, "kg", free=True)})
-    with pytest.raises(UnknownNameError, match=r"unknown parameter 'load\.mess'; did you mean 'load\.mass'"):
-        identify(system, [log], stranger)
 
 
 def test_a_loops_set_point_may_stay_in_the_log_and_names_become_distinct() -> None:
@@ -231,17 +162,6 @@ def test_a_refusal_names_its_check_and_is_overridden_by_that_name() -> None:
         check_content(system, [braked(("speed",))], RIG.parameters)
     fit = identify(system, braked(), RIG.parameters.freed("friction.coulomb"), accept=["work"], throw=False)
     assert "accepted as right" in fit.status.message
-
-
-def test_an_unknown_check_is_named() -> None:
-    with pytest.raises(UnknownNameError, match=r"run: accept: unknown check 'werk'; did you mean 'work'"):
-        check_logs(RIG.system(), [braked(("werk",))], RIG.parameters)
-
-
-@pytest.mark.parametrize("name", ["length", "inputs", "outputs", "noise"])
-def test_what_a_fit_cannot_do_without_is_not_accepted_and_it_is_said_why(name: str) -> None:
-    with pytest.raises(LogError, match=f"run: accept: '{name}' cannot be accepted: {NEEDED[name][:20]}"):
-        check_logs(RIG.system(), [braked((name,))], RIG.parameters)
 
 
 def test_a_channel_that_no_model_reads_is_left_out_by_name() -> None:
@@ -315,18 +235,18 @@ def test_one_name_is_a_name_and_no_letters() -> None:
         select_model({"a": PLANT, "b": PLANT}, braked(), PLANT.parameters, free="friction.x*")
 
 
-DRIVE_REPAIRS = ForceDrive(Coulomb()).system()
+SYSTEM = ForceDrive(Coulomb()).system()
 TRUTH = {"load.mass": 5.0, "friction.coulomb": 20.0, "friction.viscous": 60.0}
-KNOWN = DRIVE_REPAIRS.parameters.with_values(TRUTH)
+KNOWN = SYSTEM.parameters.with_values(TRUTH)
 FREE = KNOWN.with_values({"load.mass": 3.0}).freed(*TRUTH)
-NOISE_REPAIRS, LINEAR = 1e-5, {"force": Intersample.LINEAR}
+SMALL_NOISE, LINEAR = 1e-5, {"force": Intersample.LINEAR}
 
 
 def logged(t: Array) -> Experiment:
     force = 60 * np.sin(9 * t) + 40 * np.sin(21 * t)
-    run = simulate(DRIVE_REPAIRS, Trajectory(t, {"force": force}), KNOWN, rtol=1e-8, intersample=LINEAR)
-    noisy = run["position"] + NOISE_REPAIRS * np.random.default_rng(0).standard_normal(t.size)
-    return Experiment(Trajectory(t, {"force": force, "position": noisy}), {"position": NOISE_REPAIRS}, name="run")
+    run = simulate(SYSTEM, Trajectory(t, {"force": force}), KNOWN, rtol=1e-8, intersample=LINEAR)
+    noisy = run["position"] + SMALL_NOISE * np.random.default_rng(0).standard_normal(t.size)
+    return Experiment(Trajectory(t, {"force": force, "position": noisy}), {"position": SMALL_NOISE}, name="run")
 
 
 WHOLE = logged(np.linspace(0.0, 3.998, 2000))
@@ -347,7 +267,7 @@ def pausing(begin: int, end: int) -> Experiment:
 
 
 def assert_recovered(log: Experiment, *said: str) -> None:
-    fit = identify(DRIVE_REPAIRS, log, FREE)
+    fit = identify(SYSTEM, log, FREE)
     rows = fit.estimates
     assert len(fit.trajectories["run"]) == len(log.trajectory)
     off = {n: abs(float(rows["value"][n]) - true) / float(rows["stderr"][n]) for n, true in TRUTH.items()}
@@ -360,7 +280,7 @@ def assert_recovered(log: Experiment, *said: str) -> None:
 def test_a_short_hole_of_a_measured_input_is_bridged() -> None:
     part = slice(500, 500 + 4)
     assert_recovered(without(part), "run: 4 samples lack an input, 4 in a row at most; they are bridged")
-    mended, (said,) = repair_log(DRIVE_REPAIRS, without(part, slice(700, 701)))
+    mended, (said,) = repair_log(SYSTEM, without(part, slice(700, 701)))
     assert "5 samples lack an input, 4 in a row" in said
     np.testing.assert_allclose(mended.trajectory["force"][part], WHOLE.trajectory["force"][part], atol=0.2)
     assert mended.holes == ()
@@ -368,7 +288,7 @@ def test_a_short_hole_of_a_measured_input_is_bridged() -> None:
 
 def test_a_command_holds_its_last_value_over_a_hole() -> None:
     held = without(slice(500, 505)).with_intersample({"force": Intersample.HELD})
-    mended = repair_log(DRIVE_REPAIRS, held)[0].trajectory["force"]
+    mended = repair_log(SYSTEM, held)[0].trajectory["force"]
     assert set(mended[499:505]) == {WHOLE.trajectory["force"][499]}
 
 
@@ -378,21 +298,21 @@ def test_a_long_hole_of_an_input_cuts_the_log(where: tuple[int, int]) -> None:
     t = log.trajectory.t
     said = f"from {t[max(where[0] - 1, 0)]:g} s to {t[min(where[1], 1999)]:g} s; the log is cut there"
     assert_recovered(log, f"run: inputs are unknown {said}")
-    mended = repair_log(DRIVE_REPAIRS, log)[0]
+    mended = repair_log(SYSTEM, log)[0]
     assert mended.holes == (where,)
     assert not np.isfinite(mended.trajectory["position"][slice(*where)]).any()
 
 
 def test_a_pause_cuts_the_log() -> None:
     assert_recovered(pausing(800, 1100), "run: inputs are unknown from 1.598 s to 2.2 s; the log is cut there")
-    assert repair_log(DRIVE_REPAIRS, pausing(800, 1100))[0].holes == ((800, 800),)
-    assert repair_log(DRIVE_REPAIRS, pausing(800, 800 + MAX_BRIDGE))[0].holes == ()
+    assert repair_log(SYSTEM, pausing(800, 1100))[0].holes == ((800, 800),)
+    assert repair_log(SYSTEM, pausing(800, 800 + MAX_BRIDGE))[0].holes == ()
 
 
 def test_ten_samples_are_bridged_and_eleven_are_cut() -> None:
     for count, holes in ((10, False), (11, True)):
         for log in (without(slice(800, 800 + count)), pausing(800, 800 + count)):
-            assert bool(repair_log(DRIVE_REPAIRS, log)[0].holes) is holes
+            assert bool(repair_log(SYSTEM, log)[0].holes) is holes
 
 
 def test_a_logger_that_polls_one_sensor_after_the_other_is_read_without_a_cut() -> None:
@@ -403,28 +323,28 @@ def test_a_logger_that_polls_one_sensor_after_the_other_is_read_without_a_cut() 
     force, position = (WHOLE.trajectory[n].copy() for n in ("force", "position"))
     force[1::2], position[::2] = math.nan, math.nan
     log = replace(WHOLE, trajectory=WHOLE.trajectory.with_columns({"force": force, "position": position}))
-    fit = identify(DRIVE_REPAIRS, log, FREE)
+    fit = identify(SYSTEM, log, FREE)
     assert "999 samples lack an input, 1 in a row at most; they are bridged" in fit.status.message
     assert fit.estimates["value"].to_dict() == pytest.approx(TRUTH, rel=2e-3)
 
 
 def test_what_is_left_between_two_holes_has_to_hold_some_samples() -> None:
     few = without(slice(800, 900), slice(900 + MIN_RUN - 1, 1000))
-    assert repair_log(DRIVE_REPAIRS, few)[0].holes == ((800, 1000),)
+    assert repair_log(SYSTEM, few)[0].holes == ((800, 1000),)
     enough = without(slice(800, 900), slice(900 + MIN_RUN, 1000))
-    assert known_runs(repair_log(DRIVE_REPAIRS, enough)[0]) == [(0, 800), (900, 900 + MIN_RUN), (1000, 2000)]
+    assert known_runs(repair_log(SYSTEM, enough)[0]) == [(0, 800), (900, 900 + MIN_RUN), (1000, 2000)]
     assert_recovered(enough)
 
 
 def test_a_prediction_begins_anew_behind_a_hole() -> None:
     log = without(slice(200, 300))
     log = replace(log, trajectory=log.trajectory.rows(0, 500))
-    run = predict(DRIVE_REPAIRS, log, KNOWN)
+    run = predict(SYSTEM, log, KNOWN)
     off = run["position"] - WHOLE.trajectory["position"][:500]
     assert np.isnan(off[200:300]).all()
     assert np.isfinite(np.delete(off, range(200, 300))).all()
-    assert float(np.nanmax(np.abs(off))) < 6 * NOISE_REPAIRS
-    assert validate(DRIVE_REPAIRS, log, KNOWN)["samples"].tolist() == [400]
+    assert float(np.nanmax(np.abs(off))) < 6 * SMALL_NOISE
+    assert validate(SYSTEM, log, KNOWN)["samples"].tolist() == [400]
 
 
 def test_a_static_map_needs_no_cut() -> None:
@@ -438,7 +358,7 @@ def test_a_static_map_needs_no_cut() -> None:
 
 
 def test_a_sampled_loop_goes_on_over_a_hole() -> None:
-    loop = LoggedLoop(ClosedLoop(DRIVE_REPAIRS, PID(sample_time=2e-3), measured="position"))
+    loop = LoggedLoop(ClosedLoop(SYSTEM, PID(sample_time=2e-3), measured="position"))
     reference = np.where(np.arange(2000) // 100 == 3, math.nan, 0.1)
     log = Experiment(WHOLE.trajectory.select(["position"]).with_columns({"position_reference": reference}), name="run")
     with pytest.raises(LogError, match=r"unknown from 0\.598 s to 0\.8 s, and a sampled controller goes on meanwhile"):
@@ -446,18 +366,18 @@ def test_a_sampled_loop_goes_on_over_a_hole() -> None:
 
 
 def test_a_stated_noise_is_checked_against_the_log() -> None:
-    for stated, told in ((NOISE_REPAIRS, False), (10 * NOISE_REPAIRS, True), (NOISE_REPAIRS / 10, True)):
-        fit = identify(DRIVE_REPAIRS, WHOLE.with_noise({"position": stated}), FREE, throw=False)
+    for stated, told in ((SMALL_NOISE, False), (10 * SMALL_NOISE, True), (SMALL_NOISE / 10, True)):
+        fit = identify(SYSTEM, WHOLE.with_noise({"position": stated}), FREE, throw=False)
         assert ("leave it out to have it estimated" in fit.status.message) is told
     assert "noise of position is stated as 1e-06 m" in fit.status.message
 
 
-DRIVE_COMMAND_CENTRE = po.PneumaticDrive(friction=po.Viscous())
-GIVEN = DRIVE_COMMAND_CENTRE.parameters
+PNEUMATIC = po.PneumaticDrive(friction=po.Viscous())
+GIVEN = PNEUMATIC.parameters
 CENTRE = "valve.centre"
 
 
-def logged_of_command_centre(centre: float, rest: float = 0.05, swing: float = 2.0, name: str = "run") -> po.Experiment:
+def logged_command(centre: float, rest: float = 0.05, swing: float = 2.0, name: str = "run") -> po.Experiment:
     """A piston that stands between two strokes, while its command rests a little off the valve's middle."""
     t = np.arange(600) * 2e-3
     moving = np.where((t > 0.2) & (t < 0.5), 1.0, np.where((t > 0.8) & (t < 1.1), -1.0, 0.0))
@@ -468,7 +388,7 @@ def logged_of_command_centre(centre: float, rest: float = 0.05, swing: float = 2
 
 
 def found(*logs: po.Experiment, given: po.ParameterSet = GIVEN) -> po.ParameterSet:
-    return find_centre(DRIVE_COMMAND_CENTRE.system(), logs, given)
+    return find_centre(PNEUMATIC.system(), logs, given)
 
 
 def test_a_command_from_0_to_10_V_frees_the_valves_centre_in_words() -> None:
@@ -477,7 +397,7 @@ def test_a_command_from_0_to_10_V_frees_the_valves_centre_in_words() -> None:
         r'estimated with the rest, or state it, centre = "5 V", under \[valve\]'
     )
     with pytest.warns(po.PhysicsWarning, match=words):
-        centre = found(logged_of_command_centre(5.0))[CENTRE]
+        centre = found(logged_command(5.0))[CENTRE]
     assert centre.free
     assert (centre.value, centre.lower, centre.upper) == pytest.approx((5.05, 4.05, 6.05))
 
@@ -490,23 +410,23 @@ def test_a_command_from_0_to_10_V_frees_the_valves_centre_in_words() -> None:
 def test_another_command_leaves_the_centre_as_it_is(centre: float, rest: float, swing: float) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert found(logged_of_command_centre(centre, rest, swing)) is GIVEN
+        assert found(logged_command(centre, rest, swing)) is GIVEN
 
 
 def test_a_stated_centre_is_kept_of_a_drive_and_of_a_log() -> None:
     given = GIVEN.with_values({CENTRE: 5.1})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert found(logged_of_command_centre(5.0), given=given) is given
-        assert found(logged_of_command_centre(5.0).with_conditions({CENTRE: 5.1})) is GIVEN
+        assert found(logged_command(5.0), given=given) is given
+        assert found(logged_command(5.0).with_conditions({CENTRE: 5.1})) is GIVEN
 
 
 def test_the_valves_span_counts_and_a_log_knows_its_own() -> None:
-    assert not found(logged_of_command_centre(5.0).with_conditions({"valve.span": 10.0}))[CENTRE].free
+    assert not found(logged_command(5.0).with_conditions({"valve.span": 10.0}))[CENTRE].free
 
 
 def test_a_log_without_motion_sensors_counts_as_a_whole() -> None:
-    log = logged_of_command_centre(5.0).select(["valve_voltage", "pressure_a", "pressure_b"])
+    log = logged_command(5.0).select(["valve_voltage", "pressure_a", "pressure_b"])
     with pytest.warns(po.PhysicsWarning, match="closed near 5 V"):
         assert abs(found(log).value(CENTRE) - 5) < 1
 
@@ -514,22 +434,22 @@ def test_a_log_without_motion_sensors_counts_as_a_whole() -> None:
 def test_logs_that_count_from_different_voltages_are_refused() -> None:
     words = "one: valve_voltage .* rests at 5.05 V, but other: valve_voltage .* rests at 0.05 V; subtract"
     with pytest.raises(LogError, match=words):
-        found(logged_of_command_centre(5.0, name="one"), logged_of_command_centre(0.0, name="other"))
+        found(logged_command(5.0, name="one"), logged_command(0.0, name="other"))
 
 
 def test_a_centre_that_is_counted_twice_is_refused() -> None:
     words = "run: valve_voltage .* rests at 0.05 V, which is no command of a valve with valve.centre = 5 V; leave that"
     with pytest.raises(LogError, match=words):
-        found(logged_of_command_centre(0.0), given=GIVEN.with_values({CENTRE: 5.0}))
+        found(logged_command(0.0), given=GIVEN.with_values({CENTRE: 5.0}))
 
 
 def test_a_loop_counts_from_the_centre_and_has_none_to_find() -> None:
-    loop = po.ClosedLoop(DRIVE_COMMAND_CENTRE, po.PID(1e-3))
-    assert find_centre(loop.plant, [logged_of_command_centre(5.0)], loop.parameters) is loop.parameters
+    loop = po.ClosedLoop(PNEUMATIC, po.PID(1e-3))
+    assert find_centre(loop.plant, [logged_command(5.0)], loop.parameters) is loop.parameters
 
 
 def simulated(centre: float) -> tuple[po.System, po.ParameterSet, po.Experiment]:
-    system = DRIVE_COMMAND_CENTRE.system()
+    system = PNEUMATIC.system()
     values = {CENTRE: centre, "valve.dead_zone": 0.03, "valve.rounding": 0.01, "friction.viscous": 90.0}
     truth = system.parameters.with_values(values)
     t, random = np.arange(1500) * 1e-3, np.random.default_rng(1)

@@ -67,7 +67,7 @@ def test_many_logs_are_shown_in_short() -> None:
 
 
 VALUES = ForceDrive(LuGre()).parameters  # 5 kg, 30 N, Stribeck velocity 20 mm/s
-EXCITATION = ForceDrive(Asymmetric(LuGre())).system().excitation
+HINTS = ForceDrive(Asymmetric(LuGre())).system().identification_hints
 T = np.arange(0, 4, 1e-3)
 
 
@@ -82,23 +82,23 @@ def test_a_sine_excites_everything() -> None:
     assert 6 <= found.reversals <= 8
     assert abs(found.acceleration - 0.3 * 2 * np.pi / np.sqrt(2)) < 0.1
     free = [f"friction.{n}" for n in ("coulomb", "static", "viscous", "stribeck_velocity", "bristle_stiffness")]
-    assert all(missing_excitation(EXCITATION, name, [*free, "load.mass", "load.force"], found) is None for name in free)
+    assert all(missing_excitation(HINTS, name, [*free, "load.mass", "load.force"], found) is None for name in free)
 
 
 def test_what_is_lacking_counts_only_where_it_confuses() -> None:
     found = summarise_motion([seen(np.full(T.size, 0.2))], {}, VALUES, VALUES)
     both = ["friction.coulomb", "friction.viscous", "load.force"]
     for name, words in (("friction.viscous", "too near for a slope"), ("load.force", "moves forwards only")):
-        lack = missing_excitation(EXCITATION, name, both, found)
+        lack = missing_excitation(HINTS, name, both, found)
         assert lack is not None
         assert words in lack[0]
-    assert missing_excitation(EXCITATION, "friction.viscous", ["friction.viscous"], found) is None
-    assert missing_excitation(EXCITATION, "load.force[run 1]", ["load.force[run 1]"], found) is None
-    assert missing_excitation(EXCITATION, "valve.leak", ["valve.leak"], found) is None
-    bristle = missing_excitation(EXCITATION, "friction.bristle_damping", ["friction.bristle_damping"], found)
+    assert missing_excitation(HINTS, "friction.viscous", ["friction.viscous"], found) is None
+    assert missing_excitation(HINTS, "load.force[run 1]", ["load.force[run 1]"], found) is None
+    assert missing_excitation(HINTS, "valve.leak", ["valve.leak"], found) is None
+    bristle = missing_excitation(HINTS, "friction.bristle_damping", ["friction.bristle_damping"], found)
     assert bristle is not None
     assert bristle[0].startswith("the motion never reverses")
-    assert missing_excitation(EXCITATION, "load.mass", ["load.mass"], found) is not None
+    assert missing_excitation(HINTS, "load.mass", ["load.mass"], found) is not None
 
 
 def test_states_stand_in_for_a_speed_that_is_not_logged() -> None:
@@ -107,12 +107,12 @@ def test_states_stand_in_for_a_speed_that_is_not_logged() -> None:
     found = summarise_motion([log], {"log": Trajectory(T, {"speed": np.full(T.size, -0.1)})}, VALUES, VALUES)
     assert found is not None
     assert found.forward == 0
-    assert missing_excitation(EXCITATION, "friction.viscous", ["friction.viscous", "friction.coulomb"], None) is None
+    assert missing_excitation(HINTS, "friction.viscous", ["friction.viscous", "friction.coulomb"], None) is None
 
 
 def test_the_remedy_suits_the_pair() -> None:
-    assert "turn the axis round" in remedy(EXCITATION, ["load.force[a]", "friction.coulomb_asymmetry"])
-    assert "beyond 5 times the stribeck velocity" in remedy(EXCITATION, ["friction.coulomb", "friction.viscous"])
-    assert "slow ramps" in remedy(EXCITATION, ["friction.static", "friction.stribeck_velocity"])
-    assert remedy(EXCITATION, ["rig.area"]) == "fix it, or log a run that moves differently"
-    assert remedy(EXCITATION, ["rig.area", "rig.area_bias"]).startswith("fix one of them")
+    assert "turn the axis round" in remedy(HINTS, ["load.force[a]", "friction.coulomb_asymmetry"])
+    assert "beyond 5 times the stribeck velocity" in remedy(HINTS, ["friction.coulomb", "friction.viscous"])
+    assert "slow ramps" in remedy(HINTS, ["friction.static", "friction.stribeck_velocity"])
+    assert remedy(HINTS, ["rig.area"]) == "fix it, or log a run that moves differently"
+    assert remedy(HINTS, ["rig.area", "rig.area_bias"]).startswith("fix one of them")

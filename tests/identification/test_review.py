@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from pneuopt.dynamics.hooks import Axis, FinalElement
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identification import review as wrong_values
+from pneuopt.identification import review
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.review import FixedValueTest, WrongValue, find_wrong_value
@@ -106,9 +106,9 @@ def test_what_a_user_knows_best_is_named_last(
     fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
     axis = Axis(final_element=FinalElement("valve", "spool", "air", "", "", "valve.bandwidth", "", ()))
     problem = replace(problem, system=replace(problem.system.plant, axis=axis))
-    monkeypatch.setattr(wrong_values, "_promised_squares", lambda *_: (2e6, dict.fromkeys(names, 1e3)))
+    monkeypatch.setattr(review, "_promised_squares", lambda *_: (2e6, dict.fromkeys(names, 1e3)))
     monkeypatch.setattr(
-        wrong_values, "_try_freed", lambda _p, _f, name, _e: WrongValue(name, 50.0, 25.0, "Hz", 0.99, found[name])
+        review, "_try_freed", lambda _p, _f, name, _e: WrongValue(name, 50.0, 25.0, "Hz", 0.99, found[name])
     )
     value = find_wrong_value(problem, fit)
     assert value is not None

@@ -102,7 +102,9 @@ def test_static_friction_below_coulomb_friction_is_not_recommended() -> None:
     """Friction that rises with the speed at first, as presliding does: an anti-Stribeck curve fits it best."""
     run = moved(STATIC["stribeck"], 1, values=ANTI)
     pair = {n: systems()[n] for n in ("coulomb", "stribeck")}
-    limitless = {n: replace(s, excitation=replace(s.excitation, at_least={})) for n, s in pair.items()}
+    limitless = {
+        n: replace(s, identification_hints=replace(s.identification_hints, at_least={})) for n, s in pair.items()
+    }
     assert select_model(limitless, run, ParameterSet(), free=FREE[:4]).recommended == "stribeck"
     found = select_model(pair, run, ParameterSet(), free=FREE[:4])
     assert found.recommended == "coulomb"

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import write_fit
 from pneuopt.files.toml import read_toml
@@ -172,13 +170,6 @@ def test_windows_that_no_log_can_be_cut_into_are_refused(window: float, said: st
         identify(DRIVE.system(), pushed(), DRIVE.parameters.freed(*FREE), window=window)
     with pytest.raises(InputError, match=said):
         validate(DRIVE.system(), pushed(), TRUTH, window=window)
-
-
-def test_windows_of_a_sampled_loop_are_refused() -> None:
-    loop = ClosedLoop(DRIVE.system(), PID(sample_time=STEP))
-    log = Experiment(Trajectory(TIME, {"speed_reference": np.sign(FORCE) * 0.1, "position": y_centred(pushed())}))
-    with pytest.raises(InputError, match="a sampled controller goes on"):
-        identify(loop, log, loop.parameters.freed(*FREE), window=0.5)
 
 
 def test_a_profile_of_windows_is_that_of_the_fit() -> None:

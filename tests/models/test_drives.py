@@ -257,7 +257,7 @@ def test_its_speed_loop_is_tuned_in_radians_per_second(servo: tuple[RotaryDrive,
 def test_advice_speaks_in_the_axis_units() -> None:
     given = RotaryDrive().parameters
     slow = LoggedMotion(10.0, 12.0, 0.5, 9, 1e-3, np.array([10.0, 12.0]), given, given)
-    needs = RotaryDrive().system().excitation.needs
+    needs = RotaryDrive().system().identification_hints.needs
     viscous, inertia = (needs[n].lack(slow) for n in ("friction.viscous", "load.inertia"))
     assert viscous is not None
     assert viscous.remedy == "log speeds from 10 to beyond 60 rad/s"
@@ -305,7 +305,7 @@ def test_the_log_of_a_shaft_is_checked_in_its_own_channels(servo: tuple[RotaryDr
 
 def test_the_width_of_its_friction_is_chosen_in_the_axis_units() -> None:
     system = RotaryDrive().system()
-    assert [(w.name, system.parameters[w.name].unit) for w in system.excitation.widths] == [
+    assert [(w.name, system.parameters[w.name].unit) for w in system.identification_hints.widths] == [
         ("friction.smoothing", "rad/s")
     ]
     assert system.parameters["friction.smoothing"].source == DEFAULT_WIDTH

@@ -254,7 +254,7 @@ def test_every_unknown_is_a_parameter_with_advice_that_names_parameters(name: st
     assert set(law.start.unknowns) <= set(law.parameters)
     assert {*law.start.scanned, *law.start.above, *law.start.floors} <= set(law.parameters)
     known = set(law.parameters) | {"viscous_asymmetry", "coulomb_asymmetry"}
-    assert set(law.excitation.needs) <= known
+    assert set(law.identification_hints.needs) <= known
 
 
 @dataclass(frozen=True)

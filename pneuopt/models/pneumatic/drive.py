@@ -14,11 +14,20 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import brentq
 
-from pneuopt.dynamics.hooks import Axis, Excitation, FinalElement, Log, LogWarningHook, Rest, SeparatingRun, Width
+from pneuopt.dynamics.hooks import (
+    Axis,
+    FinalElement,
+    IdentificationHints,
+    Log,
+    LogWarningHook,
+    Rest,
+    SeparatingRun,
+    Width,
+)
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.models.declaration import Alias, DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drives import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
-from pneuopt.models.friction import LOAD_EXCITATION, FrictionModel, Stribeck, law_inputs
+from pneuopt.models.friction import LOAD_HINTS, FrictionModel, Stribeck, law_inputs
 from pneuopt.models.friction_laws import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import LOAD_FORCE, LOAD_KEYS, Load
@@ -222,7 +231,7 @@ class PneumaticDrive:
             hardware_check_hook=self.check,
             validity_limits=cylinder_limits(self.cylinder.stops),
             log_warning_hook=warnings,
-            excitation=self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION | _FLOW_EXCITATION,
+            identification_hints=self.friction.identification_hints.with_prefix("friction") | LOAD_HINTS | _FLOW_HINTS,
             axis=_AXIS,
         )
         return replace(declared, meter=self._meter_function())
@@ -337,7 +346,7 @@ class PneumaticDrive:
 # out the rounding of a worn valve
 _ROUNDING_FACTOR = 4.0
 _FLOW_PARAMETERS = frozenset({"valve.conductance", "valve.critical_ratio", "supply.pressure", "valve.leak"})
-_FLOW_EXCITATION = Excitation(
+_FLOW_HINTS = IdentificationHints(
     runs=(
         SeparatingRun(
             _FLOW_PARAMETERS,
