@@ -16,7 +16,7 @@ from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.certificate import Defect, certificate
 from pneuopt.evaluation.evaluate import metric_cell, metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
-from pneuopt.evaluation.plants import ExpectedPlants, PlantAxis
+from pneuopt.evaluation.plants import CorrelatedParameters, ExpectedPlants
 from pneuopt.evaluation.requirements import METRICS, metric_name, requirement_values, user_limit
 from pneuopt.evaluation.response import TuningCase
 from pneuopt.evaluation.scenarios import Scenarios, apply_scenario
@@ -56,7 +56,7 @@ class DesignValidation(Result):
         What the plants differ by.
     advice : tuple of str
         What would help, a sentence each; computed from these plants.
-    suggested : tuple of PlantAxis
+    suggested : tuple of CorrelatedParameters
         What of it to tune over.
     units : mapping of str to str
         The metrics' units.
@@ -68,7 +68,7 @@ class DesignValidation(Result):
     broken: Mapping[str, tuple[str, ...]]
     varied: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
-    suggested: tuple[PlantAxis, ...] = ()
+    suggested: tuple[CorrelatedParameters, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -214,7 +214,7 @@ def report_validation(found: DesignValidation) -> Report:
     return Report((lead, *(Line(text, indent=2) for text in found.varied), table, *map(Line, advice)))
 
 
-def _scenario_lines(axes: Sequence[PlantAxis]) -> list[str]:
+def _scenario_lines(axes: Sequence[CorrelatedParameters]) -> list[str]:
     """What to write under [scenarios] to tune over these: [scenarios.corners] "load.mass" = "5 %"."""
     kinds = {"corners": [a for a in axes if not a.is_gain], "tolerances": [a for a in axes if a.is_gain]}
     return [
@@ -361,8 +361,8 @@ def advise(
     plants: "pd.DataFrame",
     broken: Mapping[str, tuple[str, ...]],
     certified: "pd.DataFrame",
-    axes: Mapping[PlantAxis, "pd.DataFrame"],
-) -> tuple[tuple[str, ...], tuple[PlantAxis, ...]]:
+    axes: Mapping[CorrelatedParameters, "pd.DataFrame"],
+) -> tuple[tuple[str, ...], tuple[CorrelatedParameters, ...]]:
     """Advice where a design breaks on plants: what to relax, and what to tune over.
 
     Parameters
@@ -374,13 +374,13 @@ def advise(
         Of a `DesignValidation`.
     broken : mapping of str to tuple of str
         Likewise.
-    axes : mapping of PlantAxis to DataFrame
+    axes : mapping of CorrelatedParameters to DataFrame
         Of what varies the metrics with that alone at its low and its high end, a column each.
 
     Returns
     -------
     sentences : tuple of str
-    suggested : tuple of PlantAxis
+    suggested : tuple of CorrelatedParameters
         What of it to tune over.
     """
     if not broken:
@@ -420,7 +420,9 @@ def _relaxed_limit(requirement: Requirement, values: Sequence[float], loop: Clos
     return f"{metric.name} {'>=' if least else '<='} {value:.{RELAXED_DIGITS}g} {unit}".strip() + f" (now {asked:.4g})"
 
 
-def _culprits(spec: Specification, axes: Mapping[PlantAxis, "pd.DataFrame"]) -> tuple[tuple[PlantAxis, ...], str]:
+def _culprits(
+    spec: Specification, axes: Mapping[CorrelatedParameters, "pd.DataFrame"]
+) -> tuple[tuple[CorrelatedParameters, ...], str]:
     """What breaks a limit on its own, the worst first; else what comes nearest to it."""
     ends = {a: [{str(n): v for n, v in row.items()} for row in found.to_dict().values()] for a, found in axes.items()}
     worst = {a: max((_worst_excess(row, spec) for row in rows), default=math.inf) for a, rows in ends.items()}
