@@ -250,7 +250,7 @@ class Front:
         if solution.status.code is Code.INTERRUPTED:
             raise KeyboardInterrupt
         point = np.array([solution.parameters.value(n) for n in search.space.names])
-        found = SearchResult(point, solution.status, tuple(solution.multipliers), {"optimum": solution.stats["cost"]})
+        found = SearchResult(point, solution.status, tuple(solution.multipliers), optimum=solution.stats["cost"])
         good = solution.status.converged
         return (
             search.certify_roundings(found, margin)

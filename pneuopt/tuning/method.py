@@ -4,8 +4,8 @@ Agreement of a search's starts: how many end in the best optimum, and how likely
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from math import inf, isfinite, nan
+from dataclasses import dataclass, field
+from math import inf, isfinite, isnan, nan
 from typing import Protocol
 
 from pneuopt.control.loop import ClosedLoop
@@ -62,7 +62,13 @@ class SearchResult:
     active : tuple of str
         Limits and bounds that are active there.
     stats : mapping of str to float
-        At least "optimum", the objective there, where the status is "converged".
+        Further figures of the method's own, for users.
+    optimum : float
+        The objective there; NaN where the method has none.
+    simulations : int
+        Candidates simulated; 0 for a method that does not count them.
+    agreement : Agreement, optional
+        How far its starts agree.
     is_complete : bool
         False where Ctrl-C ended the search.
     uses_simulator : bool
@@ -72,9 +78,20 @@ class SearchResult:
     point: Array
     status: Status
     active: tuple[str, ...]
-    stats: Mapping[str, float]
+    stats: Mapping[str, float] = field(default_factory=dict)
+    optimum: float = nan
+    simulations: int = 0
+    agreement: "Agreement | None" = None
     is_complete: bool = True
     uses_simulator: bool = False
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """All figures as a `TuningResult.stats` shows them."""
+        own = {} if self.agreement is None else self.agreement.stats
+        own |= {} if isnan(self.optimum) else {"optimum": self.optimum}
+        own |= {"simulations": float(self.simulations)} if self.simulations else {}
+        return {**self.stats, **own}
 
 
 class LimitPath(Protocol):
@@ -171,10 +188,10 @@ class Agreement:
 
     Attributes
     ----------
-    starts, converged, agreeing : int
-        Starts, those that end in an optimum, and those that end in the best one.
-    optima : int
-        Different optima among them.
+    starts, agreeing : int
+        Starts, and those that end in the best optimum.
+    converged, optima : int, optional
+        Those that end in an optimum, and different optima among them; None where the method does not tell them apart.
     spread : float
         Relative excess of the worst of them over the best; NaN without two.
     unseen : float
@@ -191,22 +208,20 @@ class Agreement:
     """
 
     starts: int
-    converged: int
     agreeing: int
-    optima: int
-    spread: float
-    unseen: float
+    converged: int | None = None
+    optima: int | None = None
+    spread: float = nan
+    unseen: float = nan
 
     @property
     def stats(self) -> dict[str, float]:
         """The figures as a result's `stats` names them: "starts", "starts_agreeing" and so on."""
-        figures = {"_converged": self.converged, "_agreeing": self.agreeing, "_optima": self.optima}
-        return {
-            "starts": float(self.starts),
-            **{f"starts{n}": float(v) for n, v in figures.items()},
-            "starts_spread": self.spread,
-            "starts_unseen": self.unseen,
-        }
+        found = {"starts": float(self.starts), "starts_agreeing": float(self.agreeing)}
+        if self.converged is None or self.optima is None:
+            return found
+        found |= {"starts_converged": float(self.converged), "starts_optima": float(self.optima)}
+        return found | {"starts_spread": self.spread, "starts_unseen": self.unseen}
 
 
 def compare_starts(objectives: Sequence[float], tolerance: float) -> Agreement:
@@ -229,23 +244,22 @@ def compare_starts(objectives: Sequence[float], tolerance: float) -> Agreement:
     agreeing = sum(value - best <= tolerance * abs(best) for value in found)
     spread = (found[-1] - best) / abs(best) if n > 1 and best else nan
     unseen = min(1.0, w * (w + 1) / (n * (n - 1))) if n > 2 else nan
-    return Agreement(len(objectives), n, agreeing, w, spread, unseen)
+    return Agreement(len(objectives), agreeing, n, w, spread, unseen)
 
 
-def describe_agreement(stats: Mapping[str, float]) -> tuple[str, str]:
+def describe_agreement(found: Agreement | None) -> tuple[str, str]:
     """Words on the agreement of a result's starts, and a sentence where some do not agree; empty where none has ended.
 
     Examples
     --------
-    >>> print(*describe_agreement(compare_starts([0.94, 0.94, 0.94, 1.223], 1e-3).stats), sep="; ")
+    >>> print(*describe_agreement(compare_starts([0.94, 0.94, 0.94, 1.223], 1e-3)), sep="; ")
     3 of 4 starts agree; others end up to 30 % worse, one start more would find another optimum with a chance of 50 %
     """
-    if not stats.get("starts"):
+    if found is None or not found.starts:
         return "", ""
-    agreeing, starts = stats["starts_agreeing"], stats["starts"]
-    words = f"{agreeing:.0f} of {starts:.0f} starts agree"
-    if agreeing == stats.get("starts_converged", starts) or not stats.get("starts_spread", nan) > 0:
+    words = f"{found.agreeing} of {found.starts} starts agree"
+    if found.agreeing == found.converged or not found.spread > 0:
         return words, ""
-    unseen, worse = stats.get("starts_unseen", nan), f"others end up to {100 * stats['starts_spread']:.2g} % worse"
-    chance = f"one start more would find another optimum with a chance of {100 * unseen:.0f} %"
-    return words, f"{worse}, {chance}" if isfinite(unseen) else worse
+    worse = f"others end up to {100 * found.spread:.2g} % worse"
+    chance = f"one start more would find another optimum with a chance of {100 * found.unseen:.0f} %"
+    return words, f"{worse}, {chance}" if isfinite(found.unseen) else worse

@@ -47,7 +47,7 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import check_argument, check_number
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.gradients import Polish
-from pneuopt.tuning.method import SearchResult, TuningTask, check_method_options
+from pneuopt.tuning.method import Agreement, SearchResult, TuningTask, check_method_options
 from pneuopt.tuning.simulator import Responses, Simulator, to_records
 from pneuopt.tuning.space import Space, penalty_settling_time
 from pneuopt.tuning.tolerances import (
@@ -393,7 +393,7 @@ def search_result(task: TuningTask, simulator: Simulator, spec: Specification, p
     """
     values = to_records(simulator.values(point[None], spec))[0]
     active = _active_limits(task.space, spec, point, values)
-    return SearchResult(point, _search_status(task.spec, values), active, {"optimum": spec.objective(values)})
+    return SearchResult(point, _search_status(task.spec, values), active, optimum=spec.objective(values))
 
 
 def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
@@ -499,9 +499,13 @@ class Racing:
         method = replace(self, bands=(), trials=max(1, self.trials // 3)) if attempt else self
         best = run_racing(task, simulator, spec, method, start, progress)
         result = search_result(task, simulator, spec, best.point)
-        counts = {"simulations": best.count, "starts": best.starts, "starts_agreeing": best.agreeing}
-        stats = {**result.stats, **{n: float(count) for n, count in counts.items()}}
-        return replace(result, stats=stats, is_complete=best.is_complete, uses_simulator=True)
+        return replace(
+            result,
+            simulations=best.count,
+            agreement=Agreement(best.starts, best.agreeing),
+            is_complete=best.is_complete,
+            uses_simulator=True,
+        )
 
     def shorten(self, margin: float) -> "Racing":
         """The method for a short search from a point that is close."""

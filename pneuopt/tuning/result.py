@@ -27,6 +27,7 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, 
 from pneuopt.quantities.results import NOT_SAVED, Result
 from pneuopt.quantities.status import Code, Status, report_status
 from pneuopt.quantities.units import write_value
+from pneuopt.tuning.method import Agreement
 from pneuopt.tuning.relaxation import describe_relaxations
 from pneuopt.tuning.tolerances import ACTIVE_ROOM, MIN_DERIVATIVE_RATIO
 from pneuopt.tuning.validation import DesignValidation, report_validation, report_validation_verdict
@@ -124,6 +125,8 @@ class TuningResult(Result):
     best : mapping of str to float
         Where the given gains stand, the tuned parameters' values in the best candidate that was found, rounded [SI],
         of which `claimed` and `certified` tell; empty where the design is certified, or none was found.
+    agreement : Agreement, optional
+        How far the starts of the search agree.
     refusal : Refusal, optional
         What the search goes on by where the certificate has refused the design.
     """
@@ -145,6 +148,7 @@ class TuningResult(Result):
     limits: Mapping[str, float] = field(default_factory=dict)
     rest: RestCheck | None = None
     best: Mapping[str, float] = field(default_factory=dict)
+    agreement: Agreement | None = field(default=None, metadata=NOT_SAVED)
     refusal: Refusal | None = field(default=None, metadata=NOT_SAVED)
 
     @property

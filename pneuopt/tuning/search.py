@@ -148,7 +148,9 @@ class Certifier:
         marks = {"contacts": float(len(contacts))} if contacts else {}
         fails_late = within and not contacts and not status.converged
         marks |= {"fails_late": 1.0} if fails_late else {}
-        active, stats = (found.active, found.stats) if found is not None else ((), {})
+        active, stats, agreement = (
+            (found.active, found.figures, found.agreement) if found is not None else ((), {}, None)
+        )
         return TuningResult(
             self.task.space.parameters,
             claimed,
@@ -160,6 +162,7 @@ class Certifier:
             {**stats, **{f"deviation.{n}": float(v) for n, v in deviation}, **marks, **slopes},
             self._provenance(),
             proof,
+            agreement=agreement,
             refusal=Refusal.END_STOP if contacts else Refusal.LATE if fails_late else None,
         )
 
@@ -224,11 +227,11 @@ class Certifier:
             verdict = f"the design found {lack}{self._worst_case(certified, n)}{claim_text}"
             return Status(Code.NOT_CERTIFIED, (verdict, "give the limits more room, or lengthen the horizon"))
         ours, theirs = spec.objective(proof), spec.objective(claim)
-        if not objectives_agree(ours, theirs, found.stats["optimum"], spec.resolution):
-            verdict = f"the objective is {ours:.6g}, claimed {min(theirs, found.stats['optimum']):.6g}"
+        if not objectives_agree(ours, theirs, found.optimum, spec.resolution):
+            verdict = f"the objective is {ours:.6g}, claimed {min(theirs, found.optimum):.6g}"
             cause = "the optimum grazes the band, or does not survive rounding, or the search misread it"
             return Status(Code.NOT_CERTIFIED, (verdict, cause, "ask for more digits or a wider band"))
-        agreeing, warning = describe_agreement(found.stats)
+        agreeing, warning = describe_agreement(found.agreement)
         verdict = f"certified objective {ours:.6g}, claimed {theirs:.6g}"
         return Status(Code.CONVERGED, (f"{verdict}, {agreeing}" if agreeing else verdict,)).with_details(warning)
 
@@ -349,14 +352,14 @@ class Search:
                 self._report_start(simulator)
         except KeyboardInterrupt:
             return self._result_so_far(simulator, _interruption_result(self.space.start))
-        result, start, counts = None, self.space.start if start is None else start, dict[str, float]()
+        result, start, agreement = None, self.space.start if start is None else start, None
         finder = self
         for attempt in range(MARGINS_TO_TRY):
             margin = min(self.method.margin * 2**attempt, 0.5)
             found = self._find_with(finder, margin, start, attempt)
             simulator = self.simulator
-            counts = {k: v for k, v in found.stats.items() if k.startswith("starts")} | counts
-            found = replace(found, stats={**found.stats, **counts, "margin": margin})
+            agreement = agreement or found.agreement  # later searches begin near the first one's point
+            found = replace(found, stats={**found.stats, "margin": margin}, agreement=agreement)
             if not found.is_complete:
                 return self._result_so_far(simulator, found)
             if found.status.converged:
@@ -425,7 +428,7 @@ class Search:
     def restate(self, found: SearchResult) -> SearchResult:
         """A point that was found over another horizon, or by no search, with its objective over the one asked for."""
         values = to_records(self.simulator.values(found.point[None], self.spec))[0]
-        return replace(found, stats={**found.stats, "optimum": self.spec.objective(values)})
+        return replace(found, optimum=self.spec.objective(values))
 
     @cached_property
     def simulator(self) -> Simulator:
@@ -491,7 +494,7 @@ class Search:
     def certify_point(self, point: Array) -> TuningResult:
         """Round a point and certify it."""
         rounded = self._round(point)
-        found = self.restate(SearchResult(rounded, Status(Code.CONVERGED), (), {}))
+        found = self.restate(SearchResult(rounded, Status(Code.CONVERGED), ()))
         return self.certifier.certify(self.simulator, found, rounded)
 
     def _round(self, point: Array) -> Array:
@@ -509,7 +512,7 @@ class Search:
         """Round and certify the best point of an interrupted search; the result keeps the given gains."""
         best = self.certifier.certify(simulator, found, self._round(found.point))
         keeps = "keeps every limit on the model" if best.status.converged else "is not certified"
-        lead = f"the best of {found.stats['simulations']:.0f} simulations so far {keeps}"
+        lead = f"the best of {found.simulations} simulations so far {keeps}"
         is_candidate = not np.allclose(found.point, self.space.start, rtol=1e-9, atol=0.0)
         if not is_candidate:
             lead = "interrupted before anything better than the given gains was found; their evaluation"
@@ -533,7 +536,7 @@ class Search:
             yield found.point
             return
         nearest = self.space.round_point(found.point, digits)
-        points, most = nearest[None], found.stats["optimum"] * (1 + MAX_CERTIFIED_EXCESS)
+        points, most = nearest[None], found.optimum * (1 + MAX_CERTIFIED_EXCESS)
         for _ in range(ROUNDING_ROUNDS):
             values = simulator.values(points, spec)
             order, rows = np.argsort(compute_merits(values, spec, self.task.horizon)), to_records(values)
@@ -572,7 +575,7 @@ def _fails_late(result: TuningResult) -> bool:
 
 def _interruption_result(point: Array) -> SearchResult:
     """The result of a search that was interrupted before it had found anything better than its start."""
-    return SearchResult(point, Status(Code.INTERRUPTED), (), {"simulations": 1.0}, is_complete=False)
+    return SearchResult(point, Status(Code.INTERRUPTED), (), simulations=1, is_complete=False)
 
 
 def relax(search: Search, result: TuningResult) -> TuningResult:

@@ -11,7 +11,6 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from math import inf
 from types import MappingProxyType
 
 from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
@@ -281,7 +280,7 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback)
     search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
-    found_once = result.stats.get("starts_agreeing", inf) < MIN_AGREEING
+    found_once = result.agreement is not None and result.agreement.agreeing < MIN_AGREEING
     doubtful = not result.status.converged or found_once
     if method is not None or successor is None or not doubtful or result.status.code is Code.INTERRUPTED:
         return search, result, False

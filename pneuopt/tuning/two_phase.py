@@ -148,13 +148,10 @@ class TwoPhase:
         space = Space(task.space.parameters_at(start), task.space.names)
         optima = _solve_stable(task, replace(task, space=space, spec=spec), method, progress)
         best, values = optima.best, optima.best.parameters
-        stats = {
-            **optima.agreement.stats,
-            "optimum": best.stats.get("cost", np.nan),
-            "iterations": best.stats.get("iterations", 0.0),
-        }
-        point = np.array([values.value(n) for n in task.space.names])
-        return SearchResult(point, best.status, tuple(best.multipliers), stats)
+        stats = {"iterations": best.stats.get("iterations", 0.0)}
+        point, cost = np.array([values.value(n) for n in task.space.names]), best.stats.get("cost", np.nan)
+        active = tuple(best.multipliers)
+        return SearchResult(point, best.status, active, stats, optimum=cost, agreement=optima.agreement)
 
     def shorten(self, margin: float) -> "TwoPhase":
         """The method for a short search from a point that is close."""

@@ -60,7 +60,7 @@ class ForgedSimulator:
 
 
 def certify(tuning: Search, **factors: float) -> TuningResult:
-    found = SearchResult(POINT, Status(Code.CONVERGED), (), {"optimum": np.inf})
+    found = SearchResult(POINT, Status(Code.CONVERGED), (), optimum=np.inf)
     forged: Any = ForgedSimulator(tuning, **factors)
     return tuning.certifier.certify(forged, found, POINT)
 
@@ -109,14 +109,14 @@ def test_an_objective_that_is_claimed_too_low_or_too_high_is_refused(factor: flo
 def test_an_optimum_before_rounding_is_not_missed_by_much() -> None:
     tuning = search(IAE())
     exact = float(certify(tuning).requirements["certified"]["IAE"])
-    lower = SearchResult(POINT, Status(Code.CONVERGED), (), {"optimum": 0.9 * exact})
+    lower = SearchResult(POINT, Status(Code.CONVERGED), (), optimum=0.9 * exact)
     assert not tuning.certifier.certify(tuning.simulator, lower, POINT).status.converged
 
 
 def test_an_objective_of_zero_is_no_refusal() -> None:
     tuning = search(Overshoot())
     point = np.array([0.5, 4.0])  # no overshoot
-    found = SearchResult(point, Status(Code.CONVERGED), (), {"optimum": 0.0})
+    found = SearchResult(point, Status(Code.CONVERGED), (), optimum=0.0)
     assert tuning.certifier.certify(tuning.simulator, found, point).status.converged
     assert certifier.objectives_agree(4.16e-16, 0.0, 0.0, specify(Overshoot()).resolution)
     assert not certifier.objectives_agree(1e-3, 0.0, 0.0, specify(Overshoot()).resolution)
@@ -139,7 +139,7 @@ def test_a_design_without_the_objectives_value_is_refused_in_words(kind: type[Re
 
 def test_a_value_that_only_the_search_has_is_told() -> None:
     tuning, never = search(SettlingTime()), np.array([0.5, 0.3])
-    found = SearchResult(never, Status(Code.CONVERGED), (), {"optimum": 0.5})
+    found = SearchResult(never, Status(Code.CONVERGED), (), optimum=0.5)
     row = {**tuning.simulator.table(never, tuning.spec)[0], "SettlingTime": 0.5}
     forged: Any = type("Claims", (), {"cases": tuning.simulator.cases, "table": lambda *_: [row]})()
     refused = tuning.certifier.certify(forged, found, never).status

@@ -60,7 +60,7 @@ def test_steps_that_change_a_claim_are_halved_and_a_short_search_goes_on_from_it
 
     def find(*given: Any) -> SearchResult:
         calls.append((given[2], given[5]))
-        return SearchResult(given[4], Status(Code.CONVERGED), (), {"optimum": 1.0}, uses_simulator=True)
+        return SearchResult(given[4], Status(Code.CONVERGED), (), optimum=1.0, uses_simulator=True)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Racing, "find", find)
