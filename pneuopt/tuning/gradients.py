@@ -190,7 +190,7 @@ class SQP:
 
 
 @dataclass(frozen=True, eq=False)
-class Descent:
+class DescentState:
     """The descent from one start: its present point, its trust region, and whether it goes on."""
 
     point: LinearisedPoint
@@ -217,7 +217,7 @@ def descend(
     """
     method = method or SQP()
     first = [problem.improve(p) for p in problem.evaluate(starts)]
-    found = [Descent(p, method.radius, bool(np.isfinite(p.merit))) for p in first]
+    found = [DescentState(p, method.radius, bool(np.isfinite(p.merit))) for p in first]
     for _ in range(iterations):
         moving = [k for k, d in enumerate(found) if d.moves]
         if not moving:
@@ -227,7 +227,7 @@ def descend(
     return [d.point for d in found]
 
 
-def _advance(problem: MinimaxProblem, descents: Sequence[Descent], method: SQP) -> list[Descent]:
+def _advance(problem: MinimaxProblem, descents: Sequence[DescentState], method: SQP) -> list[DescentState]:
     """Advance each descent by a step; where it gains less than predicted, a second-order correction is tried, too."""
     steps = [solve_quadratic_program(d.point, _step_box(problem, d)) for d in descents]
     trials = _evaluate_and_improve(problem, [d.point.z + step for d, step in zip(descents, steps, strict=True)])
@@ -264,12 +264,14 @@ def _evaluate_and_improve(problem: MinimaxProblem, z: Sequence[Array]) -> list[t
     return [(p, problem.improve(p)) for p in problem.evaluate(np.clip(np.array(z), low, up))]
 
 
-def _promises_decrease(descent: Descent, predicted: float, method: SQP) -> bool:
+def _promises_decrease(descent: DescentState, predicted: float, method: SQP) -> bool:
     """Whether the predicted decrease of the objective is worth a step."""
     return predicted > method.tolerance * abs(descent.point.merit)
 
 
-def _update_descent(descent: Descent, step: Array, trial: LinearisedPoint, predicted: float, method: SQP) -> Descent:
+def _update_descent(
+    descent: DescentState, step: Array, trial: LinearisedPoint, predicted: float, method: SQP
+) -> DescentState:
     """Accept or refuse a trial point, and adapt the trust region."""
     if not _promises_decrease(descent, predicted, method):
         smaller = 0.25 * descent.radius  # where the program failed, a smaller region may help
@@ -281,10 +283,10 @@ def _update_descent(descent: Descent, step: Array, trial: LinearisedPoint, predi
     elif gained > GROW_GAIN_RATIO * predicted and reach > 0.9 * radius:
         radius = min(2 * radius, 1.0)
     point = trial if gained > 0 else descent.point
-    return Descent(point, radius, radius > method.least_radius)
+    return DescentState(point, radius, radius > method.least_radius)
 
 
-def _step_box(problem: MinimaxProblem, descent: Descent) -> Array:
+def _step_box(problem: MinimaxProblem, descent: DescentState) -> Array:
     """Bounds and trust region as `solve_quadratic_program` takes them, shape (n, 3)."""
     return np.column_stack([problem.bounds, descent.radius * problem.scales])
 
@@ -595,8 +597,8 @@ class LinearisedProblem:
             rows = periods == period
             fastest[rows] = self._simulator.fastest_samples(grid, found.y[rows], period)
         assert found.x is not None
-        passage = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
-        return self._simulator.operating_points(p, case, passage)
+        response_points = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
+        return self._simulator.operating_points(p, case, response_points)
 
     def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:
         """Derivatives of the start states, where they depend on the gains, and the parameters to the unknowns.

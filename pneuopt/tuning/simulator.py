@@ -87,7 +87,7 @@ class ResponsePoints(NamedTuple):
         return ResponsePoints(*states, np.zeros(m, dtype=np.intp), np.zeros(m))
 
     def select(self, rows: Indices | Mask) -> "ResponsePoints":
-        """The passage of some lanes."""
+        """The points of some lanes."""
         return ResponsePoints(self.states[rows], self.ends[rows], self.fastest[rows], self.command[rows])
 
 
@@ -123,7 +123,7 @@ class PointFinder:
     rate: float
 
     def __call__(
-        self, grids: Sequence[tuple[ReferenceGrid, Indices]], p: Array, periods: Array, passage: ResponsePoints
+        self, grids: Sequence[tuple[ReferenceGrid, Indices]], p: Array, periods: Array, response_points: ResponsePoints
     ) -> tuple[Array, Array]:
         """Find the points.
 
@@ -134,7 +134,7 @@ class PointFinder:
         p : ndarray, shape (m, n_parameters)
         periods : ndarray, shape (m,)
             Periods over which lanes are averaged [s]; 0: they are not.
-        passage : ResponsePoints
+        response_points : ResponsePoints
 
         Returns
         -------
@@ -142,17 +142,17 @@ class PointFinder:
         u : ndarray, shape (k, m, n_plant_inputs)
             Of k points: at rest, sliding, at the end; of an affine plant the end alone.
         """
-        found = [self._points(grid, rows, p, periods, passage) for grid, rows in grids]
+        found = [self._points(grid, rows, p, periods, response_points) for grid, rows in grids]
         x, u = (np.empty((len(a), len(p), a.shape[2])) for a in found[0])
         for (_, rows), (own_x, own_u) in zip(grids, found, strict=True):
             x[:, rows], u[:, rows] = own_x, own_u
         return x, u
 
     def _points(
-        self, grid: ReferenceGrid, rows: Indices, p: Array, periods: Array, passage: ResponsePoints
+        self, grid: ReferenceGrid, rows: Indices, p: Array, periods: Array, response_points: ResponsePoints
     ) -> tuple[Array, Array]:
         """Points of lanes on one grid, states and inputs, shapes (k, m, n)."""
-        own, p = passage.select(rows), p[rows]
+        own, p = response_points.select(rows), p[rows]
         states, (end, reach) = list[Array](), self._at_end(grid, p, periods[rows], own)
         if not is_affine(self.loop.plant):
             states.append(self._at_start(grid, p, own))
@@ -308,7 +308,9 @@ class Responses:
         row, case = np.nonzero(self._lanes)
         wanted = measured.sound & rows[row]
         if wanted.any():
-            for n, value in self._margins.read(self._p[wanted], case[wanted], measured.passage.select(wanted)).items():
+            for n, value in self._margins.read(
+                self._p[wanted], case[wanted], measured.response_points.select(wanted)
+            ).items():
                 found[n][wanted] = value
         return {n: self.to_table(value)[rows] for n, value in found.items()}
 
@@ -321,7 +323,7 @@ class Responses:
 
 @dataclass(frozen=True, eq=False)
 class LaneMetrics:
-    """The metrics of m lanes and their passage.
+    """The metrics of m lanes and the points of their responses.
 
     Attributes
     ----------
@@ -330,18 +332,18 @@ class LaneMetrics:
         graded; infinite where the response runs away.
     sound : ndarray of bool, shape (m,)
         False where the response runs away.
-    passage : ResponsePoints
+    response_points : ResponsePoints
     """
 
     metrics: dict[str, Array]
     sound: Mask
-    passage: ResponsePoints
+    response_points: ResponsePoints
 
     @staticmethod
     def empty(m: int, n: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
         """Metrics of m lanes of n samples to be filled in; until then they read as running away."""
-        passage = ResponsePoints.empty(m, n, n_states)
-        return LaneMetrics({name: np.full(m, np.inf) for name in read}, np.zeros(m, dtype=bool), passage)
+        response_points = ResponsePoints.empty(m, n, n_states)
+        return LaneMetrics({name: np.full(m, np.inf) for name in read}, np.zeros(m, dtype=bool), response_points)
 
 
 def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:
@@ -364,7 +366,7 @@ class MarginReader:
     names : tuple of str
         The metrics that `read` gives.
     read : callable
-        Of parameters, shape (m, n_parameters), cases, shape (m,), and the lanes' passage.
+        Of parameters, shape (m, n_parameters), cases, shape (m,), and the points of the lanes' responses.
     """
 
     names: tuple[str, ...]
@@ -524,15 +526,15 @@ class Simulator:
         margins = {n: table[0] for n, table in responses.margin_metrics(np.ones(1, dtype=bool)).items()}
         return to_records({n: responses.table(n)[0] for n in self.response_metrics} | margins)
 
-    def _read_margins(self, p: Array, case: Indices, passage: ResponsePoints) -> dict[str, Array]:
+    def _read_margins(self, p: Array, case: Indices, response_points: ResponsePoints) -> dict[str, Array]:
         """Margins and peaks of loops, the worst over their lanes' operating points."""
-        return self.robustness(p, *self.operating_points(p, case, passage), self.margin_metrics)
+        return self.robustness(p, *self.operating_points(p, case, response_points), self.margin_metrics)
 
-    def operating_points(self, p: Array, case: Indices, passage: ResponsePoints) -> tuple[Array, Array]:
+    def operating_points(self, p: Array, case: Indices, response_points: ResponsePoints) -> tuple[Array, Array]:
         """The plant's states and inputs at the lanes' operating points; see `PointFinder`."""
         own = self._grid_index[case]
         lanes = [(self.grids[g], np.flatnonzero(own == g)) for g in np.unique(own)]
-        return self._find_points(lanes, p, self.sampled.periods(p), passage)
+        return self._find_points(lanes, p, self.sampled.periods(p), response_points)
 
     def lanes(self, points: Array, rows: Indices, case: Indices) -> tuple[Array, Array]:
         """Parameters, shape (m, n_parameters), and start states, shape (m, n_states), of lanes.
@@ -609,17 +611,17 @@ class Simulator:
     def _read(self, out: LaneMetrics, chunk: Indices, case: Indices, p: Array, run: LaneRun, band: Band) -> None:
         """Fill the rows `chunk` of `out` from states, outputs and end states."""
         states, outputs, ends = run
-        out.passage.states[chunk, : states.shape[1]], out.passage.ends[chunk] = states, ends
+        out.response_points.states[chunk, : states.shape[1]], out.response_points.ends[chunk] = states, ends
         for g in np.unique(self._grid_index[case]).tolist():
             own, grid, asked = self._grid_index[case] == g, self.grids[g], self.response_metrics
             y = outputs[own, : len(grid.t)]
             sound = is_sound(y, ends[own])
-            out.sound[chunk[own]], out.passage.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
+            out.sound[chunk[own]], out.response_points.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
             found = self.sampled.read(grid, y, p[own], sound, self.bands(band), asked, self._envelope)
             for period, rows, metrics in found:
                 for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value
-                out.passage.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
+                out.response_points.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
 
     def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float) -> Indices:
         """Samples of the largest speed, as `ResponsePoints` has them; zeros for a plant without an axis."""
