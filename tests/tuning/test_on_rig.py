@@ -20,9 +20,8 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.on_rig import _remedies, _watch_rest, certify_on_rig
 from pneuopt.tuning.racing import Racing
-from pneuopt.tuning.tune import TuningResult, prepare_search, prepare_task, tune
+from pneuopt.tuning.tune import TuningResult, _remedies, _watch_rest, certify_on_rig, prepare_search, prepare_task, tune
 
 STEP = Step(0.2, horizon=0.4)
 SENSORS = {"speed": Sensor()}
