@@ -1,11 +1,10 @@
-"""`Front`: the designs between two requirements, found by epsilon constraint.
+"""`pareto_front`: what one requirement costs in terms of another, as a table of certified designs.
 
 The first requirement is minimised under a row of limits on the second, between the design that is best by the first and
-the one that is best by the second; two full tunings find these ends. Each design is a start for both of its neighbours,
-so that the better of the two branches of local minima, one from either end, is kept. Where another design, or one of
-many points spread over the gains' box, is better within a design's limit, that design is searched for again from there.
-
-`pareto_front`: what one requirement costs in terms of another, as a table of certified designs.
+the one that is best by the second (epsilon constraint); two full tunings find these ends. Each design is a start for
+both of its neighbours, so that the better of the two branches of local minima, one from either end, is kept. Where
+another design, or one of many points spread over the gains' box, is better within a design's limit, that design is
+searched for again from there.
 """
 
 import time
@@ -58,17 +57,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """One point of a front.
-
-    Attributes
-    ----------
-    limit : float
-        On the second requirement, as `Specification.limit` counts.
-    result : TuningResult or None
-        None: not yet searched for.
-    seconds, solver_seconds : float
-        Time spent on it, and in the solver [s].
-    """
+    """One point of a front: its limit on the second requirement, as `Specification.limit` counts, and its cost [s]."""
 
     limit: float
     result: TuningResult | None = None
@@ -78,18 +67,10 @@ class Design:
 
 @dataclass(eq=False)
 class Front:
-    """The designs of a front while they are searched for.
+    """The designs of a front while they are searched for, from the best by the first requirement on.
 
-    Parameters
-    ----------
-    base_search : Search
-        For both requirements at once; each design's search is made from it.
-    first, second : Requirement
-        The one that is minimised, and the one whose limit moves along the front.
-    last : float or None
-        The limit on the second with which the front ends, as `upper_limit` counts; None: the best that it can be.
-    designs : list of Design
-        From the best by the first to the best by the second.
+    `last` is the limit on the second with which the front ends, as `upper_limit` counts; None: the best that it can
+    be.
     """
 
     base_search: Search
@@ -109,7 +90,7 @@ class Front:
             try:
                 self._fill_between(ends, points)
             except KeyboardInterrupt:
-                self.designs = max((self.designs, done), key=_count_successes)
+                self.designs = max((self.designs, done), key=lambda designs: sum(map(_is_certified, designs)))
                 raise
             better = [self._best(self.first), self._best(self.second)]
             if better == ends or len(self.designs) == 1:
@@ -137,12 +118,14 @@ class Front:
         if high <= low * (1 + MIN_IMPROVEMENT):
             self.designs = ends[:1]
             return
-        self.designs = [ends[0], *(Design(limit) for limit in _limit_grid(high, low, points)[1:-1]), ends[1]]
+        even = np.geomspace if low > 0 and high / low > LOG_SPACING_RATIO else np.linspace
+        self.designs = [ends[0], *(Design(limit) for limit in even(high, low, points)[1:-1].tolist()), ends[1]]
         if points > 2 and self._path is not None:
             self._follow(self._path)
         else:
             for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
-                self._improve(k, self._gains(start))
+                result = self.designs[start].result
+                self._improve(k, None if result is None else end_point(result, self.base_search.space))
         for _ in range(MAX_IMPROVEMENT_ROUNDS):
             for k in range(1, points - 1):
                 better = self._rival(k)
@@ -206,9 +189,12 @@ class Front:
             asked = [self._search_for(k, self.base_search.method) for k in todo]
             found = self._track(path, [own.tighten(margin) for own in asked]) if todo else []
             for k, own, solution in zip(todo, asked, found, strict=True):
-                self._certify(k, own, solution, margin)
+                begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
+                result = self._round_and_certify(own, solution, margin)
+                seconds, spent = old.seconds + spent + time.perf_counter() - begun, old.solver_seconds + spent
+                self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=spent)
                 self.base_search.progress(f"design {k + 1} of {len(self.designs)}: {_design_status(self.designs[k])}")
-            todo = [k for k in todo if not _design_status(self.designs[k]).converged]
+            todo = [k for k in todo if not _is_certified(self.designs[k])]
 
     @property
     def _margins(self) -> tuple[float, ...]:
@@ -237,13 +223,6 @@ class Front:
             better = back if _solution_cost(back) < _solution_cost(found[k]) else found[k]
             found[k] = replace(better, stats={**better.stats, "seconds": spent})
         return found
-
-    def _certify(self, k: int, search: Search, solution: Solution, margin: float) -> None:
-        """Certify a solution as design k."""
-        begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
-        result = self._round_and_certify(search, solution, margin)
-        seconds = old.seconds + spent + time.perf_counter() - begun
-        self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=old.solver_seconds + spent)
 
     def _round_and_certify(self, search: Search, solution: Solution, margin: float) -> TuningResult:
         """Round a solution's gains and certify them."""
@@ -281,14 +260,7 @@ class Front:
         )
 
     def _resolve(self, path: LimitPath, k: int, start: Array) -> tuple[TuningResult, float]:
-        """Solve for design k from given gains, with more margin where rounding makes it infeasible.
-
-        Returns
-        -------
-        result : TuningResult
-        seconds : float
-            Time in the solver [s].
-        """
+        """Solve for design k, with more margin where rounding makes it infeasible; also the solver's time [s]."""
         search, spent, result = self._search_for(k, self.base_search.method), 0.0, None
         for margin in self._margins:
             (solution,) = path.follow(start, [search.tighten(margin)])
@@ -304,20 +276,13 @@ class Front:
             return one.status.converged
         return _result_value(one, self.first) < _result_value(other, self.first)
 
-    def _gains(self, k: int) -> Array | None:
-        """The gains of design k, shape (n,); None where there is none yet."""
-        result = self.designs[k].result
-        return None if result is None else end_point(result, self.base_search.space)
-
     def _rival(self, k: int) -> Array | None:
         """The gains of another design or sampled point that beats design k within its limit; None if there is none."""
         design, space = self.designs[k], self.base_search.space
         spec, own = self._constrain_second(design.limit), np.inf
         if design.result is not None and design.result.status.converged:
             own = _result_value(design.result, self.first)
-        found = [
-            d.result for d in self.designs if d is not design and _design_status(d).converged and d.result is not None
-        ]
+        found = [d.result for d in self.designs if d is not design and _is_certified(d) and d.result is not None]
         rivals = {
             _result_value(r, self.first): end_point(r, space)
             for r in found
@@ -365,9 +330,8 @@ def _check_interruption(result: TuningResult) -> TuningResult:
     return result
 
 
-def _count_successes(designs: Sequence[Design]) -> int:
-    """The number of certified designs."""
-    return sum(_design_status(design).converged for design in designs)
+def _is_certified(design: Design) -> bool:
+    return _design_status(design).converged
 
 
 def _design_status(design: Design) -> Status:
@@ -384,12 +348,6 @@ def _result_value(result: TuningResult, requirement: Requirement) -> float:
     """The certified figure as a search counts it: smaller is better, a margin as its reciprocal."""
     figure = float(result.requirements["certified"][metric_name(requirement)])
     return user_value(requirement, figure)  # the conversion is the same in both directions
-
-
-def _limit_grid(high: float, low: float, points: int) -> list[float]:
-    """Limits from high to low at even distances, or at even ratios where the ends are far apart."""
-    even = np.geomspace if low > 0 and high / low > LOG_SPACING_RATIO else np.linspace
-    return [float(v) for v in even(high, low, points)]
 
 
 def pareto_front(

@@ -1,6 +1,6 @@
 """`Method`: what a way to tune must offer; `TuningTask`, which it is given, and `SearchResult`, which it returns.
 
-Agreement of a search's starts: how many end in the best optimum, and how likely is one that none has seen.
+`Agreement`: how many of a search's starts end in the best optimum, and how likely is one that none has seen.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,20 +23,7 @@ from pneuopt.tuning.space import Space
 
 @dataclass(frozen=True, eq=False)
 class TuningTask:
-    """A loop, its references and scenarios, its free gains and what is asked of them, all checked.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-    references : tuple of Reference
-    scenarios : mapping of str to mapping
-    space : Space
-        The free gains, and every parameter of the loop.
-    spec : Specification
-        Objective and limits, as asked for.
-    accept : tuple of Defect
-        Defects with which a design is certified all the same.
-    """
+    """A loop, its references and scenarios, its free gains, what is asked of them, and defects that are accepted."""
 
     loop: ClosedLoop
     references: tuple[Reference, ...]
@@ -53,26 +40,11 @@ class TuningTask:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The point that a method found, before rounding.
+    """The point (n,) that a method found, before rounding, with the limits and bounds that are active there.
 
-    Attributes
-    ----------
-    point : ndarray, shape (n,)
-    status : Status
-    active : tuple of str
-        Limits and bounds that are active there.
-    stats : mapping of str to float
-        Further figures of the method's own, for users.
-    optimum : float
-        The objective there; NaN where the method has none.
-    simulations : int
-        Candidates simulated; 0 for a method that does not count them.
-    agreement : Agreement, optional
-        How far its starts agree.
-    is_complete : bool
-        False where Ctrl-C ended the search.
-    uses_simulator : bool
-        Whether the method has searched on the task's simulator, so that closer samples of that matter to it.
+    `optimum` is the objective there, NaN where the method has none; `stats` are further figures for users;
+    `is_complete` is False where Ctrl-C ended the search; `uses_simulator` says that closer samples of the task's
+    simulator matter to it.
     """
 
     point: Array
@@ -156,20 +128,11 @@ class Method(Protocol):
         attempt: int,
         progress: ProgressCallback,
     ) -> SearchResult:
-        """Search for the best point; Ctrl-C ends a search by simulation with the best so far.
+        """Search for the best point from a start (n,); Ctrl-C ends a search by simulation with the best so far.
 
-        Parameters
-        ----------
-        task : TuningTask
-        simulator : Simulator
-            It simulates the task's cases.
-        spec : Specification
-            The task's specification, tightened by the margin.
-        start : ndarray, shape (n,)
-        attempt : int
-            How often the certificate has failed so far; from 1 on `start` is the point found with less margin.
-        progress : callable
-            Receives a line of text a generation, start or program.
+        `spec` is the task's, tightened by the margin; `attempt` counts the certificates that have failed, and from 1 on
+        `start` is the point found with less margin; `progress` receives a line of text a generation, start or
+        program.
         """
         ...
 
@@ -184,21 +147,13 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class Agreement:
-    """What the objectives in which several starts end tell of optima that were missed.
+    """How many starts end in the best optimum, and what their ends tell of optima that were missed.
 
-    Attributes
-    ----------
-    starts, agreeing : int
-        Starts, and those that end in the best optimum.
-    converged, optima : int, optional
-        Those that end in an optimum, and different optima among them; None where the method does not tell them apart.
-    spread : float
-        Relative excess of the worst of them over the best; NaN without two.
-    unseen : float
-        The chance that one start more ends in an optimum that none has seen, by C. G. E. Boender and A. H. G. Rinnooy
-        Kan, Bayesian stopping rules for multistart global optimization methods, Math. Program. 37 (1987) 59-80: with w
-        optima from n starts ``w (w + 1)/(n (n - 1))``. It takes starts as independent; NaN of fewer than three, which
-        tell nothing.
+    `converged` and `optima`, the starts that end in an optimum and the different ones among them, are None where the
+    method does not tell them apart; `spread` is the relative excess of the worst. `unseen` is the chance that one start
+    more ends in another optimum: of w optima from n independent starts ``w (w + 1)/(n (n - 1))`` (C. G. E. Boender and
+    A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods, Math. Program. 37 (1987)
+    59-80); fewer than three tell nothing, NaN.
 
     Examples
     --------
@@ -225,15 +180,7 @@ class Agreement:
 
 
 def compare_starts(objectives: Sequence[float], tolerance: float) -> Agreement:
-    """Compare the objectives in which starts end.
-
-    Parameters
-    ----------
-    objectives : sequence of float
-        Infinite where a start found nothing.
-    tolerance : float
-        Relative difference of two objectives below which they count as one optimum.
-    """
+    """Compare the objectives in which starts end, infinite where one found nothing, to within a relative tolerance."""
     found = sorted(value for value in objectives if isfinite(value))
     best, n = found[0] if found else inf, len(found)
     optima = list[float]()

@@ -1,24 +1,17 @@
 """`Racing`: the search by simulation, success-history differential evolution whose trials race over the cases.
 
-It tunes any loop, with friction, clip and sampling, for any requirements and scenarios. A trial is simulated first on
-the case that its parent finds worst, and is dropped as soon as it is certain to lose. Each number of times that a
+It tunes any loop, with friction, clip and sampling, for any requirements and scenarios. Each number of times that a
 response leaves a narrow band makes an optimum of its own: the mean settling time over wide and narrow bands leads the
 search across them, on coarse samples; then the band asked for counts, and at last, for the best points only, on fine
 samples.
 
-`Race`: the merit of points that beat their rivals; the others are dropped as soon as it is certain that they do not.
+`Race`: a trial runs first on the case that its parent finds worst, then on those that lately beat the most others, and
+is dropped as soon as it is certain to lose: by machine code within a response, where the bounds of `RACE_VALUES` pass
+the rival's merit, by the CasADi VM after its first case. Neither changes an answer.
 
-A point runs first on the case that its parent finds worst, then on those that lately beat the most others. Machine
-code drops it within a response, where the bounds of `RACE_VALUES` pass the rival's merit; the CasADi VM after its first
-case. Neither changes an answer: what comes through is read as the `Simulator` reads it.
-
-`SuccessHistory`: differential evolution that learns its step lengths and crossover rates from what succeeded.
-
+`SuccessHistory`: differential evolution that learns its step lengths and crossover rates from what succeeded, by
 R. Tanabe, A. Fukunaga, Success-history based parameter adaptation for differential evolution (SHADE), IEEE Congress on
-Evolutionary Computation 2013, 71-78. It knows no merit function: `propose` gives trial points of the unit cube and
-`select` takes their merits, so that a race may answer with a bound where a trial has lost.
-
-`compute_merits`: how searches by simulation rank points; `search_result`: what they return of the best.
+Evolutionary Computation 2013, 71-78. It knows no merit function, so that a race may answer with a bound.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -49,8 +42,9 @@ from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.gradients import Polish
 from pneuopt.tuning.method import Agreement, SearchResult, TuningTask, check_method_options
 from pneuopt.tuning.simulator import Responses, Simulator, to_records
-from pneuopt.tuning.space import Space, penalty_settling_time
+from pneuopt.tuning.space import penalty_settling_time
 from pneuopt.tuning.tolerances import (
+    ACTIVE_ROOM,
     AGREEMENT,
     BAND_SHARES,
     BEST_SHARE,
@@ -91,19 +85,8 @@ CUT_REQUIREMENTS = (SettlingTime, Overshoot, PeakControl, ControlRate, *ROBUSTNE
 class Race:
     """Races on one simulator for one specification.
 
-    Parameters
-    ----------
-    simulator : Simulator
-    spec : Specification
-    scale : float
-        The horizon, which stands for the settling time of what never settles [s].
-
-    Attributes
-    ----------
-    count : int
-        Points that were simulated, on one case or more.
-    is_cut : bool
-        Whether races see less than the whole of a response.
+    `scale`, the horizon [s], stands for the settling time of what never settles; `count` is the number of points
+    simulated, on one case or more; `is_cut` says that races see less than the whole of a response.
     """
 
     def __init__(self, simulator: Simulator, spec: Specification, scale: float) -> None:
@@ -129,21 +112,10 @@ class Race:
         return self._complete_merits(responses, np.full(len(points), np.inf) if rivals is None else rivals)
 
     def race(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
-        """The merit of points that are no worse than their rivals; for the others a number above their rival's merit.
+        """Merits and worst cases (m,) of points (m, n) no worse than their rivals; of others more than the rival's.
 
-        Parameters
-        ----------
-        points : ndarray, shape (m, n)
-        rivals : ndarray, shape (m,)
-            The merits to beat.
-        first : ndarray of int, shape (m,)
-            The case on which each point is simulated first, its rival's worst.
-
-        Returns
-        -------
-        merits : ndarray, shape (m,)
-        worst : ndarray of int, shape (m,)
-            Each point's worst case, or the one by which it lost.
+        `first` (m,) is the case on which each point is simulated first, its rival's worst; of a loser the worst case is
+        the one by which it lost.
         """
         self.count += len(points)
         compete, most = self._race_cases, len(points)
@@ -167,8 +139,14 @@ class Race:
         if self._records.size < m * C * n * outputs:
             self._records = np.empty(m * C * n * outputs)
         y = self._records[: m * C * n * outputs].reshape(m, C, n, outputs)
-        field = RaceField(p, starts, simulator.sampled.periods(p), self._order(first), rivals)
-        merit = _merit_bounds(self._plain, simulator.bands(self._spec.band))
+        rank = np.tile(-self._kills, (len(first), 1))
+        rank[np.arange(len(first)), first] = -np.inf
+        order = np.argsort(rank, axis=1, kind="stable")  # the first case, then those that beat the most points
+        field = RaceField(p, starts, simulator.sampled.periods(p), order, rivals)
+        kinds = [next(kind for kind in REQUIREMENT_KINDS if kind.metric.name == n) for n in RACE_VALUES]
+        weights, limits = np.array([[self._plain.weight(kind), self._plain.limit(kind)] for kind in kinds]).T
+        edges = (1 + EDGE_ROUNDING) * np.array([band_number(band) for band in simulator.bands(self._spec.band)])
+        merit = RaceMerit(edges, weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL)
         outcome = race(simulator.rollout, self._course, merit, field, y)
         merits, worst, through = np.full(m, np.inf), outcome.loser.copy(), outcome.loser < 0
         if through.any():
@@ -192,10 +170,10 @@ class Race:
         return merits, worst
 
     def _complete_merits(self, responses: Responses, rivals: Array) -> tuple[Array, Indices]:
-        """Merits and worst cases of points that ran on every case.
+        """Merits and worst cases of points that ran on every case, margins left out of the latter.
 
-        Margins, a frequency response each, cost as much as a simulation. A limit on them can only raise a merit, so
-        they are computed for points that can still beat their rival.
+        Margins, a frequency response each, cost as much as a simulation and can only raise a merit, so they are read of
+        points that can still beat their rival.
         """
         merits = np.full(len(rivals), -np.inf)
         if not self._spec.weight(ROBUSTNESS_REQUIREMENTS):
@@ -204,20 +182,10 @@ class Race:
             ahead = merits <= rivals
             if ahead.any():
                 merits[ahead] = compute_merits(responses.with_margins(ahead), self._spec, self._scale)
-        return merits, self._worst_cases(responses)
-
-    def _worst_cases(self, responses: Responses) -> Indices:
-        """Each point's case with the largest merit, margins left out, shape (m,)."""
         if len(self._kills) == 1 or self._spec.weight(ROBUSTNESS_REQUIREMENTS):
-            return np.zeros(len(responses.values["Excess"]), dtype=np.intp)
+            return merits, np.zeros(len(rivals), dtype=np.intp)
         table = responses.to_table(compute_merits(responses.by_case(), self._plain, self._scale))
-        return np.asarray(np.argmax(table, axis=1))
-
-    def _order(self, first: Indices) -> Indices:
-        """Each point's cases in the order in which they run, shape (m, n_cases)."""
-        rank = np.tile(-self._kills, (len(first), 1))
-        rank[np.arange(len(first)), first] = -np.inf
-        return np.asarray(np.argsort(rank, axis=1, kind="stable"))
+        return merits, np.asarray(np.argmax(table, axis=1))
 
 
 def may_be_cut(spec: Specification) -> bool:
@@ -243,27 +211,8 @@ def _course(simulator: Simulator, band: Band) -> RaceCourse:
     )
 
 
-def _merit_bounds(spec: Specification, bands: Sequence[Band]) -> RaceMerit:
-    kinds = [next(kind for kind in REQUIREMENT_KINDS if kind.metric.name == n) for n in RACE_VALUES]
-    weights, limits = np.array([[spec.weight(kind), spec.limit(kind)] for kind in kinds]).T
-    edges = (1 + EDGE_ROUNDING) * np.array([band_number(band) for band in bands])
-    return RaceMerit(edges, weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL)
-
-
 class SuccessHistory:
-    """A population of points of the unit cube with their merits, and what its trials have taught it.
-
-    Parameters
-    ----------
-    population : ndarray, shape (m, n)
-    merits : ndarray, shape (m,)
-        Small is good.
-    rng : numpy.random.Generator
-
-    Attributes
-    ----------
-    population, merits
-    """
+    """Points of the unit cube (m, n) with merits (m,), of which small ones are good, and what trials have taught."""
 
     def __init__(self, population: Array, merits: Array, rng: np.random.Generator) -> None:
         self.population, self.merits, self._rng = population.copy(), merits.copy(), rng
@@ -276,7 +225,10 @@ class SuccessHistory:
         rng, x = self._rng, self.population
         m, n = x.shape
         entry: Indices = rng.integers(0, MEMORY_SIZE, len(x))
-        F, rates = self._draw_lengths(entry), np.clip(rng.normal(self._rates[entry], RATE_SPREAD), 0.0, 1.0)
+        F = np.zeros(m)  # from a Cauchy distribution about the memory, drawn again where not positive
+        while (none := F <= 0).any():
+            F[none] = self._lengths[entry[none]] + LENGTH_SPREAD * rng.standard_cauchy(int(none.sum()))
+        F, rates = np.minimum(F, 1.0), np.clip(rng.normal(self._rates[entry], RATE_SPREAD), 0.0, 1.0)
         best = np.argsort(self.merits, kind="stable")[: max(2, round(BEST_SHARE * m))]
         towards = x[rng.choice(best, m)]
         one, other = _others(m, m + len(self._archive), rng)
@@ -289,46 +241,26 @@ class SuccessHistory:
         return np.where(taken, mutant, x)
 
     def select(self, trials: Array, merits: Array) -> Mask:
-        """Put trials that are no worse in the place of their parents, and learn from those that are better.
+        """Put trials (m, n) that are no worse in their parents' place, learn from the better ones; who was replaced.
 
-        Parameters
-        ----------
-        trials : ndarray, shape (m, n)
-            Of `propose`.
-        merits : ndarray, shape (m,)
-            A bound above the parent's merit is enough for a trial that has lost.
-
-        Returns
-        -------
-        ndarray of bool, shape (m,)
-            Which members were replaced.
+        Of a trial that has lost a bound above its parent's merit is enough.
         """
         replaced, better = merits <= self.merits, merits < self.merits
         if better.any():
-            self._learn(better, merits)
+            # what succeeded is remembered by its relative improvement, which is free of the merit's unit
+            F, rates = (drawn[better] for drawn in self._drawn)
+            old, new = self.merits[better], merits[better]
+            with np.errstate(invalid="ignore"):
+                gain = np.where(np.isfinite(old), (old - new) / (np.abs(old) + np.abs(new)), 1.0)
+            weights = gain / gain.sum()
+            self._lengths[self._entry] = (weights @ F**2) / (weights @ F)
+            self._rates[self._entry] = weights @ rates
+            self._entry = (self._entry + 1) % MEMORY_SIZE
             archive = np.vstack([self._archive, self.population[better]])
             kept = self._rng.permutation(len(archive))[: len(trials)]
             self._archive = archive[np.sort(kept)]
         self.population[replaced], self.merits[replaced] = trials[replaced], merits[replaced]
         return np.asarray(replaced)
-
-    def _draw_lengths(self, entry: Indices) -> Array:
-        """Step lengths from a Cauchy distribution about the memory, drawn again where not positive, at most 1."""
-        F = np.zeros(len(entry))
-        while (none := F <= 0).any():
-            F[none] = self._lengths[entry[none]] + LENGTH_SPREAD * self._rng.standard_cauchy(int(none.sum()))
-        return np.minimum(F, 1.0)
-
-    def _learn(self, better: Mask, merits: Array) -> None:
-        """Put the successful lengths and rates into the memory, weighted by relative improvement, free of its unit."""
-        F, rates = (drawn[better] for drawn in self._drawn)
-        old, new = self.merits[better], merits[better]
-        with np.errstate(invalid="ignore"):
-            gain = np.where(np.isfinite(old), (old - new) / (np.abs(old) + np.abs(new)), 1.0)
-        weights = gain / gain.sum()
-        self._lengths[self._entry] = (weights @ F**2) / (weights @ F)
-        self._rates[self._entry] = weights @ rates
-        self._entry = (self._entry + 1) % MEMORY_SIZE
 
 
 def first_population(members: int, start: Array, rng: np.random.Generator) -> Array:
@@ -353,19 +285,12 @@ WIDEN_BOUNDS = "widen the gains' bounds, or lower their lower ends"  # the remed
 
 
 def compute_merits(values: Mapping[str, Array], spec: Specification, scale: float) -> Array:
-    """The objective of points that keep all limits; of others more than any objective, graded by their violations.
+    """The objective (m,) of points that keep all limits; of others more than any objective, graded by violations.
 
     So limits come first, whatever unit the objective has: K. Deb, An efficient constraint handling method for genetic
     algorithms, Comput. Methods Appl. Mech. Engrg. 186 (2000) 311-338. Where a settling time is minimised, a response
-    that never settles counts as a violation, the larger the further from the reference it ends, so that a search can
-    start.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (m,)
-        As `Responses` has them.
-    scale : float
-        The horizon, which stands for the settling time of what never settles [s].
+    that never settles counts as a violation, the larger the further from the reference it ends, on the `scale` of the
+    horizon [s], so that a search can start.
     """
     filled = {n: np.where(np.isfinite(value), value, WORST_MERIT) for n, value in values.items()}
     settles, late = np.isfinite(values["SettlingTime"]), penalty_settling_time(scale, filled["Excess"])
@@ -380,19 +305,12 @@ def compute_merits(values: Mapping[str, Array], spec: Specification, scale: floa
 
 
 def search_result(task: TuningTask, simulator: Simulator, spec: Specification, point: Array) -> SearchResult:
-    """The result of a search by simulation: its best point, of shape (n,), with its status and what is active there.
-
-    Parameters
-    ----------
-    task : TuningTask
-        Whose limits the status is about.
-    simulator : Simulator
-    spec : Specification
-        The tightened one that was searched for.
-    point : ndarray, shape (n,)
-    """
+    """The result of a search by simulation for a tightened `spec`: its best point (n,), and what is active there."""
     values = to_records(simulator.values(point[None], spec))[0]
-    active = _active_limits(task.space, spec, point, values)
+    limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= (1 - ACTIVE_ROOM) * upper_limit(q)]
+    low, up = task.space.bounds.T
+    near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
+    active = (*limits, *(n for n, held in zip(task.space.names, near, strict=True) if held))
     return SearchResult(point, _search_status(task.spec, values), active, optimum=spec.objective(values))
 
 
@@ -415,14 +333,6 @@ def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
             Code.NOT_CONVERGED, ("nothing found settles", "widen the band or the bounds, or lengthen the horizon")
         )
     return Status(Code.CONVERGED)
-
-
-def _active_limits(space: Space, spec: Specification, point: Array, values: Mapping[str, float]) -> tuple[str, ...]:
-    """The names of limits that are reached to within 2 %, and of gains within 0.1 % of their range from a bound."""
-    limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= 0.98 * upper_limit(q)]
-    low, up = space.bounds.T
-    near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
-    return (*limits, *(n for n, held in zip(space.names, near, strict=True) if held))
 
 
 @dataclass(frozen=True)
@@ -519,19 +429,7 @@ class Racing:
 
 @dataclass(frozen=True, eq=False)
 class RacingResult:
-    """What a search found.
-
-    Parameters
-    ----------
-    point : ndarray, shape (n,)
-        The gains with the least merit.
-    count : int
-        Candidates simulated.
-    is_complete : bool
-        False where Ctrl-C cut the search short.
-    starts, agreeing : int
-        Starts, and how many of them ended within 1 % of the best.
-    """
+    """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best."""
 
     point: Array
     count: int
@@ -558,18 +456,8 @@ def run_racing(
 ) -> RacingResult:
     """Search in phases from starts that differ in kind; Ctrl-C ends the search with the best point so far.
 
-    Parameters
-    ----------
-    task : TuningTask
-    simulator : Simulator
-    spec : Specification
-        Already tightened.
-    method : Racing
-        Without `bands` it searches about the start.
-    start : ndarray, shape (n,)
-        A member of the first population.
-    progress : callable
-        Receives a line of text a generation.
+    `spec` is tightened; `start` (n,) is a member of the first population, and a method without `bands` searches about
+    it.
     """
     rng, space = np.random.default_rng(method.seed), simulator.space
     search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress)
@@ -630,7 +518,8 @@ class _RacingSearch:
         names, given = self._space.names, self.best
         population = first_population(method.members, given, self._rng)
         if not method.bands:
-            population[1:] = _near(given, population[1:], self._rng)
+            others = population[1:]  # every other one lies close to the start
+            others[::2] = np.clip(given + NEARBY * self._rng.standard_normal(others.shape), 0.0, 1.0)[::2]
             self._points = POLISHED_NEARBY
         bests = list[float]()
         for share in START_SHARES:
@@ -708,7 +597,9 @@ class _RacingSearch:
         for number in range(-(-phase.trials // len(population))):
             trials = history.propose()
             merits, cases = race.race(self._space.from_unit(trials), history.merits, worst)
-            merits = self._prove(race, trials, merits, best)
+            better = (merits < best) & race.is_cut
+            if better.any():  # a new best is proved on its whole response
+                merits[better] = race.merits(self._space.from_unit(trials[better]))[0]
             worst = np.where(history.select(trials, merits), cases, worst)
             self.count = before + race.count
             if history.merits.min() < best:
@@ -721,24 +612,13 @@ class _RacingSearch:
         order = np.argsort(history.merits, kind="stable")
         return history.population[order], history.merits[order]
 
-    def _prove(self, race: Race, trials: Array, merits: Array, best: float) -> Array:
-        """Merits, those that beat the best one on responses cut short replaced by those on whole responses."""
-        better = (merits < best) & race.is_cut
-        if better.any():
-            merits[better] = race.merits(self._space.from_unit(trials[better]))[0]
-        return merits
-
     def _cut(self, race: Race) -> None:
-        """Cut the responses of a race."""
-        race.cut(self._cut_time())
-
-    def _cut_time(self) -> float:
-        """A multiple of the best settling time [s], where later samples change no merit; elsewhere infinity."""
-        if not may_be_cut(self._spec):
-            return np.inf
-        values = self._coarse.respond(self._space.from_unit(self.best[None]), self._spec.band)
-        settled = float(values.values["SettlingTime"][0])
-        return max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf
+        """Cut a race's responses at a multiple of the best settling time, where later samples change no merit."""
+        settled = np.inf
+        if may_be_cut(self._spec):
+            values = self._coarse.respond(self._space.from_unit(self.best[None]), self._spec.band).values
+            settled = float(values["SettlingTime"][0])
+        race.cut(max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf)
 
 
 def _distinct_points(unit: Array) -> Indices:
@@ -748,12 +628,6 @@ def _distinct_points(unit: Array) -> Indices:
         if all(np.max(np.abs(unit[k] - unit[other])) > MIN_DISTANCE for other in found):
             found.append(k)
     return np.array(found)
-
-
-def _near(best: Array, others: Array, rng: np.random.Generator) -> Array:
-    """Points about the best one, in place of half of the others."""
-    close = np.clip(best + NEARBY * rng.standard_normal(others.shape), 0.0, 1.0)
-    return np.where((np.arange(len(others)) % 2 == 0)[:, None], close, others)
 
 
 def _is_done(stand: Sequence[tuple[float, float]], merits: Array) -> bool:

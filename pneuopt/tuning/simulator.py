@@ -2,9 +2,7 @@
 
 `Responses`: the metrics of simulated candidates, a lane each candidate and case, and their worst over the cases.
 
-`ResponsePoints`: where lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
-
-The points are those of `operating_points` in evaluation/margins.py. A search keeps few states
+`PointFinder`: the operating points of lanes (`operating_points` in evaluation/margins.py). A search keeps few states
 along a response: the fastest sample is read off the outputs, and the states there come from a second run, from the last
 kept ones up to it. Under dither further runs go through the period around it, and through the one after the end, off
 which the ripple is read.
@@ -64,15 +62,8 @@ from pneuopt.tuning.tolerances import (
 class ResponsePoints(NamedTuple):
     """Where m lanes begin, move fastest and end.
 
-    Attributes
-    ----------
-    states : ndarray, shape (m, k, n_states)
-        At every `KEPT_STATES`-th sample.
-    ends : ndarray, shape (m, n_states)
-    fastest : ndarray of int, shape (m,)
-        Sample of the largest speed, under dither of the speed without its ripple.
-    command : ndarray, shape (m,)
-        The commands in which they end.
+    States (m, k, n_states) stand at every `KEPT_STATES`-th sample, `ends` (m, n_states) with the commands (m,) there;
+    `fastest` (m,) is the sample of the largest speed, under dither without its ripple.
     """
 
     states: Array
@@ -92,15 +83,7 @@ class ResponsePoints(NamedTuple):
 
 
 def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices:
-    """Samples of the largest speed after the step, shape (m,), as `ResponsePoints` has them.
-
-    Parameters
-    ----------
-    grid : ReferenceGrid
-    speed : ndarray, shape (m, n)
-    period : float
-        Of the dither [s]; 0 for none.
-    """
+    """Samples (m,) of the largest of speeds (m, n) after the step, without a dither's ripple of this period [s]."""
     first = grid.step_index
     return np.asarray(first + first_largest(without_ripple(grid.t, speed, period)[:, first:]))
 
@@ -109,13 +92,7 @@ def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices
 class PointFinder:
     """Function that gives the operating points of simulated lanes, by a second run up to the fastest sample.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-    rollout : Rollout
-        Of `loop_pieces`.
-    rate : float
-        The fastest eigenvalue that RK4 has to resolve [1/s].
+    `rate` [1/s] is the fastest eigenvalue that RK4 has to resolve.
     """
 
     loop: ClosedLoop
@@ -125,22 +102,9 @@ class PointFinder:
     def __call__(
         self, grids: Sequence[tuple[ReferenceGrid, Indices]], p: Array, periods: Array, response_points: ResponsePoints
     ) -> tuple[Array, Array]:
-        """Find the points.
+        """The plant's states (k, m, n_states) and inputs at rest, sliding, and at the end; if affine at the end.
 
-        Parameters
-        ----------
-        grids : sequence of (ReferenceGrid, ndarray of int)
-            Each grid and the lanes that run on it.
-        p : ndarray, shape (m, n_parameters)
-        periods : ndarray, shape (m,)
-            Periods over which lanes are averaged [s]; 0: they are not.
-        response_points : ResponsePoints
-
-        Returns
-        -------
-        x : ndarray, shape (k, m, n_plant_states)
-        u : ndarray, shape (k, m, n_plant_inputs)
-            Of k points: at rest, sliding, at the end; of an affine plant the end alone.
+        Each grid comes with its lanes; p (m, n_parameters) and averaging times (m,) [s], 0 without, are the lanes'.
         """
         found = [self._points(grid, rows, p, periods, response_points) for grid, rows in grids]
         x, u = (np.empty((len(a), len(p), a.shape[2])) for a in found[0])
@@ -193,8 +157,8 @@ class PointFinder:
     ) -> tuple[Array, Array]:
         """The plant's state and the command at a sample of each lane, and the loop's state there.
 
-        Lanes wait there for the latest of them, between two samples of a held controller: at a sample it would act
-        again and again. That of lanes that go on from there has not acted yet.
+        Lanes wait for the latest between two samples of a held controller, which would act again at a sample; it has
+        not acted yet in lanes that go on from there.
         """
         kept, rows = last // KEPT_STATES, np.arange(len(p))
         left = (last - kept * KEPT_STATES)[:, None]
@@ -212,8 +176,8 @@ class PointFinder:
     def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints) -> tuple[Array, Array]:
         """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.
 
-        Under dither one more period is run after the end. Half the change from its start to its end is subtracted from
-        its mean, which puts the mean back to the end.
+        Under dither one period more is run; half the change over it is subtracted from its mean, which so belongs to
+        the end.
         """
         out = np.column_stack([own.ends[:, : len(self.loop.plant.states)], own.command])
         reach = np.zeros_like(out)
@@ -264,20 +228,9 @@ def _put_finite(out: Array, rows: Indices, values: Array) -> None:
 
 
 class Responses:
-    """The metrics of simulated candidates; margins, a frequency response each, are computed only on request.
+    """The metrics of candidates on the cases that were run, `lanes` (m, n_cases); margins come only on request.
 
-    Parameters
-    ----------
-    lanes : ndarray of bool, shape (m, n_cases)
-        Which cases of which candidate were run.
-    p : ndarray, shape (n_lanes, n_parameters)
-    measured : LaneMetrics
-    margins : MarginReader
-
-    Attributes
-    ----------
-    values : dict of str to ndarray, shape (m,)
-        The requirements' values without margins, the worst over the cases that were run.
+    `values` are the requirements' values (m,) without margins, the worst over those cases.
     """
 
     def __init__(self, lanes: Mask, p: Array, measured: "LaneMetrics", margins: "MarginReader") -> None:
@@ -323,16 +276,10 @@ class Responses:
 
 @dataclass(frozen=True, eq=False)
 class LaneMetrics:
-    """The metrics of m lanes and the points of their responses.
+    """The metrics (m,) of lanes, which of them do not run away, and the points of their responses.
 
-    Attributes
-    ----------
-    metrics : dict of str to ndarray, shape (m,)
-        Those of `step_metrics`, and "Excess", the mean error near the end, by which responses that never settle are
-        graded; infinite where the response runs away.
-    sound : ndarray of bool, shape (m,)
-        False where the response runs away.
-    response_points : ResponsePoints
+    Beside those of `step_metrics` there is "Excess", the mean error near the end, by which responses that never settle
+    are graded; infinite where the response runs away.
     """
 
     metrics: dict[str, Array]
@@ -359,15 +306,7 @@ def worst_values(found: Sequence[dict[str, float]]) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class MarginReader:
-    """A function that computes margins and peaks of loops, the worst over their operating points.
-
-    Attributes
-    ----------
-    names : tuple of str
-        The metrics that `read` gives.
-    read : callable
-        Of parameters, shape (m, n_parameters), cases, shape (m,), and the points of the lanes' responses.
-    """
+    """Function of lanes' parameters, cases (m,) and points that gives margins and peaks, the worst over the points."""
 
     names: tuple[str, ...]
     read: Callable[[Array, Indices, ResponsePoints], Mapping[str, Array]]
@@ -382,24 +321,8 @@ LaneRun = tuple[Array, Array, Array]  # states at every `KEPT_STATES`-th sample,
 class Simulator:
     """Simulate many candidates, compiled, on every reference and every scenario's plant, and read their metrics.
 
-    The plant's true signal counts, whatever a sensor shows the controller of it.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : sequence of Reference
-    space : Space
-    scenarios : mapping of str to mapping, optional
-        The plants beside the nominal one.
-    spec : Specification, optional
-        Its kinds of requirements are read beside the common ones.
-
-    Attributes
-    ----------
-    cases : tuple of TuningCase
-    response_metrics, margin_metrics : tuple of str
-        The metrics read off the responses, and off the loop linearised at their operating points.
-    sampled : LoopLanes
+    The plant's true signal counts, whatever a sensor shows the controller of it. The requirements of `spec` are read
+    beside the common ones; margins stand apart, for they cost a frequency response each.
     """
 
     def __init__(
@@ -432,8 +355,8 @@ class Simulator:
     def coarse(self, spec: Specification, bands: Sequence[Band] = ()) -> "Simulator":
         """A copy for use during a search, with half as many samples, which reads only what `spec` asks for.
 
-        With `bands` SettlingTime is the mean over those and the band asked for; a response that does not settle counts
-        as `penalty_settling_time`.
+        With `bands` SettlingTime is the mean over those and the band asked for, `penalty_settling_time` where it does
+        not settle.
         """
         part = copy.copy(self)
         part._wider = tuple(bands)

@@ -1,10 +1,8 @@
 """`tune`: find PID gains and dither together, and certify them by a simulation that shares no step with the search.
 
 A linear loop whose response shooting nodes follow closely is tuned by them (`TwoPhase`); any other, with friction, clip
-or sampling, by compiled simulation (`Racing`). The gains are rounded first and certified then, so that the printed
-numbers are proven.
-
-`METHODS`: the methods of `tune`, where a new one is registered; `choose_method` takes the first that suits.
+or sampling, by compiled simulation (`Racing`). `certify` proves given gains likewise, `certify_on_rig` once more on the
+event-accurate model of the rig. A new method is registered in `METHODS`; the first that suits is chosen.
 """
 
 import time
@@ -328,12 +326,7 @@ def _try_on_plants(
 
 
 def check_rig(rig: Rig | None, task: TuningTask) -> None:
-    """Refuse a rig that is not one of this loop, and a limit that only a rig shows without one.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a rig that is not one of this loop, and a limit that only a rig shows without one, by an `InputError`."""
     if rig is None:
         told = "NoHunting is read on the event-accurate model of the rig, which sticks; give rig=, or --rig rig.toml"
         require(task.spec.rest is None, told)
@@ -348,16 +341,9 @@ def check_rig(rig: Rig | None, task: TuningTask) -> None:
 
 
 def certify_on_rig(task: TuningTask, result: TuningResult, rig: Rig) -> TuningResult:
-    """The result with what the rig shows of its design; where a limit breaks there, it is no longer certified.
+    """The certified result with what the rig shows of it on every reference; a limit that breaks there refutes it.
 
-    Every reference is followed on the nominal plant. Margins are those of the smooth loop, which a rig does not have.
-
-    Parameters
-    ----------
-    task : TuningTask
-    result : TuningResult
-        Certified.
-    rig : Rig
+    Margins are those of the smooth loop, which a rig does not have.
     """
     assert rig.loop is not None
     parameters = task.space.parameters | result.parameters
@@ -497,19 +483,9 @@ def _make_task(
 
 
 def prepare_search(task: TuningTask, method: Method | None = None, progress: ProgressCallback | None = None) -> Search:
-    """The search that a method makes for a task, over the free parameters that have an effect on what it solves.
+    """The search of a method, by default the first that suits, over the free parameters that have an effect on it.
 
-    Parameters
-    ----------
-    task : TuningTask
-    method : Method, optional
-        By default the first that suits the task.
-    progress : callable, optional
-
-    Raises
-    ------
-    InputError
-        If the method cannot tune this task, or nothing that is free has an effect.
+    An `InputError` where the method cannot tune the task, or nothing that is free has an effect.
     """
     if method is None:
         method = choose_method(task)

@@ -1,11 +1,9 @@
 """`TwoPhase`: exact tuning of a linear loop; its settling time is a free duration of a multiple-shooting problem.
 
-The settling-time problem of a linear loop written as a transcription with a free duration.
-
 Phase "transient" is [0, Ts] with Ts unknown, phase "settled" the rest, where |y - r| <= band is a path limit; so the
 settling time is a smooth function of the gains. Each further term of the objective (the overshoot and so on) is one
 more unknown, which its path limit may not exceed. Fast dither leaves a linear loop's average alone; its offset is a
-step at the command.
+step at the command. `transcribe_two_phase` writes that problem.
 """
 
 import math
@@ -238,14 +236,9 @@ def solve_two_phase(
     report_progress: ProgressCallback,
     is_allowed: Callable[[Solution], bool] = lambda _: True,
 ) -> Optima:
-    """Solve the two-phase problem from every start; `report_progress` receives a line of text a start.
+    """Solve the two-phase problem from every start; solutions that are not allowed do not count as converged.
 
-    Solutions that are not allowed do not count as converged. The search ends early where most starts fail.
-
-    Raises
-    ------
-    InputError
-        If the loop's rest depends on the gains, or a mode is too fast for the grid.
+    It ends early where most starts fail; an `InputError` where the rest depends on the gains, or a mode is too fast.
     """
     problem = prepare_full_space(transcribe_two_phase(loop, references, space, spec, method.nodes), method.solver)
     parameters = problem.graph.transcription.parameters
@@ -272,16 +265,7 @@ def solve_two_phase(
 
 @dataclass(frozen=True, eq=False)
 class TwoPhasePath:
-    """A two-phase problem that is solved for one set of limits after the other, all of the same kinds.
-
-    Parameters
-    ----------
-    problem : FullSpaceProblem
-    names : tuple of str
-        The names of the gains.
-    band : float
-        The settling band as transcribed.
-    """
+    """A two-phase problem that is solved for one set of limits after the other, and its band as transcribed."""
 
     problem: FullSpaceProblem
     names: tuple[str, ...]
@@ -325,23 +309,10 @@ BAND_PARAMETER = "band.share"  # name of the settling band's factor, 1 as transc
 def transcribe_two_phase(
     loop: ClosedLoop, references: Sequence[Reference], space: Space, spec: Specification, nodes: tuple[int, int]
 ) -> Transcription:
-    """Write the two-phase problem, in which the references share one settling time, the largest.
+    """Write the two-phase problem of a linear loop, in which the references share one settling time, the largest.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-        A linear one.
-    references : sequence of Reference
-    space : Space
-    spec : Specification
-        Already tightened.
-    nodes : tuple of int
-        Shooting nodes of the transient and of the settled phase.
-
-    Raises
-    ------
-    InputError
-        If the state before the step depends on the gains, or a mode is too fast for the nodes.
+    `nodes` are those of the transient and of the settled phase; an `InputError` where the state before the step depends
+    on the gains, or a mode is too fast for the nodes.
     """
     free_loop = without_clip(loop)
     averaged = space.parameters.select(free_loop.parameters)
@@ -390,8 +361,8 @@ def _extra_unknowns(references: Sequence[Reference], spec: Specification) -> Par
 def _durations(references: Sequence[Reference], spec: Specification, settling: Parameter) -> ParameterSet:
     """The durations [s] of each reference, before its step and of its settled phase.
 
-    Where the error at the end counts the settled phase ends with the horizon; otherwise it is as long as the record
-    after the step, which shows more of the band.
+    The settled phase is as long as the record, which shows more of the band, unless the error at the end of it
+    counts.
     """
     found = {f"before.{i}": Parameter(r.at, "s") for i, r in enumerate(references) if r.at > 0}
     for i, r in enumerate(references):

@@ -1,7 +1,4 @@
-"""`validate_design`: a design on plants that no search has used: on how many it holds, what breaks, what would help.
-
-`advise`: what would let a design hold on more plants, computed from those on which it was tried.
-"""
+"""`validate_design`: a design on plants that no search has used: on how many it holds, what breaks, what would help."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -339,16 +336,7 @@ DEFECT_WORDS = frozenset({NO_REST, *(defect.value for defect in Defect)})
 
 
 def find_breaks(row: Mapping[str, float], spec: Specification, accept: Collection[Defect] = ()) -> tuple[str, ...]:
-    """What breaks on a plant: defects, then limits by the name of their metric.
-
-    Parameters
-    ----------
-    row : mapping of str to float
-        Its metrics, SettlingTime and MaxSensitivity among them.
-    spec : Specification
-    accept : collection of Defect
-        Defects that do not count.
-    """
+    """What breaks on a plant by its metrics: defects that are not accepted, then limits by the metric's name."""
     defects = {n: defect.value for n, defect in LANE_DEFECTS.items() if not math.isfinite(row[n])}
     limits = [metric_name(q) for q in spec.violations(requirement_values(row))]
     named = [word for word in defects.values() if Defect(word) not in accept]
@@ -363,25 +351,9 @@ def advise(
     certified: "pd.DataFrame",
     axes: Mapping[CorrelatedParameters, "pd.DataFrame"],
 ) -> tuple[tuple[str, ...], tuple[CorrelatedParameters, ...]]:
-    """Advice where a design breaks on plants: what to relax, and what to tune over.
+    """Advice where a design breaks on plants, a sentence each, and what to tune over.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-        Gives the units.
-    spec : Specification
-    plants, certified : DataFrame
-        Of a `DesignValidation`.
-    broken : mapping of str to tuple of str
-        Likewise.
-    axes : mapping of CorrelatedParameters to DataFrame
-        Of what varies the metrics with that alone at its low and its high end, a column each.
-
-    Returns
-    -------
-    sentences : tuple of str
-    suggested : tuple of CorrelatedParameters
-        What of it to tune over.
+    `axes` are the metrics with one thing that varies alone at its low and its high end, a column each.
     """
     if not broken:
         return (), ()

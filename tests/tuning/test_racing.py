@@ -195,8 +195,9 @@ def test_the_result_says_how_many_starts_agree() -> None:
     task, simulator = posed()
     found = SMALL.find(task, simulator, SPEC.with_stability(), task.space.start, 0, lambda _: None)
     assert found.status.code is Code.CONVERGED
-    assert found.stats["starts"] == 2
-    assert found.stats["starts_agreeing"] in (1, 2)
+    assert found.agreement is not None
+    assert found.agreement.starts == 2
+    assert found.agreement.agreeing in (1, 2)
 
 
 BOUNDS_RACE = {"pid.Kp": (50.0, 600.0), "pid.Ki": (100.0, 8000.0), "pid.Kd": (0.0, 1.0)}
