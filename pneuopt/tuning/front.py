@@ -43,9 +43,9 @@ from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, end_point
 from pneuopt.tuning.simulator import to_records
 from pneuopt.tuning.tolerances import (
+    LEAST_IMPROVEMENT,
     LOG_SPACING_RATIO,
     MAX_IMPROVEMENT_ROUNDS,
-    MIN_IMPROVEMENT,
     RIVAL_SAMPLES,
     SECONDARY_WEIGHT,
 )
@@ -108,14 +108,14 @@ class Front:
         return (
             best
             if _result_value(_result_of(best), requirement)
-            < _result_value(_result_of(end), requirement) * (1 - MIN_IMPROVEMENT)
+            < _result_value(_result_of(end), requirement) * (1 - LEAST_IMPROVEMENT)
             else end
         )
 
     def _fill_between(self, ends: list[Design], points: int) -> None:
         """Find the designs between two ends."""
         high, low = ends[0].limit, ends[1].limit
-        if high <= low * (1 + MIN_IMPROVEMENT):
+        if high <= low * (1 + LEAST_IMPROVEMENT):
             self.designs = ends[:1]
             return
         even = np.geomspace if low > 0 and high / low > LOG_SPACING_RATIO else np.linspace
@@ -216,7 +216,7 @@ class Front:
         starts = [end_point(result, space) for result in ends]
         found = path.follow(starts[0], specs)
         other = path.follow(starts[1], specs[-1:])
-        if _solution_cost(other[0]) < _solution_cost(found[-1]) * (1 - MIN_IMPROVEMENT):
+        if _solution_cost(other[0]) < _solution_cost(found[-1]) * (1 - LEAST_IMPROVEMENT):
             other = path.follow(starts[1], specs[::-1])
         for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
             spent = found[k].stats["seconds"] + back.stats["seconds"]
@@ -291,7 +291,7 @@ class Front:
         points, rows = self._samples
         rivals |= {v[metric_name(self.first)]: x for x, v in zip(points, rows, strict=True) if not spec.violations(v)}
         least = min((v for v in rivals if np.isfinite(v)), default=np.inf)
-        return rivals[least] if least < own * (1 - MIN_IMPROVEMENT) else None
+        return rivals[least] if least < own * (1 - LEAST_IMPROVEMENT) else None
 
     @cached_property
     def _samples(self) -> tuple[Array, list[dict[str, float]]]:

@@ -52,6 +52,7 @@ from pneuopt.quantities.errors import require
 from pneuopt.tuning.simulator import ResponsePoints, Simulator, to_records
 from pneuopt.tuning.space import (
     CONTROL_OUTPUT,
+    INTEGRAL_OUTPUT,
     SIGNAL_OUTPUT,
     ReferenceGrid,
     Space,
@@ -61,9 +62,7 @@ from pneuopt.tuning.space import (
 )
 from pneuopt.tuning.tolerances import (
     DIFFERENCE_STEP,
-    GROW_GAIN_RATIO,
     INFINITE_BOUND,
-    INTEGRAL_OUTPUT,
     KEPT_STATES,
     MAX_CUTTING_ROUNDS,
     MAX_SENSITIVITY_LANES,
@@ -76,7 +75,6 @@ from pneuopt.tuning.tolerances import (
     QP_CURVATURE,
     ROW_PADDING,
     SETTLING_RADIUS_RATIO,
-    SHRINK_GAIN_RATIO,
     VIOLATION_TOLERANCE,
 )
 
@@ -140,12 +138,15 @@ class MinimaxProblem(Protocol):
 class SQP:
     """Step control: first and least half width of the trust region, and the relative decrease that ends a descent.
 
-    Widths are shares of the unknowns' ranges.
+    Widths are shares of the unknowns' ranges. Actual over predicted decrease below `shrink` narrows the region, above
+    `grow` widens it (J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., algorithm 4.1).
     """
 
     radius: float = 0.3
     least_radius: float = 1e-5
     tolerance: float = 1e-5
+    shrink: float = 0.25
+    grow: float = 0.75
 
     def __post_init__(self) -> None:
         require(0 < self.least_radius < self.radius, f"SQP: radius must exceed {self.least_radius:g}")
@@ -187,7 +188,7 @@ def _advance(problem: MinimaxProblem, descents: Sequence[DescentState], method: 
     poor = [
         k
         for k, (predicted, gained) in enumerate(gains)
-        if _promises_decrease(descents[k], predicted, method) and gained < SHRINK_GAIN_RATIO * predicted
+        if _promises_decrease(descents[k], predicted, method) and gained < method.shrink * predicted
     ]
     seconds = [
         _second_order_step(descents[k].point, steps[k], trials[k][0], _step_box(problem, descents[k])) for k in poor
@@ -227,9 +228,9 @@ def _update_descent(
         return replace(descent, radius=smaller, moves=predicted < 0 and smaller > method.least_radius)
     gained, reach = descent.point.merit - trial.merit, float(np.max(np.abs(step)))
     radius = descent.radius
-    if gained < SHRINK_GAIN_RATIO * predicted:
+    if gained < method.shrink * predicted:
         radius = 0.4 * min(radius, reach)
-    elif gained > GROW_GAIN_RATIO * predicted and reach > 0.9 * radius:
+    elif gained > method.grow * predicted and reach > 0.9 * radius:
         radius = min(2 * radius, 1.0)
     point = trial if gained > 0 else descent.point
     return DescentState(point, radius, radius > method.least_radius)

@@ -54,11 +54,10 @@ from pneuopt.tuning.tolerances import (
     KEPT_STATES,
     LAGGING,
     LEAST_CUT,
+    LEAST_IMPROVEMENT,
     LEAST_MEMBERS,
-    LEAST_PROGRESS,
     LEAST_SHORT_TRIALS,
     LEAST_SPREAD,
-    LENGTH_SPREAD,
     LIMIT_TOLERANCE,
     MAX_RECORDED_NUMBERS,
     MEMORY_OF_KILLS,
@@ -69,7 +68,6 @@ from pneuopt.tuning.tolerances import (
     PATIENCE,
     POLISHED,
     POLISHED_NEARBY,
-    RATE_SPREAD,
     RUNAWAY_LEVEL,
     SHORT_MEMBERS,
     SIMULATION_PEAK_MARGIN,
@@ -225,10 +223,10 @@ class SuccessHistory:
         rng, x = self._rng, self.population
         m, n = x.shape
         entry: Indices = rng.integers(0, MEMORY_SIZE, len(x))
-        F = np.zeros(m)  # from a Cauchy distribution about the memory, drawn again where not positive
+        F = np.zeros(m)  # Cauchy, and rates normal, about the memory with a spread of 0.1, as published
         while (none := F <= 0).any():
-            F[none] = self._lengths[entry[none]] + LENGTH_SPREAD * rng.standard_cauchy(int(none.sum()))
-        F, rates = np.minimum(F, 1.0), np.clip(rng.normal(self._rates[entry], RATE_SPREAD), 0.0, 1.0)
+            F[none] = self._lengths[entry[none]] + 0.1 * rng.standard_cauchy(int(none.sum()))
+        F, rates = np.minimum(F, 1.0), np.clip(rng.normal(self._rates[entry], 0.1), 0.0, 1.0)
         best = np.argsort(self.merits, kind="stable")[: max(2, round(BEST_SHARE * m))]
         towards = x[rng.choice(best, m)]
         one, other = _others(m, m + len(self._archive), rng)
@@ -538,7 +536,7 @@ class _RacingSearch:
         """Search on fine samples: by gradients from the best points, then by trials, and again where those got on."""
         few = np.vstack([self._best_first(population, self._coarse)[0][:FINE_MEMBERS], *self._polished])
         population, merits = self._polish(*self._best_first(few, fine.simulator), fine.simulator, iterations)
-        best = merits[0] * (1 - LEAST_PROGRESS)
+        best = merits[0] * (1 - LEAST_IMPROVEMENT)
         population, merits = self.evolve(population[:FINE_MEMBERS], fine)
         if merits[0] < best:
             self._polish(population, merits, fine.simulator, iterations)
@@ -633,6 +631,6 @@ def _distinct_points(unit: Array) -> Indices:
 def _is_done(stand: Sequence[tuple[float, float]], merits: Array) -> bool:
     """Whether a population no longer advances: its best and its median stand still, or all its members are alike."""
     stands = len(stand) > PATIENCE and all(
-        now > before * (1 - LEAST_PROGRESS) for now, before in zip(stand[-1], stand[-1 - PATIENCE], strict=True)
+        now > before * (1 - LEAST_IMPROVEMENT) for now, before in zip(stand[-1], stand[-1 - PATIENCE], strict=True)
     )
     return stands or bool(np.ptp(merits) <= LEAST_SPREAD * abs(merits.min()))

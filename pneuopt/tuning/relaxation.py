@@ -21,7 +21,7 @@ from pneuopt.evaluation.tolerances import TAIL_SHARE
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import MAX_LOCAL_SIMULATIONS, RELAXED_LIMIT_DIGITS, UNSETTLED_EXCESS
+from pneuopt.tuning.tolerances import MAX_LOCAL_SIMULATIONS, RELAXED_DIGITS, UNSETTLED_EXCESS
 
 
 def relaxation_specification(
@@ -121,6 +121,6 @@ def _round_outwards(value: float, *, upwards: bool) -> float:
     """
     if not 0 < abs(value) < inf:
         return value
-    place = 10.0 ** (floor(log10(abs(value))) - RELAXED_LIMIT_DIGITS + 1)
+    place = 10.0 ** (floor(log10(abs(value))) - RELAXED_DIGITS + 1)
     steps = (ceil if upwards else floor)(value / place * (1 - 1e-12 if upwards else 1 + 1e-12))
-    return float(f"{steps * place:.{RELAXED_LIMIT_DIGITS}g}")
+    return float(f"{steps * place:.{RELAXED_DIGITS}g}")

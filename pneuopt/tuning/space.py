@@ -44,7 +44,6 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.tolerances import (
     BOUND_DISTANCE,
-    INTEGRAL_OUTPUT,
     MAX_LOOP_SUBSTEPS,
     MAX_ROUNDING_POINTS,
     RUNAWAY_LEVEL,
@@ -269,8 +268,9 @@ def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> 
     return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
 
 
-# Indices of the outputs that are run: the measured signal, the command, then the meter's channels one after another.
-SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT = range(3)
+# Indices of the outputs that are run: the measured signal, the command, then the meter's channels one after another;
+# under dither the signal's integral is the last output and the last state.
+SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT, INTEGRAL_OUTPUT = [*range(3), -1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,6 @@ from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
-from pneuopt.tuning.tolerances import MIN_AGREEING
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuning.validation import validate_design
 
@@ -292,7 +291,7 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback)
     search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
-    found_once = result.agreement is not None and result.agreement.agreeing < MIN_AGREEING
+    found_once = result.agreement is not None and result.agreement.agreeing < 2  # perhaps the nearest of many optima
     doubtful = not result.status.converged or found_once
     if method is not None or successor is None or not doubtful or result.status.code is Code.INTERRUPTED:
         return search, result, False

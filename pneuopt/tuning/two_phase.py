@@ -52,7 +52,7 @@ from pneuopt.tuning.method import Agreement, SearchResult, TuningTask, check_met
 from pneuopt.tuning.racing import WIDEN_BOUNDS, Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue, rk4_substeps
-from pneuopt.tuning.tolerances import EXACT_PEAK_MARGIN, MAX_STEPS_A_SEGMENT, MIN_STARTS, OPTIMA_TOLERANCE
+from pneuopt.tuning.tolerances import EXACT_PEAK_MARGIN, LEAST_IMPROVEMENT, MAX_STEPS_A_SEGMENT, MIN_STARTS
 
 # Parameters on which the average of a linear loop does not depend.
 PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
@@ -254,7 +254,7 @@ def solve_two_phase(
         report_progress(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
         good += [s for s in found[-1:] if s.status.converged and is_allowed(s)]
     failed = [math.inf] * (len(found) - len(good))
-    agreement = compare_starts([*map(_objective_value, good), *failed], OPTIMA_TOLERANCE)
+    agreement = compare_starts([*map(_objective_value, good), *failed], LEAST_IMPROVEMENT)
     if not good:
         closest = min(found, key=lambda s: s.stats.get("largest_violation", math.inf))
         unstable = Status(Code.INFEASIBLE, ("every optimum found is an unstable loop, or nearly so", WIDEN_BOUNDS))

@@ -25,7 +25,7 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, 
 from pneuopt.quantities.results import Result
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import MAX_ADVISED_AXES, RELAXED_DIGITS, SUMMARY_PERCENTILE
+from pneuopt.tuning.tolerances import MAX_TOLD, RELAXED_DIGITS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -314,7 +314,7 @@ def _figures(
         order = _rank_order(given, metric)
         rows[metric] = {
             "median": _quantile(given, metric, 50.0),
-            "p95": _quantile(given, metric, SUMMARY_PERCENTILE),
+            "p95": _quantile(given, metric, 95.0),
             "worst": float(given[order[-1]]),
             "worst_plant": str(values.columns[order[-1]]),
             "certified": float(certified[case].to_dict()[metric]),
@@ -401,8 +401,8 @@ def _culprits(
     order = sorted(worst, key=lambda a: -worst[a])
     alone = [a for a in order if worst[a] > 0]
     if alone:
-        return tuple(alone[:MAX_ADVISED_AXES]), "what breaks it most, each alone"
-    return tuple(order[:MAX_ADVISED_AXES]), "nothing breaks it alone, most is done by"
+        return tuple(alone[:MAX_TOLD]), "what breaks it most, each alone"
+    return tuple(order[:MAX_TOLD]), "nothing breaks it alone, most is done by"
 
 
 def _worst_excess(row: Mapping[str, float], spec: Specification) -> float:
