@@ -25,14 +25,14 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
-from pneuopt.quantities.errors import ConvergenceError, InputError
+from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning import search as certifier
 from pneuopt.tuning.method import SearchResult
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search
-from pneuopt.tuning.tune import prepare_search, prepare_task, tune
+from pneuopt.tuning.tune import prepare_search, prepare_task
 
 POINT = np.array([0.5, 8.0])  # Kp, Ki: an overshoot of 4.6 %
 FAST, SLOW = {"plant.gain": 1.2}, {"plant.gain": 0.6}
@@ -199,11 +199,3 @@ def test_a_rest_off_the_reference_is_accepted_as_far_as_a_limit_on_it_says() -> 
     assert rest(SteadyStateError(0.11)).status.converged
     assert "misses the reference" in rest().status.sentences[0]
     assert "misses the reference" in rest(Overshoot(0.1)).status.sentences[0]
-
-
-def test_accepting_what_is_no_defect_is_an_error() -> None:
-    tuning = search(SettlingTime())
-    words: Any = "hunts"
-    with pytest.raises(InputError, match="accept"):
-        tune(tuning.task.loop, Step(1.0), tuning.space.parameters, minimise=SettlingTime(), accept=words)
-    assert replace(tuning.task, accept=(Defect.HUNTS,)).accept == (Defect.HUNTS,)
