@@ -79,6 +79,55 @@ from pneuopt.tuning.tolerances import (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Polish:
+    """Improve points of a search by gradients."""
+
+    simulator: Simulator
+    spec: Specification
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether there are gradients of all that is asked for."""
+        return not nonsmooth_terms(self.simulator.loop, self.simulator.space, self.spec)
+
+    @cached_property
+    def _rollout(self) -> Rollout:
+        return sensitivity_rollout(self.simulator)
+
+    def improve(self, unit: Array, on: Simulator, iterations: int) -> tuple[Array, int]:
+        """Descend from points of the unit cube (m, n) on some samples; where each ends, and points simulated."""
+        inside, count, space = self.spec.tighten(PROGRAM_MARGIN, PROGRAM_MARGIN), 0, self.simulator.space
+        first = to_records(on.values(space.from_unit(unit[:1]), self.spec))[0]
+        unknown = {SettlingTime.metric.name: max(grid.reference.horizon for grid in on.grids)}
+        known = {n: v if np.isfinite(v) else unknown.get(n, 1.0) for n, v in first.items()}
+        scale = self.spec.objective(known)  # the size of the objective sets that of the penalties
+        for raises in range(PENALTY_RAISES + 1):
+            problem = LinearisedProblem(on, self._rollout, inside, NODES, scale * 10.0**raises)
+            found = descend(problem, problem.start(unit), iterations, SQP())
+            unit, count = np.array([point.z[:-1] for point in found]), count + problem.count
+            values = to_records(on.values(space.from_unit(unit), self.spec))
+            if not any(self.spec.violations(row) for row in values):
+                break
+        return unit, count
+
+
+# Free parameters that no gradient serves: the averaging time moves with the frequency, and a clip that no response
+# meets has derivative zero.
+NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
+
+
+QUANTISER_PARAMETERS = ("sensor.resolution",)  # an encoder's: its counts make responses piecewise flat
+
+
+def nonsmooth_terms(loop: ClosedLoop, space: Space, spec: Specification) -> list[str]:
+    """The names of requirements without a gradient, and of free parameters to which there is none."""
+    rough = [metric_name(q) for q in (*spec.weights, *spec.limits) if not isinstance(q, SMOOTH_REQUIREMENTS)]
+    counted = [f"{n} (an encoder's counts)" for n in QUANTISER_PARAMETERS if n in space.parameters]
+    jumping = {f"{c.section}.{n}" for c in loop.compensators for n in c.without_gradient}
+    return [*rough, *(n for n in space.names if n in NONSMOOTH_PARAMETERS or n in jumping), *counted]
+
+
 @dataclass(frozen=True)
 class RowGroups:
     """Weights and floors (n_groups,): a limit has its violation's penalty and floor 0, an objective floor -inf."""
@@ -320,6 +369,8 @@ def _qp_solver(n: int, m: int) -> Any:
 
 
 ROW_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.slope is not None)
+
+
 SMOOTH_REQUIREMENTS: tuple[type[Requirement], ...] = (SettlingTime, *ROW_REQUIREMENTS, *ROBUSTNESS_REQUIREMENTS)
 """Requirements of which there are derivatives to the gains."""
 
@@ -735,50 +786,3 @@ def _move(signal: ValuesAndSlopes, mean: ValuesAndSlopes, reach: ValuesAndSlopes
     side, inside = np.sign(rest), np.abs(rest) <= reach[0]
     slopes = np.where(inside[:, None], mean[1], signal[1] - side[:, None] * reach[1])
     return np.where(inside, mean[0], signal[0] - side * reach[0]), slopes
-
-
-# Free parameters that no gradient serves: the averaging time moves with the frequency, and a clip that no response
-# meets has derivative zero.
-NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
-QUANTISER_PARAMETERS = ("sensor.resolution",)  # an encoder's: its counts make responses piecewise flat
-
-
-def nonsmooth_terms(loop: ClosedLoop, space: Space, spec: Specification) -> list[str]:
-    """The names of requirements without a gradient, and of free parameters to which there is none."""
-    rough = [metric_name(q) for q in (*spec.weights, *spec.limits) if not isinstance(q, SMOOTH_REQUIREMENTS)]
-    counted = [f"{n} (an encoder's counts)" for n in QUANTISER_PARAMETERS if n in space.parameters]
-    jumping = {f"{c.section}.{n}" for c in loop.compensators for n in c.without_gradient}
-    return [*rough, *(n for n in space.names if n in NONSMOOTH_PARAMETERS or n in jumping), *counted]
-
-
-@dataclass(frozen=True, eq=False)
-class Polish:
-    """Improve points of a search by gradients."""
-
-    simulator: Simulator
-    spec: Specification
-
-    @property
-    def is_possible(self) -> bool:
-        """Whether there are gradients of all that is asked for."""
-        return not nonsmooth_terms(self.simulator.loop, self.simulator.space, self.spec)
-
-    @cached_property
-    def _rollout(self) -> Rollout:
-        return sensitivity_rollout(self.simulator)
-
-    def improve(self, unit: Array, on: Simulator, iterations: int) -> tuple[Array, int]:
-        """Descend from points of the unit cube (m, n) on some samples; where each ends, and points simulated."""
-        inside, count, space = self.spec.tighten(PROGRAM_MARGIN, PROGRAM_MARGIN), 0, self.simulator.space
-        first = to_records(on.values(space.from_unit(unit[:1]), self.spec))[0]
-        unknown = {SettlingTime.metric.name: max(grid.reference.horizon for grid in on.grids)}
-        known = {n: v if np.isfinite(v) else unknown.get(n, 1.0) for n, v in first.items()}
-        scale = self.spec.objective(known)  # the size of the objective sets that of the penalties
-        for raises in range(PENALTY_RAISES + 1):
-            problem = LinearisedProblem(on, self._rollout, inside, NODES, scale * 10.0**raises)
-            found = descend(problem, problem.start(unit), iterations, SQP())
-            unit, count = np.array([point.z[:-1] for point in found]), count + problem.count
-            values = to_records(on.values(space.from_unit(unit), self.spec))
-            if not any(self.spec.violations(row) for row in values):
-                break
-        return unit, count

@@ -76,6 +76,133 @@ from pneuopt.tuning.tolerances import (
     WORST_MERIT,
 )
 
+
+@dataclass(frozen=True)
+class Racing:
+    """Tune any loop by success-history differential evolution on compiled simulations, trials racing over the cases.
+
+    Parameters
+    ----------
+    members : int
+        Candidates in the population.
+    trials : int
+        Trials for each free gain, at most: a search ends sooner where it no longer advances. On the corners of the
+        drive in problems/shared/t32.py two seeds that ended at 0.185 s with 600 came to 0.154 s with 1200.
+    bands : tuple of float
+        Settling bands over which the first phase takes the mean settling time, as multiples of the one asked for.
+    polish : int
+        Iterations by gradients from each of the best points, where there are gradients of all that is asked for.
+    margin : float
+        How much tighter the search's limits are than those asked for, a fraction.
+    seed : int
+        Of the random numbers.
+    digits : int, optional
+        Significant digits to which the gains are rounded; None: all.
+    """
+
+    members: int = 40
+    trials: int = 1200
+    bands: tuple[float, ...] = (1.5, 2.5, 5.0)
+    polish: int = 20
+    margin: float = 0.015
+    seed: int = 0
+    digits: int | None = 4
+
+    peak_margin: ClassVar[float] = SIMULATION_PEAK_MARGIN
+    parameters_without_effect: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for option in ("members", "trials", "polish"):
+            check_number(f"Racing: {option}", getattr(self, option), "a whole number, as 40", whole=True)
+        meant = "multiples of the settling band, as (1.5, 2.5)"
+        check_argument("Racing: bands", self.bands, (tuple, list), meant)
+        for band in self.bands:
+            check_number("Racing: bands", band, meant)
+        object.__setattr__(self, "bands", tuple(self.bands))
+        check_method_options(self)
+        require(self.members >= LEAST_MEMBERS, f"Racing: members must be at least {LEAST_MEMBERS}, got {self.members}")
+        require(self.trials >= 1, f"Racing: trials must be at least 1, got {self.trials}")
+        require(self.polish >= 0, f"Racing: polish must not be negative, got {self.polish}")
+        require(all(b > 1 for b in self.bands), f"Racing: bands are multiples of the one asked for, got {self.bands}")
+        require(0 <= self.margin < 1, f"Racing: margin is a fraction below 1, got {self.margin}")
+        require(self.digits is None or self.digits >= 2, f"Racing: digits must be at least 2, got {self.digits}")
+
+    @property
+    def successor(self) -> None:
+        """No method follows this one: its answer is final."""
+
+    def check(self, task: TuningTask) -> None:
+        """Accept every task: a simulation can be searched whatever the loop."""
+
+    def suits(self, task: TuningTask) -> bool:  # noqa: ARG002
+        """Whether it is the one to choose: always."""
+        return True
+
+    def find(
+        self,
+        task: TuningTask,
+        simulator: Simulator,
+        spec: Specification,
+        start: Array,
+        attempt: int,
+        progress: ProgressCallback,
+    ) -> SearchResult:
+        """Search for the best point, from one that is close where a certificate has failed; see `Method.find`."""
+        method = replace(self, bands=(), trials=max(1, self.trials // 3)) if attempt else self
+        best = run_racing(task, simulator, spec, method, start, progress)
+        result = search_result(task, simulator, spec, best.point)
+        return replace(
+            result,
+            simulations=best.count,
+            agreement=Agreement(best.starts, best.agreeing),
+            is_complete=best.is_complete,
+            uses_simulator=True,
+        )
+
+    def shorten(self, margin: float) -> "Racing":
+        """The method for a short search from a point that is close."""
+        trials = min(self.trials, max(LEAST_SHORT_TRIALS, self.trials // 6))
+        members = max(LEAST_MEMBERS, round(SHORT_MEMBERS * self.members))
+        return replace(self, members=members, trials=trials, bands=(), margin=margin)
+
+    def limit_path(self, task: TuningTask, spec: Specification) -> None:
+        """No path: each set of limits needs a new search."""
+
+
+@dataclass(frozen=True, eq=False)
+class RacingResult:
+    """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best."""
+
+    point: Array
+    count: int
+    is_complete: bool
+    starts: int
+    agreeing: int
+
+
+def run_racing(
+    task: TuningTask,
+    simulator: Simulator,
+    spec: Specification,
+    method: Racing,
+    start: Array,
+    progress: ProgressCallback,
+) -> RacingResult:
+    """Search in phases from starts that differ in kind; Ctrl-C ends the search with the best point so far.
+
+    `spec` is tightened; `start` (n,) is a member of the first population, and a method without `bands` searches about
+    it.
+    """
+    rng, space = np.random.default_rng(method.seed), simulator.space
+    search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress)
+    try:
+        search.run(method)
+    except KeyboardInterrupt:
+        best = space.from_unit(search.best_so_far())
+        return RacingResult(best, search.count, False, search.starts, search.agreeing)
+    return RacingResult(space.from_unit(search.best), search.count, True, search.starts, search.agreeing)
+
+
 # What may be asked for where responses are cut short: nothing of it grows after the response has settled.
 CUT_REQUIREMENTS = (SettlingTime, Overshoot, PeakControl, ControlRate, *ROBUSTNESS_REQUIREMENTS)
 
@@ -333,138 +460,12 @@ def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
     return Status(Code.CONVERGED)
 
 
-@dataclass(frozen=True)
-class Racing:
-    """Tune any loop by success-history differential evolution on compiled simulations, trials racing over the cases.
-
-    Parameters
-    ----------
-    members : int
-        Candidates in the population.
-    trials : int
-        Trials for each free gain, at most: a search ends sooner where it no longer advances. On the corners of the
-        drive in problems/shared/t32.py two seeds that ended at 0.185 s with 600 came to 0.154 s with 1200.
-    bands : tuple of float
-        Settling bands over which the first phase takes the mean settling time, as multiples of the one asked for.
-    polish : int
-        Iterations by gradients from each of the best points, where there are gradients of all that is asked for.
-    margin : float
-        How much tighter the search's limits are than those asked for, a fraction.
-    seed : int
-        Of the random numbers.
-    digits : int, optional
-        Significant digits to which the gains are rounded; None: all.
-    """
-
-    members: int = 40
-    trials: int = 1200
-    bands: tuple[float, ...] = (1.5, 2.5, 5.0)
-    polish: int = 20
-    margin: float = 0.015
-    seed: int = 0
-    digits: int | None = 4
-
-    peak_margin: ClassVar[float] = SIMULATION_PEAK_MARGIN
-    parameters_without_effect: ClassVar[tuple[str, ...]] = ()
-
-    def __post_init__(self) -> None:
-        for option in ("members", "trials", "polish"):
-            check_number(f"Racing: {option}", getattr(self, option), "a whole number, as 40", whole=True)
-        meant = "multiples of the settling band, as (1.5, 2.5)"
-        check_argument("Racing: bands", self.bands, (tuple, list), meant)
-        for band in self.bands:
-            check_number("Racing: bands", band, meant)
-        object.__setattr__(self, "bands", tuple(self.bands))
-        check_method_options(self)
-        require(self.members >= LEAST_MEMBERS, f"Racing: members must be at least {LEAST_MEMBERS}, got {self.members}")
-        require(self.trials >= 1, f"Racing: trials must be at least 1, got {self.trials}")
-        require(self.polish >= 0, f"Racing: polish must not be negative, got {self.polish}")
-        require(all(b > 1 for b in self.bands), f"Racing: bands are multiples of the one asked for, got {self.bands}")
-        require(0 <= self.margin < 1, f"Racing: margin is a fraction below 1, got {self.margin}")
-        require(self.digits is None or self.digits >= 2, f"Racing: digits must be at least 2, got {self.digits}")
-
-    @property
-    def successor(self) -> None:
-        """No method follows this one: its answer is final."""
-
-    def check(self, task: TuningTask) -> None:
-        """Accept every task: a simulation can be searched whatever the loop."""
-
-    def suits(self, task: TuningTask) -> bool:  # noqa: ARG002
-        """Whether it is the one to choose: always."""
-        return True
-
-    def find(
-        self,
-        task: TuningTask,
-        simulator: Simulator,
-        spec: Specification,
-        start: Array,
-        attempt: int,
-        progress: ProgressCallback,
-    ) -> SearchResult:
-        """Search for the best point, from one that is close where a certificate has failed; see `Method.find`."""
-        method = replace(self, bands=(), trials=max(1, self.trials // 3)) if attempt else self
-        best = run_racing(task, simulator, spec, method, start, progress)
-        result = search_result(task, simulator, spec, best.point)
-        return replace(
-            result,
-            simulations=best.count,
-            agreement=Agreement(best.starts, best.agreeing),
-            is_complete=best.is_complete,
-            uses_simulator=True,
-        )
-
-    def shorten(self, margin: float) -> "Racing":
-        """The method for a short search from a point that is close."""
-        trials = min(self.trials, max(LEAST_SHORT_TRIALS, self.trials // 6))
-        members = max(LEAST_MEMBERS, round(SHORT_MEMBERS * self.members))
-        return replace(self, members=members, trials=trials, bands=(), margin=margin)
-
-    def limit_path(self, task: TuningTask, spec: Specification) -> None:
-        """No path: each set of limits needs a new search."""
-
-
-@dataclass(frozen=True, eq=False)
-class RacingResult:
-    """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best."""
-
-    point: Array
-    count: int
-    is_complete: bool
-    starts: int
-    agreeing: int
-
-
 class _Phase(NamedTuple):
     """A part of a search: what it reads, on which samples, and how many trials it may take."""
 
     name: str
     simulator: Simulator
     trials: int
-
-
-def run_racing(
-    task: TuningTask,
-    simulator: Simulator,
-    spec: Specification,
-    method: Racing,
-    start: Array,
-    progress: ProgressCallback,
-) -> RacingResult:
-    """Search in phases from starts that differ in kind; Ctrl-C ends the search with the best point so far.
-
-    `spec` is tightened; `start` (n,) is a member of the first population, and a method without `bands` searches about
-    it.
-    """
-    rng, space = np.random.default_rng(method.seed), simulator.space
-    search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress)
-    try:
-        search.run(method)
-    except KeyboardInterrupt:
-        best = space.from_unit(search.best_so_far())
-        return RacingResult(best, search.count, False, search.starts, search.agreeing)
-    return RacingResult(space.from_unit(search.best), search.count, True, search.starts, search.agreeing)
 
 
 def _phases(simulator: Simulator, spec: Specification, method: Racing, share: float) -> Iterator[_Phase]:
