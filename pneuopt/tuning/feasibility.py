@@ -79,16 +79,16 @@ def _check_following(case: TuningCase, loop: ClosedLoop, spec: Specification) ->
         return
     shown, prefix = write_value(most, unit, 3), _case_prefix(case)
     size = write_value(abs(reference.size), unit, 3)
-    told = (
+    message = (
         f"{prefix}FollowingError: max {shown} is less than the step of {size}, its error at once; follow a move instead"
     )
-    require(not isinstance(reference, Step) or most >= abs(reference.size), told)
+    require(not isinstance(reference, Step) or most >= abs(reference.size), message)
     asked = min(spec.limit(SettlingTime), reference.horizon - reference.at)
     left = float(abs(reference.final - reference.values(np.array([reference.at + asked]))[0]))
     half = band_share(spec.band, reference) * abs(reference.nominal_size)
-    told = f"{prefix}SettlingTime: max {asked:g} s comes when the reference still lacks {write_value(left, unit, 3)}"
+    message = f"{prefix}SettlingTime: max {asked:g} s comes when the reference still lacks {write_value(left, unit, 3)}"
     room = f"more than the band and FollowingError's max {shown}; raise one of them, or speed and acceleration"
-    require(left <= half + most, f"{told}, {room}")
+    require(left <= half + most, f"{message}, {room}")
 
 
 def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
@@ -113,8 +113,8 @@ def _check_counts(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specif
     dithered = max(abs(v) for v in _parameter_range(space, DITHER_AMPLITUDE)) > 0
     if dithered or sees_speed(loop) or not spec.concerns(SettlingTime):
         return
-    told = describe_counts(loop, case.case_parameters(space.parameters), case.reference, spec.band)
-    require(told is None, f"{_case_prefix(case)}{told}")
+    message = describe_counts(loop, case.case_parameters(space.parameters), case.reference, spec.band)
+    require(message is None, f"{_case_prefix(case)}{message}")
 
 
 def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
@@ -208,9 +208,9 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Spe
     ranges = {n: _parameter_range(space, n) for n in SIGNED_GAINS if any(_parameter_range(space, n))}
     words = ", ".join(f"{n} {f'within [{a:g}, {b:g}]' if a < b else f'= {a:g}'}" for n, (a, b) in ranges.items())
     end = write_value(case.reference.final, loop.feedback.unit, 3)
-    told = f"every gain allowed makes the loop unstable: {words}; linearised at {end}, where the reference ends, "
+    message = f"every gain allowed makes the loop unstable: {words}; linearised at {end}, where the reference ends, "
     remedy = ", or ".join(remedies) or "neither turned signs nor gains ten times as large hold it"
-    require(False, f"{told}a deviation grows e-fold in {1 / growth:.2g} s or less; {remedy}")
+    require(False, f"{message}a deviation grows e-fold in {1 / growth:.2g} s or less; {remedy}")
 
 
 def _shapes_linear_loop(loop: ClosedLoop, n: str) -> bool:

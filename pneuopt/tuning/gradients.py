@@ -115,8 +115,6 @@ class Polish:
 # Free parameters that no gradient serves: the averaging time moves with the frequency, and a clip that no response
 # meets has derivative zero.
 NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
-
-
 QUANTISER_PARAMETERS = ("sensor.resolution",)  # an encoder's: its counts make responses piecewise flat
 
 
@@ -369,8 +367,6 @@ def _qp_solver(n: int, m: int) -> Any:
 
 
 ROW_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.slope is not None)
-
-
 SMOOTH_REQUIREMENTS: tuple[type[Requirement], ...] = (SettlingTime, *ROW_REQUIREMENTS, *ROBUSTNESS_REQUIREMENTS)
 """Requirements of which there are derivatives to the gains."""
 

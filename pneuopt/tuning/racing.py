@@ -65,12 +65,12 @@ from pneuopt.tuning.tolerances import (
     MIN_DISTANCE,
     NEARBY,
     NO_DITHER,
-    PATIENCE,
     POLISHED,
     POLISHED_NEARBY,
     RUNAWAY_LEVEL,
     SHORT_MEMBERS,
     SIMULATION_PEAK_MARGIN,
+    STALLED_GENERATIONS,
     START_SHARES,
     VIOLATION_PENALTY,
     WORST_MERIT,
@@ -631,7 +631,8 @@ def _distinct_points(unit: Array) -> Indices:
 
 def _is_done(stand: Sequence[tuple[float, float]], merits: Array) -> bool:
     """Whether a population no longer advances: its best and its median stand still, or all its members are alike."""
-    stands = len(stand) > PATIENCE and all(
-        now > before * (1 - LEAST_IMPROVEMENT) for now, before in zip(stand[-1], stand[-1 - PATIENCE], strict=True)
+    stands = len(stand) > STALLED_GENERATIONS and all(
+        now > before * (1 - LEAST_IMPROVEMENT)
+        for now, before in zip(stand[-1], stand[-1 - STALLED_GENERATIONS], strict=True)
     )
     return stands or bool(np.ptp(merits) <= LEAST_SPREAD * abs(merits.min()))

@@ -431,7 +431,11 @@ class Simulator:
             len(rows), max(len(grid.t) for grid in self.grids), starts.shape[1], self.response_metrics
         )
         for chunk in self._chunks(case):
-            self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
+            u, t, h, steps = self.pad(case[chunk])
+            with np.errstate(all="ignore"):
+                found = self.rollout.run(starts[chunk], u, p[chunk], t, h, substeps=steps, states=KEPT_STATES)
+            assert found.x is not None
+            self._read(measured, chunk, case[chunk], p[chunk], (found.x, found.y, found.x_end), band)
         return Responses(wanted, p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
     def values(self, points: Array, spec: Specification) -> dict[str, Array]:
@@ -502,22 +506,12 @@ class Simulator:
 
     def _chunks(self, case: Indices) -> Iterator[Indices]:
         """Indices of lanes that run together: all at once if they are few, otherwise those on the same grid."""
-        if len(case) <= MAX_MIXED_LANES:
+        if 0 < len(case) <= MAX_MIXED_LANES:
             yield np.arange(len(case))
             return
-        for g in range(len(self.grids)):
+        for g in np.unique(self._grid_index[case]).tolist():
             own = np.flatnonzero(self._grid_index[case] == g)
             yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
-
-    def _measure(self, out: LaneMetrics, chunk: Indices, case: Indices, starts: Array, p: Array, band: Band) -> None:
-        """Simulate the lanes `chunk` and fill their rows of `out`."""
-        if not len(chunk):
-            return
-        u, t, h, steps = self.pad(case)
-        with np.errstate(all="ignore"):
-            found = self.rollout.run(starts, u, p, t, h, substeps=steps, states=KEPT_STATES)
-        assert found.x is not None
-        self._read(out, chunk, case, p, (found.x, found.y, found.x_end), band)
 
     def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: Band) -> Responses:
         """The responses of candidates on every case that ran elsewhere; `shape` is (m, n_cases).

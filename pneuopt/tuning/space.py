@@ -179,8 +179,8 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
             n.partition(".")[0] in loop.tunable_sections,
             f"{n} is free, but tune changes the controller and the dither only; use parameters.fixed({n!r})",
         )
-        told = f"{n} is free, but it says what a machine does in a fault; use parameters.fixed({n!r})"
-        require(n.removeprefix("pid.") not in loop.pid.fixed_parameters, told)
+        message = f"{n} is free, but it says what a machine does in a fault; use parameters.fixed({n!r})"
+        require(n.removeprefix("pid.") not in loop.pid.fixed_parameters, message)
         p = full[n]
         require(
             bool(np.isfinite([p.lower, p.upper]).all()) and p.lower < p.upper,

@@ -278,9 +278,9 @@ def _warn_of_swing(task: TuningTask) -> None:
     """Warn, in the name of the caller's caller, of a dither that moves the signal out of its settling band."""
     if not task.spec.concerns(SettlingTime):
         return
-    told = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
-    if told is not None:
-        warnings.warn(told, PhysicsWarning, stacklevel=3)
+    message = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
+    if message is not None:
+        warnings.warn(message, PhysicsWarning, stacklevel=3)
 
 
 def _search(task: TuningTask, method: Method | None, progress: ProgressCallback) -> tuple[Search, TuningResult, bool]:
@@ -327,12 +327,12 @@ def _try_on_plants(
 def check_rig(rig: Rig | None, task: TuningTask) -> None:
     """Refuse a rig that is not one of this loop, and a limit that only a rig shows without one, by an `InputError`."""
     if rig is None:
-        told = "NoHunting is read on the event-accurate model of the rig, which sticks; give rig=, or --rig rig.toml"
-        require(task.spec.rest is None, told)
+        message = "NoHunting is read on the event-accurate model of the rig, which sticks; give rig=, or --rig rig.toml"
+        require(task.spec.rest is None, message)
         return
     compares = task.spec.rest is not None and np.isfinite(task.spec.rest.repeatability)
-    told = "NoHunting: repeatability is a range over references, and there is one; give more, from several starts"
-    require(not compares or len(task.references) > 1, told)
+    message = "NoHunting: repeatability is a range over references, and there is one; give more, from several starts"
+    require(not compares or len(task.references) > 1, message)
     require(rig.loop is not None, "the rig has no controller; make it of the loop, Rig(ClosedLoop(...), sensors)")
     signals = [(own.feedback.name, own.command.name, own.pid) for own in (rig.loop, task.loop) if own is not None]
     message = f"the rig's loop controls {signals[0][:2]}, the loop to be tuned {signals[-1][:2]}, or with another PID"
@@ -373,8 +373,8 @@ def _watch_rest(
         breaks = (f"on the rig its errors at rest range over {reached}, the limit of repeatability is {limit}",)
     if breaks:
         return replace(_reject(task, result, result.on_rig, breaks), rest=rest)
-    told = f"on the rig it comes to rest, watched for {wanted.duration:g} s"
-    return replace(result, rest=rest, status=result.status.with_details(told))
+    message = f"on the rig it comes to rest, watched for {wanted.duration:g} s"
+    return replace(result, rest=rest, status=result.status.with_details(message))
 
 
 def _breaks(task: TuningTask, found: "pd.DataFrame") -> Iterator[str]:

@@ -495,26 +495,17 @@ def _sensitivity_limit(
     """The limit on the sensitivity's peak: Ms^2 |1 + L|^2 >= 1 at every frequency of a grid."""
     if not spec.concerns(MaxSensitivity):
         return []
-    grid = np.unique(
-        np.concatenate(
-            [
-                _sensitivity_frequencies(loop, averaged, space.from_unit(np.full(len(space.names), k)), space)
-                for k in (0.2, 0.8)
-            ]
-        )
-    )
+    own, frequencies = Space(averaged, space.names), list[Array]()
+    for share in (0.2, 0.8):  # around the loop's modes, where the sensitivity peaks [rad/s]
+        point = space.from_unit(np.full(len(space.names), share))
+        full = frequency_grid(open_loop(loop, own.parameters_at(point)), 40)
+        frequencies.append(full[(full > 30 * full[0]) & (full < full[-1] / 30)])
+    grid = np.unique(np.concatenate(frequencies))
     terms = sensitivity_terms(loop, grid, averaged)
     q = ca.SX.sym("q", len(parameters))
     Ms = q[list(parameters).index("MaxSensitivity")]
     value = terms(q[: len(loop.parameters)]) * Ms**2
     return [Limit("MaxSensitivity", ca.Function("limit", [q], [value]), 1.0, math.inf, Where.PARAMETERS)]
-
-
-def _sensitivity_frequencies(loop: ClosedLoop, averaged: ParameterSet, point: Array, space: Space) -> Array:
-    """Frequencies around the loop's modes, where the sensitivity peaks [rad/s]."""
-    own = Space(averaged, space.names).parameters_at(point)
-    full = frequency_grid(open_loop(loop, own), 40)
-    return np.asarray(full[(full > 30 * full[0]) & (full < full[-1] / 30)], dtype=float)
 
 
 def _costs(spec: Specification, parameters: ParameterSet) -> tuple[Cost, ...]:
