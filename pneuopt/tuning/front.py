@@ -327,7 +327,11 @@ class Front:
                 0.0,
             )
             result = _check_interruption(search.run(start))
-        kept = old.result if old.result is not None and not self._is_better(result, old.result) else result
+        before, kept = old.result, result
+        if before is not None and not result.status.converged:
+            kept = before
+        elif before is not None and before.status.converged:
+            kept = min((before, result), key=lambda each: _result_value(each, self.first))
         seconds, solver_seconds = old.seconds + time.perf_counter() - begun, old.solver_seconds + spent
         self.designs[k] = replace(old, result=kept, seconds=seconds, solver_seconds=solver_seconds)
         self.base_search.progress(
@@ -344,12 +348,6 @@ class Front:
                 break
         assert result is not None
         return result, spent
-
-    def _is_better(self, one: TuningResult, other: TuningResult) -> bool:
-        """Whether a result is certified and the other is not, or is smaller by the first requirement."""
-        if not one.status.converged or not other.status.converged:
-            return one.status.converged
-        return _result_value(one, self.first) < _result_value(other, self.first)
 
     def _rival(self, k: int) -> Array | None:
         """The gains of another design or sampled point that beats design k within its limit; None if there is none."""

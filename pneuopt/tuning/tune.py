@@ -382,7 +382,9 @@ def _breaks(task: TuningTask, found: "pd.DataFrame") -> Iterator[str]:
     rows = found.to_dict()
     never = [str(case) for case, row in rows.items() if not np.isfinite(row["SettlingTime"])]
     if never:
-        yield f"on the rig it never settles at {' and '.join(never)}{_hunting(rows[never[0]], task)}"
+        size, rate = (rows[never[0]][f"LimitCycle{n}"] for n in ("Amplitude", "Frequency"))
+        hunts = f": it hunts by +-{size:.3g} {task.loop.feedback.unit} at {rate:.3g} Hz" if size > 0 else ""
+        yield f"on the rig it never settles at {' and '.join(never)}{hunts}"
     for q in task.spec.limits:
         values = _requirement_rows(metric_name(q), found)
         worst = max(values, key=lambda case: values[case], default="")
@@ -419,14 +421,6 @@ def _shown(requirement: Requirement, value: float, task: TuningTask) -> str:
     """A value with its unit, in percent where tables have percent."""
     unit = requirement.metric.shown_unit(task.loop.command.unit, task.loop.feedback.unit)
     return f"{requirement.metric.factor * user_value(requirement, value):.3g} {unit}".strip()
-
-
-def _hunting(row: dict[str, float], task: TuningTask) -> str:
-    """The limit cycle in words; empty where there is none."""
-    if not row["LimitCycleAmplitude"] > 0:
-        return ""
-    unit = task.loop.feedback.unit
-    return f": it hunts by +-{row['LimitCycleAmplitude']:.3g} {unit} at {row['LimitCycleFrequency']:.3g} Hz"
 
 
 def _reject(

@@ -9,7 +9,6 @@ step at the command. `transcribe_two_phase` writes that problem.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import ClassVar
 
 import casadi as ca
@@ -208,7 +207,12 @@ def _solve_stable(task: TuningTask, tightened: TuningTask, method: TwoPhase, pro
     """
     loop, references, space, spec = tightened.loop, tightened.references, tightened.space, tightened.spec
     plain = _without_stability(task, spec)
-    is_allowed = partial(_is_stable, loop, math.inf if plain is spec else spec.limit(MaxSensitivity))
+    free_loop, most = without_clip(loop), math.inf if plain is spec else spec.limit(MaxSensitivity)
+
+    def is_allowed(solution: Solution) -> bool:
+        found = margins(open_loop(free_loop, solution.parameters.select(free_loop.parameters)))
+        return found.stable and found.max_sensitivity <= most
+
     optima = solve_two_phase(loop, references, space, plain, method, progress, is_allowed)
     if plain is spec or optima.agreement.converged:
         return optima
@@ -218,13 +222,6 @@ def _solve_stable(task: TuningTask, tightened: TuningTask, method: TwoPhase, pro
 def _without_stability(task: TuningTask, spec: Specification) -> Specification:
     """The specification without a limit on the sensitivity that nobody asked for."""
     return spec if task.spec.concerns(MaxSensitivity) else spec.without(MaxSensitivity)
-
-
-def _is_stable(loop: ClosedLoop, most: float, solution: Solution) -> bool:
-    """Whether the loop with a solution's gains is stable, its sensitivity not above `most`."""
-    free_loop = without_clip(loop)
-    found = margins(open_loop(free_loop, solution.parameters.select(free_loop.parameters)))
-    return found.stable and found.max_sensitivity <= most
 
 
 def solve_two_phase(
@@ -328,7 +325,13 @@ def transcribe_two_phase(
         *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)),
         *_sensitivity_limit(free_loop, averaged, space, spec, parameters),
     ]
-    return Transcription(system, parameters, tuple(phases), (), _costs(spec, parameters), tuple(limits))
+    q, weights = ca.SX.sym("q", len(parameters)), {k.metric.name: spec.weight(k) for k in REQUIREMENT_KINDS}
+    costs = tuple(  # of the unknowns that stand for the objective's terms
+        Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
+        for n, weight in weights.items()
+        if METRICS[n].exact and weight > 0
+    )
+    return Transcription(system, parameters, tuple(phases), (), costs, tuple(limits))
 
 
 def without_clip(loop: ClosedLoop) -> ClosedLoop:
@@ -506,14 +509,3 @@ def _sensitivity_limit(
     Ms = q[list(parameters).index("MaxSensitivity")]
     value = terms(q[: len(loop.parameters)]) * Ms**2
     return [Limit("MaxSensitivity", ca.Function("limit", [q], [value]), 1.0, math.inf, Where.PARAMETERS)]
-
-
-def _costs(spec: Specification, parameters: ParameterSet) -> tuple[Cost, ...]:
-    """The objective: a weighted sum of the unknowns that stand for its terms."""
-    q = ca.SX.sym("q", len(parameters))
-    terms = {kind.metric.name: spec.weight(kind) for kind in REQUIREMENT_KINDS if kind.metric.exact}
-    return tuple(
-        Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
-        for n, weight in terms.items()
-        if weight > 0
-    )
