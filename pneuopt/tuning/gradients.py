@@ -516,11 +516,13 @@ class LinearisedProblem:
                 )
                 for k in range(0, len(rows), MAX_SENSITIVITY_LANES)
             ]
-            whole = _concatenate_responses(parts)
+            error, by_gain = (np.concatenate(rows) for rows in zip(*((r.error, r.by_gain) for r in parts), strict=True))
+            values = {k: np.concatenate([r.values[k] for r in parts]) for k in parts[0].values}
+            slopes = {k: np.concatenate([r.derivatives[k] for r in parts]) for k in values}
             for i in range(len(points)):
                 lanes = slice(i * len(own), (i + 1) * len(own))
-                values, slopes = ({k: v[lanes] for k, v in d.items()} for d in (whole.values, whole.derivatives))
-                found[i].append(LinearisedResponse(whole.error[lanes], whole.by_gain[lanes], values, slopes))
+                tables = ({k: v[lanes] for k, v in every.items()} for every in (values, slopes))
+                found[i].append(LinearisedResponse(error[lanes], by_gain[lanes], *tables))
         return found
 
     def _simulate_lanes(self, g: int, points: Array, rows: Indices, case: Indices) -> LinearisedResponse:
@@ -649,19 +651,6 @@ def _band_entry_times(t: Array, size: Array, band: float) -> Array:
         share = np.where(~inside[:, :-1] & inside[:, 1:], (before - band) / (before - after), 0.0)
     entered = np.where(inside[:, :-1], t[:-1], t[:-1] + share * np.diff(t))
     return np.asarray(np.append(t[0], entered.max(axis=0)))
-
-
-def _concatenate_responses(parts: Sequence[LinearisedResponse]) -> LinearisedResponse:
-    """Join the lanes of several responses."""
-    if len(parts) == 1:
-        return parts[0]
-    kinds = parts[0].values
-    return LinearisedResponse(
-        np.concatenate([r.error for r in parts]),
-        np.concatenate([r.by_gain for r in parts]),
-        {k: np.concatenate([r.values[k] for r in parts]) for k in kinds},
-        {k: np.concatenate([r.derivatives[k] for r in parts]) for k in kinds},
-    )
 
 
 @dataclass(frozen=True, eq=False)

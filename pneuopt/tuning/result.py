@@ -232,14 +232,12 @@ def report_tuning(
     `was` are the metrics with the gains before, `source` names the gains that stand where it failed, empty where
     nothing was sought.
     """
-    head = report_status(result.status) if source else report_certificate_status(result.status)
-    return head + (_report_design(result, was) if result.status.converged else report_refusal(result, source))
-
-
-def _report_design(result: TuningResult, was: "pd.DataFrame | None") -> Report:
+    found = report_status(result.status) if source else report_certificate_status(result.status)
+    if not result.status.converged:
+        return found + report_refusal(result, source)
     tried, certificate = result.validation, result.certificate
     beside = ("was", was) if result.on_rig is None else ("on rig", result.on_rig)
-    found = report_validation_verdict(tried) if tried else Report()
+    found += report_validation_verdict(tried) if tried else Report()
     found += report_gains(result.given, result.parameters)
     found += report_metrics(result.certified, result.units, beside=beside, limits=result.limits)
     found += report_active(result.requirements, result.active, result.parameters)

@@ -189,7 +189,12 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
         )
         require(n not in divisors or p.lower > 0, f"{n}: its lower bound must be positive, got {p.lower:g} {p.unit}")
         if n == "dither.amplitude":
-            _check_amplitude(loop, full)
+            low, high, whose = command_range(loop, full)
+            message = (
+                f"dither.amplitude may reach {p.upper:g} {p.unit}, but {whose} ends at {low:g} and {high:g} {p.unit}"
+            )
+            peaks = f"which cuts the peaks of more than {(high - low) / 2:g} {p.unit}; lower its upper bound"
+            require(2 * p.upper <= high - low, f"{message}, {peaks}")
         require(
             not p.log or p.lower > 0, f"{n}: a log parameter needs a positive lower bound, got {p.lower:g} {p.unit}"
         )
@@ -204,17 +209,6 @@ def whole_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
 def clip_level(loop: ClosedLoop, p: ParameterSet) -> float:
     """The largest size of a command that the controller's own limits let through [its unit]; inf without limits."""
     return max(abs(p.value("pid.lower")), abs(p.value("pid.upper"))) if loop.pid.limits else float("inf")
-
-
-def _check_amplitude(loop: ClosedLoop, p: ParameterSet) -> None:
-    """Refuse an amplitude's bound with which dither alone, around any offset, exceeds the command's range."""
-    (low, high, whose), most = command_range(loop, p), p["dither.amplitude"].upper
-    unit = p["dither.amplitude"].unit
-    require(
-        2 * most <= high - low,
-        f"dither.amplitude may reach {most:g} {unit}, but {whose} ends at {low:g} and {high:g} {unit}, which cuts the "
-        f"peaks of more than {(high - low) / 2:g} {unit}; lower its upper bound",
-    )
 
 
 def dither_resolution_rate(loop: ClosedLoop, parameters: ParameterSet) -> float:
@@ -412,23 +406,18 @@ def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
     y = rates(t, z)[1]
     after = rk4(lambda at, z: rates(at, z)[0], t, h, z)
     step = ca.Function("step", [t, h, z, u, p], [after, y], {"cse": True})
-    update = discrete.update and ca.Function(
-        "update", [t, z, u, p], [ca.vertcat(_update_at_sample(loop, t, x, u, p), total)]
-    )
+    update = None
+    if loop.pid.sample_time is not None:  # the controller acts where the instant t is one of its samples
+        near = 0.25 / MAX_READINGS_A_SAMPLE
+        acts = ca.fmod(t / loop.pid.sample_time + near, 1.0) < 2 * near
+        updated = ca.if_else(acts, loop.update(t, x, u, p), x)
+        update = ca.Function("update", [t, z, u, p], [ca.vertcat(updated, total)])
     return Pieces(step, update, ca.Function("ode", [t, z, u, p], [rates(t, z)[0], y]))
 
 
 def speed_output(loop: ClosedLoop, channels: Sequence[str]) -> int | None:
     """Index of the axis's speed among the outputs of `loop_pieces`; None without an axis."""
     return None if loop.plant.axis is None else METER_OUTPUT + len(channels)
-
-
-def _update_at_sample(loop: ClosedLoop, t: ca.SX, x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
-    """The state after the controller's update, if the instant t is one of its samples; otherwise the state itself."""
-    h = loop.pid.sample_time
-    assert h is not None
-    near = 0.25 / MAX_READINGS_A_SAMPLE
-    return ca.if_else(ca.fmod(t / h + near, 1.0) < 2 * near, loop.update(t, x, u, p), x)
 
 
 def has_integral(loop: ClosedLoop) -> bool:

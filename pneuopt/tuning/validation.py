@@ -206,19 +206,13 @@ def report_validation(found: DesignValidation) -> Report:
     figures_heads = number_columns("median", "95 %", "worst", "limit", "broken by")
     table = Table((*text_columns("new plants"), *figures_heads, *text_columns("unit")), tuple(rows))
     lead = Line(f"tried on {found.count} plants that no search has seen, each off by")
-    suggestion = f"to do so, add to the tuning's file: {'; '.join(_scenario_lines(found.suggested))}"
+    lines = list[str]()  # [scenarios.corners] "load.mass" = "5 %"
+    for kind, is_gain in (("corners", False), ("tolerances", True)):
+        keys = [f'"{n}" = "{100 * a.share:.2g} %"' for a in found.suggested if a.is_gain is is_gain for n in a.names]
+        lines += [f"[scenarios.{kind}] {', '.join(keys)}"] if keys else []
+    suggestion = f"to do so, add to the tuning's file: {'; '.join(lines)}"
     advice = (*found.advice, *([suggestion] if found.suggested else []))
     return Report((lead, *(Line(text, indent=2) for text in found.varied), table, *map(Line, advice)))
-
-
-def _scenario_lines(axes: Sequence[CorrelatedParameters]) -> list[str]:
-    """What to write under [scenarios] to tune over these: [scenarios.corners] "load.mass" = "5 %"."""
-    kinds = {"corners": [a for a in axes if not a.is_gain], "tolerances": [a for a in axes if a.is_gain]}
-    return [
-        f"[scenarios.{kind}] " + ", ".join(f'"{n}" = "{100 * a.share:.2g} %"' for a in own for n in a.names)
-        for kind, own in kinds.items()
-        if own
-    ]
 
 
 def _simulate_plants(
