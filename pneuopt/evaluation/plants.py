@@ -167,7 +167,7 @@ GAIN_PREFIXES = ("pid.", "feedforward.")
 
 
 @dataclass(frozen=True, eq=False)
-class PlantAxis:
+class CorrelatedParameters:
     """Parameters that vary together from plant to plant, on their own.
 
     Attributes
@@ -201,7 +201,7 @@ class ExpectedPlants(Shown):
     ----------
     scenarios : mapping of str to mapping
         "plant 1" and so on.
-    axes : tuple of PlantAxis
+    axes : tuple of CorrelatedParameters
         What varies, without the parameters of the scenarios that a tuning knows already.
     from_fit : tuple of str
         Parameters that are drawn from a fit's covariance, or from its ranges.
@@ -210,7 +210,7 @@ class ExpectedPlants(Shown):
     """
 
     scenarios: Scenarios
-    axes: tuple[PlantAxis, ...]
+    axes: tuple[CorrelatedParameters, ...]
     from_fit: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
 
@@ -307,21 +307,21 @@ def _usual_tolerances(parameters: ParameterSet, others: Collection[str]) -> dict
     return found
 
 
-def _tolerance_axis(names: AxisNames, share: float) -> PlantAxis:
+def _tolerance_axis(names: AxisNames, share: float) -> CorrelatedParameters:
     low, high = ({n: Factor(1 + side * share) for n in names} for side in (-1, 1))
-    return PlantAxis(tuple(names), share, low, high, names[0].startswith(GAIN_PREFIXES))
+    return CorrelatedParameters(tuple(names), share, low, high, names[0].startswith(GAIN_PREFIXES))
 
 
-def _range_axis(parameters: ParameterSet, name: str, low: float, high: float) -> PlantAxis:
+def _range_axis(parameters: ParameterSet, name: str, low: float, high: float) -> CorrelatedParameters:
     value = abs(parameters.value(name))
-    return PlantAxis((name,), (high - low) / 2 / value if value else 0.0, {name: low}, {name: high})
+    return CorrelatedParameters((name,), (high - low) / 2 / value if value else 0.0, {name: low}, {name: high})
 
 
-def _estimate_axis(parameters: ParameterSet, name: str, deviation: float, dof: float) -> PlantAxis:
+def _estimate_axis(parameters: ParameterSet, name: str, deviation: float, dof: float) -> CorrelatedParameters:
     """An estimate with the interval that its standard deviation leaves, within its bounds."""
     from scipy.stats import t
 
     p, width = parameters[name], float(t.ppf((1 + FIT_SHARE) / 2, dof)) * deviation
     ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
     low, high = (float(min(max(end, p.lower), p.upper)) for end in ends)
-    return PlantAxis((name,), width / abs(p.value) if p.value else 0.0, {name: low}, {name: high})
+    return CorrelatedParameters((name,), width / abs(p.value) if p.value else 0.0, {name: low}, {name: high})

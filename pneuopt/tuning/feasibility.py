@@ -41,25 +41,12 @@ SIGNED_GAINS = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")  # which turn with the ac
 
 
 def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Space, spec: Specification) -> None:
-    """Refuse a tuning that no gains within the bounds can make feasible.
+    """Refuse a tuning that no gains within the bounds can make feasible, by an `InputError` with figure and remedy.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-    cases : sequence of TuningCase
-        The nominal plant's cases first.
-    space : Space
-    spec : Specification
-
-    Raises
-    ------
-    InputError
-        If a limit lies beyond the horizon, settling and following error contradict each other, the dither cannot be
-        sampled, the settling band is below half a count of an encoder, the stroke is too short for a reference or the
-        drive too weak for a move, no command holds it, or none that the limits allow, or all gains allowed make the
-        loop unstable.
+    The nominal plant's cases come first.
     """
-    _check_dither(loop, space)
+    if loop.dither is not None:
+        loop.dither.check(highest_dither_frequency(loop, space.parameters), loop.pid.sample_time)
     for case in cases:
         _check_horizon(case.reference, spec)
         _check_following(case, loop, spec)
@@ -70,12 +57,6 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
         check_motion(loop, case, space.parameters)
         _check_hold(loop, case, space, spec)
     _check_stability(loop, cases[0], space, spec)
-
-
-def _check_dither(loop: ClosedLoop, space: Space) -> None:
-    """Check that the controller's samples resolve the dither's highest frequency."""
-    if loop.dither is not None:
-        loop.dither.check(highest_dither_frequency(loop, space.parameters), loop.pid.sample_time)
 
 
 def _check_horizon(reference: Reference, spec: Specification) -> None:
@@ -98,16 +79,16 @@ def _check_following(case: TuningCase, loop: ClosedLoop, spec: Specification) ->
         return
     shown, prefix = write_value(most, unit, 3), _case_prefix(case)
     size = write_value(abs(reference.size), unit, 3)
-    told = (
+    message = (
         f"{prefix}FollowingError: max {shown} is less than the step of {size}, its error at once; follow a move instead"
     )
-    require(not isinstance(reference, Step) or most >= abs(reference.size), told)
+    require(not isinstance(reference, Step) or most >= abs(reference.size), message)
     asked = min(spec.limit(SettlingTime), reference.horizon - reference.at)
     left = float(abs(reference.final - reference.values(np.array([reference.at + asked]))[0]))
     half = band_share(spec.band, reference) * abs(reference.nominal_size)
-    told = f"{prefix}SettlingTime: max {asked:g} s comes when the reference still lacks {write_value(left, unit, 3)}"
+    message = f"{prefix}SettlingTime: max {asked:g} s comes when the reference still lacks {write_value(left, unit, 3)}"
     room = f"more than the band and FollowingError's max {shown}; raise one of them, or speed and acceleration"
-    require(left <= half + most, f"{told}, {room}")
+    require(left <= half + most, f"{message}, {room}")
 
 
 def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
@@ -132,8 +113,8 @@ def _check_counts(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specif
     dithered = max(abs(v) for v in _parameter_range(space, DITHER_AMPLITUDE)) > 0
     if dithered or sees_speed(loop) or not spec.concerns(SettlingTime):
         return
-    told = describe_counts(loop, case.case_parameters(space.parameters), case.reference, spec.band)
-    require(told is None, f"{_case_prefix(case)}{told}")
+    message = describe_counts(loop, case.case_parameters(space.parameters), case.reference, spec.band)
+    require(message is None, f"{_case_prefix(case)}{message}")
 
 
 def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
@@ -145,7 +126,9 @@ def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specific
     def find_obstacle(share: float) -> str:
         """The reason why a part of the reference cannot be held; empty where it can."""
         try:
-            command = _holding_command(loop, case, space, share * target)
+            command = _find_operating_point(loop, case, space, share * target)[1]
+        except ConvergenceError:
+            command = 0.0  # no steady state is known
         except InputError as error:
             return str(error)
         return _describe_command_excess(loop, case, space, spec, command, share * target)
@@ -158,14 +141,6 @@ def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specific
             low, high = (low, middle) if find_obstacle(middle) else (middle, high)
         most_held = f"; the most that can be held is {low * target:.3g} {loop.feedback.unit}" if low else ""
         require(False, f"{_case_prefix(case)}{obstacle}{most_held}")
-
-
-def _holding_command(loop: ClosedLoop, case: TuningCase, space: Space, value: float) -> float:
-    """The command that holds the measured signal at a value; 0 where no steady state is known."""
-    try:
-        return _find_operating_point(loop, case, space, value)[1]
-    except ConvergenceError:
-        return 0.0
 
 
 def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, value: float) -> tuple[Array, float]:
@@ -188,7 +163,7 @@ def _describe_command_excess(
             return (
                 f"{takes}, the controller's limits are {low:g} and {high:g} {unit}; take a smaller step, or widen them"
             )
-    amplitude = _least_size(space, "dither.amplitude")
+    amplitude = _nearest_to_zero(*_parameter_range(space, "dither.amplitude"))
     if abs(command) + amplitude > spec.limit(PeakControl):
         beside = f" beside a dither of at least {amplitude:g} {unit}" if amplitude else ""
         most_allowed = f"PeakControl allows {spec.limit(PeakControl):g} {unit}"
@@ -199,14 +174,12 @@ def _describe_command_excess(
 def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
     """Check that the bounds allow gains that may stabilise the loop, linearised where the reference ends.
 
-    The closed loop's characteristic polynomial is positive for large s > 0, so it is negative where an odd number of
-    real poles lies beyond s. It is monotone in each gain of every form of a PID. Where it is negative at one s for all
-    corners of the gains' bounds, it is so for all gains within, and each of them has an unstable pole beyond s. Of a
-    sampled loop this holds for z = (1 + s h/2)/(1 - s h/2) > 1 (`ComposedLoops`). Points within the bounds count as
-    well, for what need not be monotone, such as a free dither.
-
-    A nonlinear loop may rest elsewhere where it may miss the reference. Its growth counts within the horizon, and a
-    slower one where other gains remove it: else it is a drift of the plant's own, such as a piston's position has.
+    The closed loop's characteristic polynomial is negative at a real s > 0 where an odd number of real poles lies
+    beyond s, and monotone in each gain of every form of a PID. Where it is negative at one s for all corners of the
+    gains' bounds, it is so for all gains within. Of a sampled loop this holds for z = (1 + s h/2)/(1 - s h/2) > 1
+    (`ComposedLoops`). Points within the bounds count as well, for a free dither need not act monotonically. A nonlinear
+    loop may rest elsewhere where it may miss the reference; its growth counts within the horizon, and a slower one
+    where other gains remove it, or it is a drift of the plant's own, as a piston's position has.
     """
     may_miss = spec.limit(SteadyStateError) < inf and not spec.concerns(SettlingTime)
     if may_miss and not is_affine(loop.plant):
@@ -235,9 +208,9 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Spe
     ranges = {n: _parameter_range(space, n) for n in SIGNED_GAINS if any(_parameter_range(space, n))}
     words = ", ".join(f"{n} {f'within [{a:g}, {b:g}]' if a < b else f'= {a:g}'}" for n, (a, b) in ranges.items())
     end = write_value(case.reference.final, loop.feedback.unit, 3)
-    told = f"every gain allowed makes the loop unstable: {words}; linearised at {end}, where the reference ends, "
+    message = f"every gain allowed makes the loop unstable: {words}; linearised at {end}, where the reference ends, "
     remedy = ", or ".join(remedies) or "neither turned signs nor gains ten times as large hold it"
-    require(False, f"{told}a deviation grows e-fold in {1 / growth:.2g} s or less; {remedy}")
+    require(False, f"{message}a deviation grows e-fold in {1 / growth:.2g} s or less; {remedy}")
 
 
 def _shapes_linear_loop(loop: ClosedLoop, n: str) -> bool:
@@ -269,11 +242,6 @@ def _parameter_range(space: Space, n: str) -> tuple[float, float]:
         return 0.0, 0.0
     p = space.parameters[n]
     return (p.lower, p.upper) if n in space.names else (p.value, p.value)
-
-
-def _least_size(space: Space, n: str) -> float:
-    """The least absolute value that a parameter may have."""
-    return _nearest_to_zero(*_parameter_range(space, n))
 
 
 def _nearest_to_zero(low: float, high: float) -> float:

@@ -1,11 +1,10 @@
-"""`Front`: the designs between two requirements, found by epsilon constraint.
+"""`pareto_front`: what one requirement costs in terms of another, as a table of certified designs.
 
 The first requirement is minimised under a row of limits on the second, between the design that is best by the first and
-the one that is best by the second; two full tunings find these ends. Each design is a start for both of its neighbours,
-so that the better of the two branches of local minima, one from either end, is kept. Where another design, or one of
-many points spread over the gains' box, is better within a design's limit, that design is searched for again from there.
-
-`pareto_front`: what one requirement costs in terms of another, as a table of certified designs.
+the one that is best by the second (epsilon constraint); two full tunings find these ends. Each design is a start for
+both of its neighbours, so that the better of the two branches of local minima, one from either end, is kept. Where
+another design, or one of many points spread over the gains' box, is better within a design's limit, that design is
+searched for again from there.
 """
 
 import time
@@ -44,9 +43,9 @@ from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, end_point
 from pneuopt.tuning.simulator import to_records
 from pneuopt.tuning.tolerances import (
+    LEAST_IMPROVEMENT,
     LOG_SPACING_RATIO,
     MAX_IMPROVEMENT_ROUNDS,
-    MIN_IMPROVEMENT,
     RIVAL_SAMPLES,
     SECONDARY_WEIGHT,
 )
@@ -54,342 +53,6 @@ from pneuopt.tuning.tune import prepare_search, prepare_task
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-@dataclass(frozen=True, eq=False)
-class Design:
-    """One point of a front.
-
-    Attributes
-    ----------
-    limit : float
-        On the second requirement, as `Specification.limit` counts.
-    result : TuningResult or None
-        None: not yet searched for.
-    seconds, solver_seconds : float
-        Time spent on it, and in the solver [s].
-    """
-
-    limit: float
-    result: TuningResult | None = None
-    seconds: float = 0.0
-    solver_seconds: float = 0.0
-
-
-@dataclass(eq=False)
-class Front:
-    """The designs of a front while they are searched for.
-
-    Parameters
-    ----------
-    base_search : Search
-        For both requirements at once; each design's search is made from it.
-    first, second : Requirement
-        The one that is minimised, and the one whose limit moves along the front.
-    last : float or None
-        The limit on the second with which the front ends, as `upper_limit` counts; None: the best that it can be.
-    designs : list of Design
-        From the best by the first to the best by the second.
-    """
-
-    base_search: Search
-    first: Requirement
-    second: Requirement
-    last: float | None
-    designs: list[Design] = field(default_factory=list)
-
-    def find_designs(self, points: int) -> None:
-        """Find all designs; repeat with new ends where a design between them is better than an end."""
-        self.designs = [Design(nan)] * points
-        for k, q in ((0, self.first), (-1, self.second)):
-            self.designs[k] = self._find_end(q)
-        ends = [self.designs[0], self.designs[-1]]
-        for _ in range(MAX_IMPROVEMENT_ROUNDS):
-            done = self.designs
-            try:
-                self._fill_between(ends, points)
-            except KeyboardInterrupt:
-                self.designs = max((self.designs, done), key=_count_successes)
-                raise
-            better = [self._best(self.first), self._best(self.second)]
-            if better == ends or len(self.designs) == 1:
-                break
-            pairs = zip((self.first, self.second), ends, better, strict=True)
-            ends = [old if old is new else self._find_end(q, new.result) for q, old, new in pairs]
-
-    def _best(self, requirement: Requirement) -> Design:
-        """The best design by one requirement; an end unless another is clearly better."""
-        end = self.designs[0 if requirement is self.first else -1]
-        if requirement is self.second and self.last is not None:
-            return end
-        good = [d for d in self.designs if d.result is not None and d.result.status.converged]
-        best = min(good, key=lambda d: _result_value(_result_of(d), requirement))
-        return (
-            best
-            if _result_value(_result_of(best), requirement)
-            < _result_value(_result_of(end), requirement) * (1 - MIN_IMPROVEMENT)
-            else end
-        )
-
-    def _fill_between(self, ends: list[Design], points: int) -> None:
-        """Find the designs between two ends."""
-        high, low = ends[0].limit, ends[1].limit
-        if high <= low * (1 + MIN_IMPROVEMENT):
-            self.designs = ends[:1]
-            return
-        self.designs = [ends[0], *(Design(limit) for limit in _limit_grid(high, low, points)[1:-1]), ends[1]]
-        if points > 2 and self._path is not None:
-            self._follow(self._path)
-        else:
-            for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
-                self._improve(k, self._gains(start))
-        for _ in range(MAX_IMPROVEMENT_ROUNDS):
-            for k in range(1, points - 1):
-                better = self._rival(k)
-                if better is not None:
-                    self._improve(k, better)
-
-    def to_frame(self) -> "pd.DataFrame":
-        """The table of the designs found so far; see `pareto_front`."""
-        import pandas as pd
-
-        return pd.DataFrame([self._row(design) for design in self.designs])
-
-    def _find_end(self, requirement: Requirement, start: TuningResult | None = None) -> Design:
-        """Find the design that is best by one requirement; among equals the one that is best by the other."""
-        begun, pair = time.perf_counter(), (self.first, self.second)
-        weights = {q: self._weight(q) * (1.0 if q is requirement else SECONDARY_WEIGHT) for q in pair}
-        spec = replace(
-            self.base_search.spec,
-            weights=weights,
-            limits=limits_with_settling(self.base_search.spec, self.base_search.task.references),
-        )
-        held = requirement is self.second and self.last is not None
-        if self.last is not None and held:
-            spec = self._constrain_second(self.last)
-        method, point = self.base_search.method, None
-        if start is not None:  # a search over wide bands would lose it
-            method, point = method.shorten(method.margin), end_point(start, self.base_search.space)
-        result = _check_interruption(self.base_search.with_specification(spec, method).run(point))
-        if not result.status.converged:
-            which = "at its last limit" if held else "as good as the limits allow"
-            raise ConvergenceError(f"no front: its end, {metric_name(requirement)} {which}, is {result.status}", result)
-        limit = self.last if self.last is not None and held else _result_value(result, self.second)
-        return Design(limit, result, time.perf_counter() - begun)
-
-    def _weight(self, requirement: Requirement) -> float:
-        """The weight that scales a requirement to the size of the horizon, as the searches' penalties are."""
-        horizon = min(r.horizon - r.at for r in self.base_search.task.references)
-        return (
-            horizon / self._requirement_scales[metric_name(requirement)]
-            if self._requirement_scales[metric_name(requirement)]
-            else 1.0
-        )
-
-    @cached_property
-    def _requirement_scales(self) -> dict[str, float]:
-        """The requirements' values with the given gains; 0 where they are infinite or not positive."""
-        space = self.base_search.space
-        found = to_records(self.base_search.simulator.values(space.start[None], self.base_search.spec))[0]
-        return {n: v if np.isfinite(v) and v > 0 else 0.0 for n, v in found.items()}
-
-    def _constrain_second(self, limit: float) -> Specification:
-        """The specification that minimises the first requirement under a limit on the second."""
-        others = tuple(q for q in self.base_search.spec.limits if metric_name(q) != metric_name(self.second))
-        weights = {self.first: self._weight(self.first)}
-        return replace(self.base_search.spec, weights=weights, limits=(*others, with_upper_limit(self.second, limit)))
-
-    def _follow(self, path: LimitPath) -> None:
-        """Solve for all designs along the limits; those that rounding makes infeasible again with more margin."""
-        todo = list(range(1, len(self.designs) - 1))
-        for margin in self._margins:
-            asked = [self._search_for(k, self.base_search.method) for k in todo]
-            found = self._track(path, [own.tighten(margin) for own in asked]) if todo else []
-            for k, own, solution in zip(todo, asked, found, strict=True):
-                self._certify(k, own, solution, margin)
-                self.base_search.progress(f"design {k + 1} of {len(self.designs)}: {_design_status(self.designs[k])}")
-            todo = [k for k in todo if not _design_status(self.designs[k]).converged]
-
-    @property
-    def _margins(self) -> tuple[float, ...]:
-        """Margins of the limits, the next one for designs that rounding makes infeasible."""
-        return tuple(self.base_search.method.margin * factor for factor in (1, 2, 4))
-
-    @cached_property
-    def _path(self) -> LimitPath | None:
-        """The problem, prepared once, whose solutions are the designs; None where each design needs a search."""
-        search = self._search_for(1, self.base_search.method)
-        return search.method.limit_path(search.task, search.tighten(search.method.margin))
-
-    def _track(self, path: LimitPath, specs: Sequence[Specification]) -> list[Solution]:
-        """Follow the solutions from the first end, and from the second where that one lies on a better branch.
-
-        Next to the second end the two are compared; if they agree, there is one branch, and the first track stands.
-        """
-        space, ends = self.base_search.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
-        starts = [end_point(result, space) for result in ends]
-        found = path.follow(starts[0], specs)
-        other = path.follow(starts[1], specs[-1:])
-        if _solution_cost(other[0]) < _solution_cost(found[-1]) * (1 - MIN_IMPROVEMENT):
-            other = path.follow(starts[1], specs[::-1])
-        for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
-            spent = found[k].stats["seconds"] + back.stats["seconds"]
-            better = back if _solution_cost(back) < _solution_cost(found[k]) else found[k]
-            found[k] = replace(better, stats={**better.stats, "seconds": spent})
-        return found
-
-    def _certify(self, k: int, search: Search, solution: Solution, margin: float) -> None:
-        """Certify a solution as design k."""
-        begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
-        result = self._round_and_certify(search, solution, margin)
-        seconds = old.seconds + spent + time.perf_counter() - begun
-        self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=old.solver_seconds + spent)
-
-    def _round_and_certify(self, search: Search, solution: Solution, margin: float) -> TuningResult:
-        """Round a solution's gains and certify them."""
-        if solution.status.code is Code.INTERRUPTED:
-            raise KeyboardInterrupt
-        point = np.array([solution.parameters.value(n) for n in search.space.names])
-        found = SearchResult(point, solution.status, tuple(solution.multipliers), {"optimum": solution.stats["cost"]})
-        good = solution.status.converged
-        return (
-            search.certify_roundings(found, margin)
-            if good
-            else search.certifier.certify(search.simulator, found, point)
-        )
-
-    def _search_for(self, k: int, method: Method) -> Search:
-        """The search for design k."""
-        return self.base_search.with_specification(self._constrain_second(self.designs[k].limit), method)
-
-    def _improve(self, k: int, start: Array | None) -> None:
-        """Search for design k from given gains; it replaces the present one if it is better."""
-        begun, old, path = time.perf_counter(), self.designs[k], self._path
-        if path is not None and start is not None:
-            result, spent = self._resolve(path, k, start)
-        else:
-            search, spent = (
-                self._search_for(k, self.base_search.method.shorten(self.base_search.method.margin)),
-                0.0,
-            )
-            result = _check_interruption(search.run(start))
-        kept = old.result if old.result is not None and not self._is_better(result, old.result) else result
-        seconds, solver_seconds = old.seconds + time.perf_counter() - begun, old.solver_seconds + spent
-        self.designs[k] = replace(old, result=kept, seconds=seconds, solver_seconds=solver_seconds)
-        self.base_search.progress(
-            f"{metric_name(self.second)} {user_value(self.second, old.limit):.4g}: {result.status}"
-        )
-
-    def _resolve(self, path: LimitPath, k: int, start: Array) -> tuple[TuningResult, float]:
-        """Solve for design k from given gains, with more margin where rounding makes it infeasible.
-
-        Returns
-        -------
-        result : TuningResult
-        seconds : float
-            Time in the solver [s].
-        """
-        search, spent, result = self._search_for(k, self.base_search.method), 0.0, None
-        for margin in self._margins:
-            (solution,) = path.follow(start, [search.tighten(margin)])
-            result, spent = self._round_and_certify(search, solution, margin), spent + solution.stats["seconds"]
-            if result.status.converged:
-                break
-        assert result is not None
-        return result, spent
-
-    def _is_better(self, one: TuningResult, other: TuningResult) -> bool:
-        """Whether a result is certified and the other is not, or is smaller by the first requirement."""
-        if not one.status.converged or not other.status.converged:
-            return one.status.converged
-        return _result_value(one, self.first) < _result_value(other, self.first)
-
-    def _gains(self, k: int) -> Array | None:
-        """The gains of design k, shape (n,); None where there is none yet."""
-        result = self.designs[k].result
-        return None if result is None else end_point(result, self.base_search.space)
-
-    def _rival(self, k: int) -> Array | None:
-        """The gains of another design or sampled point that beats design k within its limit; None if there is none."""
-        design, space = self.designs[k], self.base_search.space
-        spec, own = self._constrain_second(design.limit), np.inf
-        if design.result is not None and design.result.status.converged:
-            own = _result_value(design.result, self.first)
-        found = [
-            d.result for d in self.designs if d is not design and _design_status(d).converged and d.result is not None
-        ]
-        rivals = {
-            _result_value(r, self.first): end_point(r, space)
-            for r in found
-            if _result_value(r, self.second) <= design.limit
-        }
-        points, rows = self._samples
-        rivals |= {v[metric_name(self.first)]: x for x, v in zip(points, rows, strict=True) if not spec.violations(v)}
-        least = min((v for v in rivals if np.isfinite(v)), default=np.inf)
-        return rivals[least] if least < own * (1 - MIN_IMPROVEMENT) else None
-
-    @cached_property
-    def _samples(self) -> tuple[Array, list[dict[str, float]]]:
-        """Points spread over the gains' box, and the requirements' values there."""
-        space, rng = self.base_search.space, np.random.default_rng(0)
-        points = space.from_unit(first_population(RIVAL_SAMPLES, space.to_unit(space.start), rng))
-        return points, to_records(self.base_search.simulator.values(points, self.base_search.spec))
-
-    def _row(self, design: Design) -> dict[str, Any]:
-        """A row of `pareto_front`'s table."""
-        result, pair, space = design.result, (self.first, self.second), self.base_search.space
-        good = result is not None and result.status.converged
-        columns = {"": "certified", "claimed ": "claimed"}
-        known = result.requirements if result is not None and good else None
-        figures = {
-            f"{lead}{metric_name(q)}": nan if known is None else float(known[column][metric_name(q)])
-            for lead, column in columns.items()
-            for q in pair
-        }
-        gains = {n: nan if result is None or not good else result.parameters.value(n) for n in space.names}
-        costs = {"solver_seconds": design.solver_seconds, "seconds": design.seconds}
-        error = "" if good else Code.INTERRUPTED.value if result is None else str(result.status)
-        return {**figures, "limit": user_value(self.second, design.limit), **gains, **costs, "error": error}
-
-
-def _result_of(design: Design) -> TuningResult:
-    """The result of a design that has one."""
-    assert design.result is not None
-    return design.result
-
-
-def _check_interruption(result: TuningResult) -> TuningResult:
-    """Raise KeyboardInterrupt for a search that Ctrl-C ended with its best so far, so that the front ends, too."""
-    if result.status.code is Code.INTERRUPTED:
-        raise KeyboardInterrupt
-    return result
-
-
-def _count_successes(designs: Sequence[Design]) -> int:
-    """The number of certified designs."""
-    return sum(_design_status(design).converged for design in designs)
-
-
-def _design_status(design: Design) -> Status:
-    """The status of a design's result; interrupted where there is none yet."""
-    return Status(Code.INTERRUPTED) if design.result is None else design.result.status
-
-
-def _solution_cost(solution: Solution) -> float:
-    """The objective of a solution; infinite where the solver did not converge."""
-    return solution.stats["cost"] if solution.status.converged else np.inf
-
-
-def _result_value(result: TuningResult, requirement: Requirement) -> float:
-    """The certified figure as a search counts it: smaller is better, a margin as its reciprocal."""
-    figure = float(result.requirements["certified"][metric_name(requirement)])
-    return user_value(requirement, figure)  # the conversion is the same in both directions
-
-
-def _limit_grid(high: float, low: float, points: int) -> list[float]:
-    """Limits from high to low at even distances, or at even ratios where the ends are far apart."""
-    even = np.geomspace if low > 0 and high / low > LOG_SPACING_RATIO else np.linspace
-    return [float(v) for v in even(high, low, points)]
 
 
 def pareto_front(
@@ -465,3 +128,296 @@ def pareto_front(
     with suppress(KeyboardInterrupt):
         front.find_designs(points)
     return front.to_frame()
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """One point of a front: its limit on the second requirement, as `Specification.limit` counts, and its cost [s]."""
+
+    limit: float
+    result: TuningResult | None = None
+    seconds: float = 0.0
+    solver_seconds: float = 0.0
+
+
+@dataclass(eq=False)
+class Front:
+    """The designs of a front while they are searched for, from the best by the first requirement on.
+
+    `last` is the limit on the second with which the front ends, as `upper_limit` counts; None: the best that it can
+    be.
+    """
+
+    base_search: Search
+    first: Requirement
+    second: Requirement
+    last: float | None
+    designs: list[Design] = field(default_factory=list)
+
+    def find_designs(self, points: int) -> None:
+        """Find all designs; repeat with new ends where a design between them is better than an end."""
+        self.designs = [Design(nan)] * points
+        for k, q in ((0, self.first), (-1, self.second)):
+            self.designs[k] = self._find_end(q)
+        ends = [self.designs[0], self.designs[-1]]
+        for _ in range(MAX_IMPROVEMENT_ROUNDS):
+            done = self.designs
+            try:
+                self._fill_between(ends, points)
+            except KeyboardInterrupt:
+                self.designs = max((self.designs, done), key=lambda designs: sum(map(_is_certified, designs)))
+                raise
+            better = [self._best(self.first), self._best(self.second)]
+            if better == ends or len(self.designs) == 1:
+                break
+            pairs = zip((self.first, self.second), ends, better, strict=True)
+            ends = [old if old is new else self._find_end(q, new.result) for q, old, new in pairs]
+
+    def _best(self, requirement: Requirement) -> Design:
+        """The best design by one requirement; an end unless another is clearly better."""
+        end = self.designs[0 if requirement is self.first else -1]
+        if requirement is self.second and self.last is not None:
+            return end
+        good = [d for d in self.designs if d.result is not None and d.result.status.converged]
+        best = min(good, key=lambda d: _result_value(_result_of(d), requirement))
+        return (
+            best
+            if _result_value(_result_of(best), requirement)
+            < _result_value(_result_of(end), requirement) * (1 - LEAST_IMPROVEMENT)
+            else end
+        )
+
+    def _fill_between(self, ends: list[Design], points: int) -> None:
+        """Find the designs between two ends."""
+        high, low = ends[0].limit, ends[1].limit
+        if high <= low * (1 + LEAST_IMPROVEMENT):
+            self.designs = ends[:1]
+            return
+        even = np.geomspace if low > 0 and high / low > LOG_SPACING_RATIO else np.linspace
+        self.designs = [ends[0], *(Design(limit) for limit in even(high, low, points)[1:-1].tolist()), ends[1]]
+        if points > 2 and self._path is not None:
+            self._follow(self._path)
+        else:
+            for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
+                result = self.designs[start].result
+                self._improve(k, None if result is None else end_point(result, self.base_search.space))
+        for _ in range(MAX_IMPROVEMENT_ROUNDS):
+            for k in range(1, points - 1):
+                better = self._rival(k)
+                if better is not None:
+                    self._improve(k, better)
+
+    def to_frame(self) -> "pd.DataFrame":
+        """The table of the designs found so far; see `pareto_front`."""
+        import pandas as pd
+
+        return pd.DataFrame([self._row(design) for design in self.designs])
+
+    def _find_end(self, requirement: Requirement, start: TuningResult | None = None) -> Design:
+        """Find the design that is best by one requirement; among equals the one that is best by the other."""
+        begun, pair = time.perf_counter(), (self.first, self.second)
+        weights = {q: self._weight(q) * (1.0 if q is requirement else SECONDARY_WEIGHT) for q in pair}
+        spec = replace(
+            self.base_search.spec,
+            weights=weights,
+            limits=limits_with_settling(self.base_search.spec, self.base_search.task.references),
+        )
+        held = requirement is self.second and self.last is not None
+        if self.last is not None and held:
+            spec = self._constrain_second(self.last)
+        method, point = self.base_search.method, None
+        if start is not None:  # a search over wide bands would lose it
+            method, point = method.shorten(method.margin), end_point(start, self.base_search.space)
+        result = _check_interruption(self.base_search.with_specification(spec, method).run(point))
+        if not result.status.converged:
+            which = "at its last limit" if held else "as good as the limits allow"
+            raise ConvergenceError(f"no front: its end, {metric_name(requirement)} {which}, is {result.status}", result)
+        limit = self.last if self.last is not None and held else _result_value(result, self.second)
+        return Design(limit, result, time.perf_counter() - begun)
+
+    def _weight(self, requirement: Requirement) -> float:
+        """The weight that scales a requirement to the size of the horizon, as the searches' penalties are."""
+        horizon = min(r.horizon - r.at for r in self.base_search.task.references)
+        return (
+            horizon / self._requirement_scales[metric_name(requirement)]
+            if self._requirement_scales[metric_name(requirement)]
+            else 1.0
+        )
+
+    @cached_property
+    def _requirement_scales(self) -> dict[str, float]:
+        """The requirements' values with the given gains; 0 where they are infinite or not positive."""
+        space = self.base_search.space
+        found = to_records(self.base_search.simulator.values(space.start[None], self.base_search.spec))[0]
+        return {n: v if np.isfinite(v) and v > 0 else 0.0 for n, v in found.items()}
+
+    def _constrain_second(self, limit: float) -> Specification:
+        """The specification that minimises the first requirement under a limit on the second."""
+        others = tuple(q for q in self.base_search.spec.limits if metric_name(q) != metric_name(self.second))
+        weights = {self.first: self._weight(self.first)}
+        return replace(self.base_search.spec, weights=weights, limits=(*others, with_upper_limit(self.second, limit)))
+
+    def _follow(self, path: LimitPath) -> None:
+        """Solve for all designs along the limits; those that rounding makes infeasible again with more margin."""
+        todo = list(range(1, len(self.designs) - 1))
+        for margin in self._margins:
+            asked = [self._search_for(k, self.base_search.method) for k in todo]
+            found = self._track(path, [own.tighten(margin) for own in asked]) if todo else []
+            for k, own, solution in zip(todo, asked, found, strict=True):
+                begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
+                result = self._round_and_certify(own, solution, margin)
+                seconds, spent = old.seconds + spent + time.perf_counter() - begun, old.solver_seconds + spent
+                self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=spent)
+                self.base_search.progress(f"design {k + 1} of {len(self.designs)}: {_design_status(self.designs[k])}")
+            todo = [k for k in todo if not _is_certified(self.designs[k])]
+
+    @property
+    def _margins(self) -> tuple[float, ...]:
+        """Margins of the limits, the next one for designs that rounding makes infeasible."""
+        return tuple(self.base_search.method.margin * factor for factor in (1, 2, 4))
+
+    @cached_property
+    def _path(self) -> LimitPath | None:
+        """The problem, prepared once, whose solutions are the designs; None where each design needs a search."""
+        search = self._search_for(1, self.base_search.method)
+        return search.method.limit_path(search.task, search.tighten(search.method.margin))
+
+    def _track(self, path: LimitPath, specs: Sequence[Specification]) -> list[Solution]:
+        """Follow the solutions from the first end, and from the second where that one lies on a better branch.
+
+        Next to the second end the two are compared; if they agree, there is one branch, and the first track stands.
+        """
+        space, ends = self.base_search.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
+        starts = [end_point(result, space) for result in ends]
+        found = path.follow(starts[0], specs)
+        other = path.follow(starts[1], specs[-1:])
+        if _solution_cost(other[0]) < _solution_cost(found[-1]) * (1 - LEAST_IMPROVEMENT):
+            other = path.follow(starts[1], specs[::-1])
+        for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
+            spent = found[k].stats["seconds"] + back.stats["seconds"]
+            better = back if _solution_cost(back) < _solution_cost(found[k]) else found[k]
+            found[k] = replace(better, stats={**better.stats, "seconds": spent})
+        return found
+
+    def _round_and_certify(self, search: Search, solution: Solution, margin: float) -> TuningResult:
+        """Round a solution's gains and certify them."""
+        if solution.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        point = np.array([solution.parameters.value(n) for n in search.space.names])
+        found = SearchResult(point, solution.status, tuple(solution.multipliers), optimum=solution.stats["cost"])
+        good = solution.status.converged
+        return (
+            search.certify_roundings(found, margin)
+            if good
+            else search.certifier.certify(search.simulator, found, point)
+        )
+
+    def _search_for(self, k: int, method: Method) -> Search:
+        """The search for design k."""
+        return self.base_search.with_specification(self._constrain_second(self.designs[k].limit), method)
+
+    def _improve(self, k: int, start: Array | None) -> None:
+        """Search for design k from given gains; it replaces the present one if it is better."""
+        begun, old, path = time.perf_counter(), self.designs[k], self._path
+        if path is not None and start is not None:
+            result, spent = self._resolve(path, k, start)
+        else:
+            search, spent = (
+                self._search_for(k, self.base_search.method.shorten(self.base_search.method.margin)),
+                0.0,
+            )
+            result = _check_interruption(search.run(start))
+        before, kept = old.result, result
+        if before is not None and not result.status.converged:
+            kept = before
+        elif before is not None and before.status.converged:
+            kept = min((before, result), key=lambda each: _result_value(each, self.first))
+        seconds, solver_seconds = old.seconds + time.perf_counter() - begun, old.solver_seconds + spent
+        self.designs[k] = replace(old, result=kept, seconds=seconds, solver_seconds=solver_seconds)
+        self.base_search.progress(
+            f"{metric_name(self.second)} {user_value(self.second, old.limit):.4g}: {result.status}"
+        )
+
+    def _resolve(self, path: LimitPath, k: int, start: Array) -> tuple[TuningResult, float]:
+        """Solve for design k, with more margin where rounding makes it infeasible; also the solver's time [s]."""
+        search, spent, result = self._search_for(k, self.base_search.method), 0.0, None
+        for margin in self._margins:
+            (solution,) = path.follow(start, [search.tighten(margin)])
+            result, spent = self._round_and_certify(search, solution, margin), spent + solution.stats["seconds"]
+            if result.status.converged:
+                break
+        assert result is not None
+        return result, spent
+
+    def _rival(self, k: int) -> Array | None:
+        """The gains of another design or sampled point that beats design k within its limit; None if there is none."""
+        design, space = self.designs[k], self.base_search.space
+        spec, own = self._constrain_second(design.limit), np.inf
+        if design.result is not None and design.result.status.converged:
+            own = _result_value(design.result, self.first)
+        found = [d.result for d in self.designs if d is not design and _is_certified(d) and d.result is not None]
+        rivals = {
+            _result_value(r, self.first): end_point(r, space)
+            for r in found
+            if _result_value(r, self.second) <= design.limit
+        }
+        points, rows = self._samples
+        rivals |= {v[metric_name(self.first)]: x for x, v in zip(points, rows, strict=True) if not spec.violations(v)}
+        least = min((v for v in rivals if np.isfinite(v)), default=np.inf)
+        return rivals[least] if least < own * (1 - LEAST_IMPROVEMENT) else None
+
+    @cached_property
+    def _samples(self) -> tuple[Array, list[dict[str, float]]]:
+        """Points spread over the gains' box, and the requirements' values there."""
+        space, rng = self.base_search.space, np.random.default_rng(0)
+        points = space.from_unit(first_population(RIVAL_SAMPLES, space.to_unit(space.start), rng))
+        return points, to_records(self.base_search.simulator.values(points, self.base_search.spec))
+
+    def _row(self, design: Design) -> dict[str, Any]:
+        """A row of `pareto_front`'s table."""
+        result, pair, space = design.result, (self.first, self.second), self.base_search.space
+        good = result is not None and result.status.converged
+        columns = {"": "certified", "claimed ": "claimed"}
+        known = result.requirements if result is not None and good else None
+        figures = {
+            f"{lead}{metric_name(q)}": nan if known is None else float(known[column][metric_name(q)])
+            for lead, column in columns.items()
+            for q in pair
+        }
+        gains = {n: nan if result is None or not good else result.parameters.value(n) for n in space.names}
+        costs = {"solver_seconds": design.solver_seconds, "seconds": design.seconds}
+        error = "" if good else Code.INTERRUPTED.value if result is None else str(result.status)
+        return {**figures, "limit": user_value(self.second, design.limit), **gains, **costs, "error": error}
+
+
+def _result_of(design: Design) -> TuningResult:
+    """The result of a design that has one."""
+    assert design.result is not None
+    return design.result
+
+
+def _check_interruption(result: TuningResult) -> TuningResult:
+    """Raise KeyboardInterrupt for a search that Ctrl-C ended with its best so far, so that the front ends, too."""
+    if result.status.code is Code.INTERRUPTED:
+        raise KeyboardInterrupt
+    return result
+
+
+def _is_certified(design: Design) -> bool:
+    return _design_status(design).converged
+
+
+def _design_status(design: Design) -> Status:
+    """The status of a design's result; interrupted where there is none yet."""
+    return Status(Code.INTERRUPTED) if design.result is None else design.result.status
+
+
+def _solution_cost(solution: Solution) -> float:
+    """The objective of a solution; infinite where the solver did not converge."""
+    return solution.stats["cost"] if solution.status.converged else np.inf
+
+
+def _result_value(result: TuningResult, requirement: Requirement) -> float:
+    """The certified figure as a search counts it: smaller is better, a margin as its reciprocal."""
+    figure = float(result.requirements["certified"][metric_name(requirement)])
+    return user_value(requirement, figure)  # the conversion is the same in both directions

@@ -1,27 +1,18 @@
-"""Sequential quadratic programs for max-type problems in a few unknowns, from many starts in lockstep.
+"""Gradients: points of a search improved by quadratic programs on compiled simulations with sensitivities.
 
 Minimise ``f(z) + sum_g weight_g max(floor_g, max_i r_gi(z))`` in a box, f linear: a limit is a group of rows with floor
-0 and a weight beyond its multiplier (an exact penalty), an objective such as a peak is one without a floor. The rows
-come from compiled simulations with forward sensitivities, so that the program in each step is dense and small.
-
-`LinearisedProblem`: responses and their derivatives as rows of a minimax problem in gains and settling time.
-
-The settling time Ts is an unknown: from Ts on the response has to lie within the band. So the objective is
-smooth in the gains where the settling time itself jumps. Nodes after Ts move with it.
-
-`Lanes`: simulated responses with their derivatives to the gains, as step records from which metrics are read.
-
-The signal is read at nodes, without its dither's ripple. Where a metric is the largest value over time, or the integral
-of an absolute value, its derivative is taken at the present instant of the maximum, or with the present sign.
-
-`Polish`: points improved by gradients, quadratic programs on compiled simulations with sensitivities.
+0 and a weight beyond its multiplier (an exact penalty), an objective such as a peak is one without a floor. `descend`
+solves such problems from many starts in lockstep by sequential quadratic programs, dense and small. `LinearisedProblem`
+makes the rows of a tuning: the settling time Ts is an unknown from which on the response has to lie within the band, so
+that the objective is smooth in the gains where the settling time itself jumps; `Lanes` reads the responses at nodes
+without their dither's ripple, a largest value's derivative at its present instant. `Polish` applies it to a search.
 
 Differential evolution finds the basin; within it gradients are worth a hundred trials each. On 32 plants of the drive
 in problems/shared/t32.py points that an evolution left at 0.062 and 0.065 s came to 0.050 s in some thirty simulations.
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -61,6 +52,7 @@ from pneuopt.quantities.errors import require
 from pneuopt.tuning.simulator import ResponsePoints, Simulator, to_records
 from pneuopt.tuning.space import (
     CONTROL_OUTPUT,
+    INTEGRAL_OUTPUT,
     SIGNAL_OUTPUT,
     ReferenceGrid,
     Space,
@@ -70,9 +62,7 @@ from pneuopt.tuning.space import (
 )
 from pneuopt.tuning.tolerances import (
     DIFFERENCE_STEP,
-    GROW_GAIN_RATIO,
     INFINITE_BOUND,
-    INTEGRAL_OUTPUT,
     KEPT_STATES,
     MAX_CUTTING_ROUNDS,
     MAX_SENSITIVITY_LANES,
@@ -85,22 +75,60 @@ from pneuopt.tuning.tolerances import (
     QP_CURVATURE,
     ROW_PADDING,
     SETTLING_RADIUS_RATIO,
-    SHRINK_GAIN_RATIO,
     VIOLATION_TOLERANCE,
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Polish:
+    """Improve points of a search by gradients."""
+
+    simulator: Simulator
+    spec: Specification
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether there are gradients of all that is asked for."""
+        return not nonsmooth_terms(self.simulator.loop, self.simulator.space, self.spec)
+
+    @cached_property
+    def _rollout(self) -> Rollout:
+        return sensitivity_rollout(self.simulator)
+
+    def improve(self, unit: Array, on: Simulator, iterations: int) -> tuple[Array, int]:
+        """Descend from points of the unit cube (m, n) on some samples; where each ends, and points simulated."""
+        inside, count, space = self.spec.tighten(PROGRAM_MARGIN, PROGRAM_MARGIN), 0, self.simulator.space
+        first = to_records(on.values(space.from_unit(unit[:1]), self.spec))[0]
+        unknown = {SettlingTime.metric.name: max(grid.reference.horizon for grid in on.grids)}
+        known = {n: v if np.isfinite(v) else unknown.get(n, 1.0) for n, v in first.items()}
+        scale = self.spec.objective(known)  # the size of the objective sets that of the penalties
+        for raises in range(PENALTY_RAISES + 1):
+            problem = LinearisedProblem(on, self._rollout, inside, NODES, scale * 10.0**raises)
+            found = descend(problem, problem.start(unit), iterations, SQP())
+            unit, count = np.array([point.z[:-1] for point in found]), count + problem.count
+            values = to_records(on.values(space.from_unit(unit), self.spec))
+            if not any(self.spec.violations(row) for row in values):
+                break
+        return unit, count
+
+
+# Free parameters that no gradient serves: the averaging time moves with the frequency, and a clip that no response
+# meets has derivative zero.
+NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
+QUANTISER_PARAMETERS = ("sensor.resolution",)  # an encoder's: its counts make responses piecewise flat
+
+
+def nonsmooth_terms(loop: ClosedLoop, space: Space, spec: Specification) -> list[str]:
+    """The names of requirements without a gradient, and of free parameters to which there is none."""
+    rough = [metric_name(q) for q in (*spec.weights, *spec.limits) if not isinstance(q, SMOOTH_REQUIREMENTS)]
+    counted = [f"{n} (an encoder's counts)" for n in QUANTISER_PARAMETERS if n in space.parameters]
+    jumping = {f"{c.section}.{n}" for c in loop.compensators for n in c.without_gradient}
+    return [*rough, *(n for n in space.names if n in NONSMOOTH_PARAMETERS or n in jumping), *counted]
+
+
 @dataclass(frozen=True)
 class RowGroups:
-    """The weights and floors of groups of rows: a group is a limit or a term of the objective.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (n_groups,)
-        The penalty of a limit's violation, or the weight of an objective.
-    floors : ndarray, shape (n_groups,)
-        0 for a limit, -inf for an objective.
-    """
+    """Weights and floors (n_groups,): a limit has its violation's penalty and floor 0, an objective floor -inf."""
 
     weights: Array
     floors: Array
@@ -108,24 +136,10 @@ class RowGroups:
 
 @dataclass(frozen=True, eq=False)
 class LinearisedPoint:
-    """A point and the objective's rows linearised there.
+    """A point z (n,) with f, its gradient (n,), and the objective's rows linearised there.
 
-    Parameters
-    ----------
-    z : ndarray, shape (n,)
-    cost : float
-        f(z).
-    gradient : ndarray, shape (n,)
-        The gradient of f.
-    values : ndarray, shape (n_rows,)
-        -inf: the row does not count here.
-    slopes : ndarray, shape (n_rows, n)
-        Derivatives of the values.
-    group : ndarray of int, shape (n_rows,)
-        The group of each row.
-    groups : RowGroups
-    data : object
-        Anything that the problem needs to improve the point.
+    Each row has a value (n_rows,), -inf where it does not count, slopes (n_rows, n) and a group (n_rows,); `data` is
+    what the problem needs to improve the point.
     """
 
     z: Array
@@ -169,28 +183,24 @@ class MinimaxProblem(Protocol):
 
 @dataclass(frozen=True)
 class SQP:
-    """Step control of the sequential quadratic programs.
+    """Step control: first and least half width of the trust region, and the relative decrease that ends a descent.
 
-    Parameters
-    ----------
-    radius : float
-        Half width of the first trust region, a box, as a fraction of the unknowns' ranges.
-    least_radius : float
-        Half width below which a descent ends.
-    tolerance : float
-        Predicted relative decrease of the objective below which it ends.
+    Widths are shares of the unknowns' ranges. Actual over predicted decrease below `shrink` narrows the region, above
+    `grow` widens it (J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., algorithm 4.1).
     """
 
     radius: float = 0.3
     least_radius: float = 1e-5
     tolerance: float = 1e-5
+    shrink: float = 0.25
+    grow: float = 0.75
 
     def __post_init__(self) -> None:
         require(0 < self.least_radius < self.radius, f"SQP: radius must exceed {self.least_radius:g}")
 
 
 @dataclass(frozen=True, eq=False)
-class Descent:
+class DescentState:
     """The descent from one start: its present point, its trust region, and whether it goes on."""
 
     point: LinearisedPoint
@@ -201,23 +211,10 @@ class Descent:
 def descend(
     problem: MinimaxProblem, starts: Array, iterations: int, method: SQP | None = None
 ) -> list[LinearisedPoint]:
-    """Descend from every start in lockstep, for so many iterations at most.
-
-    Parameters
-    ----------
-    problem : MinimaxProblem
-    starts : ndarray, shape (m, n)
-    iterations : int
-    method : SQP, optional
-
-    Returns
-    -------
-    list of LinearisedPoint
-        One for each start, in their order.
-    """
+    """Descend from every start (m, n) in lockstep, for so many iterations at most; where each ends, in their order."""
     method = method or SQP()
     first = [problem.improve(p) for p in problem.evaluate(starts)]
-    found = [Descent(p, method.radius, bool(np.isfinite(p.merit))) for p in first]
+    found = [DescentState(p, method.radius, bool(np.isfinite(p.merit))) for p in first]
     for _ in range(iterations):
         moving = [k for k, d in enumerate(found) if d.moves]
         if not moving:
@@ -227,7 +224,7 @@ def descend(
     return [d.point for d in found]
 
 
-def _advance(problem: MinimaxProblem, descents: Sequence[Descent], method: SQP) -> list[Descent]:
+def _advance(problem: MinimaxProblem, descents: Sequence[DescentState], method: SQP) -> list[DescentState]:
     """Advance each descent by a step; where it gains less than predicted, a second-order correction is tried, too."""
     steps = [solve_quadratic_program(d.point, _step_box(problem, d)) for d in descents]
     trials = _evaluate_and_improve(problem, [d.point.z + step for d, step in zip(descents, steps, strict=True)])
@@ -238,7 +235,7 @@ def _advance(problem: MinimaxProblem, descents: Sequence[Descent], method: SQP) 
     poor = [
         k
         for k, (predicted, gained) in enumerate(gains)
-        if _promises_decrease(descents[k], predicted, method) and gained < SHRINK_GAIN_RATIO * predicted
+        if _promises_decrease(descents[k], predicted, method) and gained < method.shrink * predicted
     ]
     seconds = [
         _second_order_step(descents[k].point, steps[k], trials[k][0], _step_box(problem, descents[k])) for k in poor
@@ -264,27 +261,29 @@ def _evaluate_and_improve(problem: MinimaxProblem, z: Sequence[Array]) -> list[t
     return [(p, problem.improve(p)) for p in problem.evaluate(np.clip(np.array(z), low, up))]
 
 
-def _promises_decrease(descent: Descent, predicted: float, method: SQP) -> bool:
+def _promises_decrease(descent: DescentState, predicted: float, method: SQP) -> bool:
     """Whether the predicted decrease of the objective is worth a step."""
     return predicted > method.tolerance * abs(descent.point.merit)
 
 
-def _update_descent(descent: Descent, step: Array, trial: LinearisedPoint, predicted: float, method: SQP) -> Descent:
+def _update_descent(
+    descent: DescentState, step: Array, trial: LinearisedPoint, predicted: float, method: SQP
+) -> DescentState:
     """Accept or refuse a trial point, and adapt the trust region."""
     if not _promises_decrease(descent, predicted, method):
         smaller = 0.25 * descent.radius  # where the program failed, a smaller region may help
         return replace(descent, radius=smaller, moves=predicted < 0 and smaller > method.least_radius)
     gained, reach = descent.point.merit - trial.merit, float(np.max(np.abs(step)))
     radius = descent.radius
-    if gained < SHRINK_GAIN_RATIO * predicted:
+    if gained < method.shrink * predicted:
         radius = 0.4 * min(radius, reach)
-    elif gained > GROW_GAIN_RATIO * predicted and reach > 0.9 * radius:
+    elif gained > method.grow * predicted and reach > 0.9 * radius:
         radius = min(2 * radius, 1.0)
     point = trial if gained > 0 else descent.point
-    return Descent(point, radius, radius > method.least_radius)
+    return DescentState(point, radius, radius > method.least_radius)
 
 
-def _step_box(problem: MinimaxProblem, descent: Descent) -> Array:
+def _step_box(problem: MinimaxProblem, descent: DescentState) -> Array:
     """Bounds and trust region as `solve_quadratic_program` takes them, shape (n, 3)."""
     return np.column_stack([problem.bounds, descent.radius * problem.scales])
 
@@ -298,15 +297,9 @@ def _second_order_step(point: LinearisedPoint, step: Array, trial: LinearisedPoi
 
 
 def solve_quadratic_program(point: LinearisedPoint, box: Array) -> Array:
-    """The step that minimises the linearised problem, shape (n,); zero where there is none.
+    """The step (n,) that minimises the linearised problem in a box of bounds and reaches (n, 3), or else zero.
 
     The program starts from the highest rows and takes in those that its solution violates.
-
-    Parameters
-    ----------
-    point : LinearisedPoint
-    box : ndarray, shape (n, 3)
-        Least and greatest value of each unknown, and how far it may step.
     """
     low, up = np.maximum(box[:, 0] - point.z, -box[:, 2]), np.minimum(box[:, 1] - point.z, box[:, 2])
     reach = np.abs(point.slopes) @ np.maximum(-low, up)
@@ -382,14 +375,8 @@ SMOOTH_REQUIREMENTS: tuple[type[Requirement], ...] = (SettlingTime, *ROW_REQUIRE
 class LinearisedResponse:
     """One point's responses to one reference, C cases on K nodes, with derivatives to n gains.
 
-    Attributes
-    ----------
-    error : ndarray, shape (C, K)
-        Distance of the signal without ripple from the reference, a fraction of the step; inf where it runs away.
-    by_gain : ndarray, shape (C, K, n)
-        Its derivatives.
-    values, derivatives : dict of type to ndarray, shapes (C, R) and (C, R, n)
-        Rows of the other requirements, by kind, and their derivatives.
+    The error without ripple (C, K) is a fraction of the step, inf where it runs away; further rows stand by kind of
+    requirement, values (C, R) and derivatives (C, R, n).
     """
 
     error: Array
@@ -399,29 +386,11 @@ class LinearisedResponse:
 
 
 class LinearisedProblem:
-    """The minimax problem that `descend` minimises, in the gains as numbers from 0 to 1 and Ts over the horizon.
+    """The minimax problem that `descend` minimises, in the gains as numbers from 0 to 1 and Ts over the horizon [s].
 
-    Parameters
-    ----------
-    simulator : Simulator
-        Its cases count.
-    rollout : Rollout
-        The compiled loop of `sensitivity_rollout`.
-    spec : Specification
-    nodes : int
-        Number of instants at which a response is read.
-    scale : float
-        The size of the objective, by which the penalties are scaled.
-
-    Attributes
-    ----------
-    bounds : ndarray, shape (n + 1, 2)
-    scales : ndarray, shape (n + 1,)
-        Sizes of the unknowns' trust regions relative to each other.
-    horizon : float
-        The shortest record after a step [s].
-    count : int
-        Candidates simulated.
+    Responses of the simulator's cases are read at so many nodes; the objective's size `scale` sets that of the
+    penalties. `bounds` (n + 1, 2) and `scales` (n + 1,) are the unknowns' ranges and trust regions, `count` the
+    candidates simulated.
     """
 
     def __init__(self, simulator: Simulator, rollout: Rollout, spec: Specification, nodes: int, scale: float) -> None:
@@ -547,9 +516,13 @@ class LinearisedProblem:
                 )
                 for k in range(0, len(rows), MAX_SENSITIVITY_LANES)
             ]
-            whole = _concatenate_responses(parts)
+            error, by_gain = (np.concatenate(rows) for rows in zip(*((r.error, r.by_gain) for r in parts), strict=True))
+            values = {k: np.concatenate([r.values[k] for r in parts]) for k in parts[0].values}
+            slopes = {k: np.concatenate([r.derivatives[k] for r in parts]) for k in values}
             for i in range(len(points)):
-                found[i].append(_slice_response(whole, slice(i * len(own), (i + 1) * len(own))))
+                lanes = slice(i * len(own), (i + 1) * len(own))
+                tables = ({k: v[lanes] for k, v in every.items()} for every in (values, slopes))
+                found[i].append(LinearisedResponse(error[lanes], by_gain[lanes], *tables))
         return found
 
     def _simulate_lanes(self, g: int, points: Array, rows: Indices, case: Indices) -> LinearisedResponse:
@@ -595,14 +568,11 @@ class LinearisedProblem:
             rows = periods == period
             fastest[rows] = self._simulator.fastest_samples(grid, found.y[rows], period)
         assert found.x is not None
-        passage = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
-        return self._simulator.operating_points(p, case, passage)
+        response_points = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
+        return self._simulator.operating_points(p, case, response_points)
 
     def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:
-        """Derivatives of the start states, where they depend on the gains, and the parameters to the unknowns.
-
-        Their shape is (m, n_columns, n).
-        """
+        """Derivatives of parameters, and of starts that depend on gains, to the unknowns (m, n_columns, n)."""
         names, cases = self._space.names, self._simulator.cases
         factors = np.array([case.slopes(names) for case in cases])[case]
         chain = factors[:, :, None] * np.eye(len(names))
@@ -646,7 +616,9 @@ class LinearisedProblem:
         near = np.zeros(len(p), dtype=bool)
         for kind, (values, _) in found.items():
             values[sound, 0] = np.nan_to_num(first[kind.__name__], nan=np.inf, posinf=np.inf)
-            near |= np.isfinite(values[:, 0]) & (values[:, 0] >= self._slope_threshold(kind))
+            limit = self._spec.limit(kind)
+            least = -np.inf if self._spec.weight(kind) or limit <= 0 else NEAR_LIMIT * limit
+            near |= np.isfinite(values[:, 0]) & (values[:, 0] >= least)
         if not shaping or not near.any():
             return found
         nudged = [p[near] + steps[k] * (np.arange(p.shape[1]) == self._wrt[k]) for k in shaping]
@@ -659,11 +631,6 @@ class LinearisedProblem:
                 for row, k in zip(np.reshape(moved[kind.__name__], (len(nudged), -1)), shaping, strict=True):
                     slopes[near, 0, k] = (row - values[near, 0]) / steps[k] * rates[:, k]
         return found
-
-    def _slope_threshold(self, kind: type[Requirement]) -> float:
-        """The requirement's value from which on its derivatives count."""
-        limit = self._spec.limit(kind)
-        return -np.inf if self._spec.weight(kind) or limit <= 0 else NEAR_LIMIT * limit
 
 
 def sensitivity_rollout(simulator: Simulator) -> Rollout:
@@ -678,10 +645,7 @@ def sensitivity_rollout(simulator: Simulator) -> Rollout:
 
 
 def _band_entry_times(t: Array, size: Array, band: float) -> Array:
-    """For each node the time at which the segment before it enters the band, by linear interpolation.
-
-    Where that segment does not enter the band it is the time at which the segment begins.
-    """
+    """For each node the time at which the segment before it enters the band, by interpolation, or else begins."""
     before, after, inside = size[:, :-1], size[:, 1:], SettlingBand(0.0, band).contains(size)
     with np.errstate(all="ignore"):
         share = np.where(~inside[:, :-1] & inside[:, 1:], (before - band) / (before - after), 0.0)
@@ -689,49 +653,12 @@ def _band_entry_times(t: Array, size: Array, band: float) -> Array:
     return np.asarray(np.append(t[0], entered.max(axis=0)))
 
 
-def _concatenate_responses(parts: Sequence[LinearisedResponse]) -> LinearisedResponse:
-    """Join the lanes of several responses."""
-    if len(parts) == 1:
-        return parts[0]
-    kinds = parts[0].values
-    return LinearisedResponse(
-        np.concatenate([r.error for r in parts]),
-        np.concatenate([r.by_gain for r in parts]),
-        {k: np.concatenate([r.values[k] for r in parts]) for k in kinds},
-        {k: np.concatenate([r.derivatives[k] for r in parts]) for k in kinds},
-    )
-
-
-def _slice_response(whole: LinearisedResponse, lanes: slice) -> LinearisedResponse:
-    """The response of some lanes."""
-    return LinearisedResponse(
-        whole.error[lanes],
-        whole.by_gain[lanes],
-        {k: v[lanes] for k, v in whole.values.items()},
-        {k: v[lanes] for k, v in whole.derivatives.items()},
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Lanes:
-    """Simulated lanes of one reference, with sensitivities.
+    """Simulated lanes of one reference: outputs y (m, n, n_outputs), derivatives dy (m, n, n_outputs, n_columns).
 
-    Parameters
-    ----------
-    grid : ReferenceGrid
-    y : ndarray, shape (m, n, n_outputs)
-    dy : ndarray, shape (m, n, n_outputs, n_columns)
-        Derivatives of y to start states and parameters, finite everywhere.
-    chain : ndarray, shape (m, n_columns, n_gains)
-        Derivatives of those start states and parameters to the unknowns of the search.
-    periods : sequence of float
-        The time over which each lane is averaged [s]; 0 without dither.
-    stride : int
-        Samples from node to node.
-    envelope : sequence of (float, float, float)
-        The bounds of a `StepEnvelope`.
-    channels : sequence of str
-        The meter's channels that were run.
+    `chain` (m, n_columns, n_gains) leads on to the unknowns, `periods` [s] are the averaging times, 0 without dither,
+    and `stride` is the number of samples between two nodes.
     """
 
     grid: ReferenceGrid
@@ -759,7 +686,8 @@ class Lanes:
         reference, columns, K = self.grid.reference, self.dy.shape[-1], len(self.nodes)
         error, by_column = np.empty((len(self.y), K)), np.empty((len(self.y), columns, K))
         last, last_by_column = np.empty((len(self.y), 1)), np.empty((len(self.y), 1, columns))
-        for period, own in self._lanes_by_averaging_time():
+        for period in sorted(set(self.periods)):
+            own = np.array([other == period for other in self.periods])
             signal = self._output(own, SIGNAL_OUTPUT), self._slopes(own, SIGNAL_OUTPUT)
             along, end = self._at_nodes(signal), (signal[0][:, -1:], signal[1][..., -1:])
             if period:
@@ -831,11 +759,6 @@ class Lanes:
     def _at_nodes(self, signal: ValuesAndSlopes) -> ValuesAndSlopes:
         return signal[0][:, :: self.stride], signal[1][..., :: self.stride]
 
-    def _lanes_by_averaging_time(self) -> Iterator[tuple[float, NDArray[np.bool_]]]:
-        """Each averaging time and a mask of the lanes that have it."""
-        for period in sorted(set(self.periods)):
-            yield period, np.array([other == period for other in self.periods])
-
 
 def reading_times(grid: ReferenceGrid, stride: int) -> Array:
     """The times after the step at which a response is read [s]."""
@@ -848,68 +771,3 @@ def _move(signal: ValuesAndSlopes, mean: ValuesAndSlopes, reach: ValuesAndSlopes
     side, inside = np.sign(rest), np.abs(rest) <= reach[0]
     slopes = np.where(inside[:, None], mean[1], signal[1] - side[:, None] * reach[1])
     return np.where(inside, mean[0], signal[0] - side * reach[0]), slopes
-
-
-# Free parameters that no gradient serves: the averaging time moves with the frequency, and a clip that no response
-# meets has derivative zero.
-NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
-QUANTISER_PARAMETERS = ("sensor.resolution",)  # an encoder's: its counts make responses piecewise flat
-
-
-def nonsmooth_terms(loop: ClosedLoop, space: Space, spec: Specification) -> list[str]:
-    """The names of requirements without a gradient, and of free parameters to which there is none."""
-    rough = [metric_name(q) for q in (*spec.weights, *spec.limits) if not isinstance(q, SMOOTH_REQUIREMENTS)]
-    counted = [f"{n} (an encoder's counts)" for n in QUANTISER_PARAMETERS if n in space.parameters]
-    jumping = {f"{c.section}.{n}" for c in loop.compensators for n in c.without_gradient}
-    return [*rough, *(n for n in space.names if n in NONSMOOTH_PARAMETERS or n in jumping), *counted]
-
-
-@dataclass(frozen=True, eq=False)
-class Polish:
-    """Improve points of a search.
-
-    Parameters
-    ----------
-    simulator : Simulator
-    spec : Specification
-    """
-
-    simulator: Simulator
-    spec: Specification
-
-    @property
-    def is_possible(self) -> bool:
-        """Whether there are gradients of all that is asked for."""
-        return not nonsmooth_terms(self.simulator.loop, self.simulator.space, self.spec)
-
-    @cached_property
-    def _rollout(self) -> Rollout:
-        return sensitivity_rollout(self.simulator)
-
-    def improve(self, unit: Array, on: Simulator, iterations: int) -> tuple[Array, int]:
-        """Descend from points of the unit cube, shape (m, n); where each ends, and how many points were simulated.
-
-        Parameters
-        ----------
-        unit : ndarray, shape (m, n)
-        on : Simulator
-            The one given, or one with other samples.
-        iterations : int
-        """
-        inside, count, space = self.spec.tighten(PROGRAM_MARGIN, PROGRAM_MARGIN), 0, self.simulator.space
-        scale = self._objective(on, unit[0])
-        for raises in range(PENALTY_RAISES + 1):
-            problem = LinearisedProblem(on, self._rollout, inside, NODES, scale * 10.0**raises)
-            found = descend(problem, problem.start(unit), iterations, SQP())
-            unit, count = np.array([point.z[:-1] for point in found]), count + problem.count
-            values = to_records(on.values(space.from_unit(unit), self.spec))
-            if not any(self.spec.violations(row) for row in values):
-                break
-        return unit, count
-
-    def _objective(self, on: Simulator, unit: Array) -> float:
-        """The objective's size at a point, which sets that of the penalties."""
-        values = to_records(on.values(on.space.from_unit(unit[None]), self.spec))[0]
-        horizon = max(grid.reference.horizon for grid in on.grids)
-        unknown = {SettlingTime.metric.name: horizon}
-        return self.spec.objective({n: v if np.isfinite(v) else unknown.get(n, 1.0) for n, v in values.items()})

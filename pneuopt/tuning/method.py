@@ -1,11 +1,11 @@
 """`Method`: what a way to tune must offer; `TuningTask`, which it is given, and `SearchResult`, which it returns.
 
-Agreement of a search's starts: how many end in the best optimum, and how likely is one that none has seen.
+`Agreement`: how many of a search's starts end in the best optimum, and how likely is one that none has seen.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from math import inf, isfinite, nan
+from dataclasses import dataclass, field
+from math import inf, isfinite, isnan, nan
 from typing import Protocol
 
 from pneuopt.control.loop import ClosedLoop
@@ -23,20 +23,7 @@ from pneuopt.tuning.space import Space
 
 @dataclass(frozen=True, eq=False)
 class TuningTask:
-    """A loop, its references and scenarios, its free gains and what is asked of them, all checked.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-    references : tuple of Reference
-    scenarios : mapping of str to mapping
-    space : Space
-        The free gains, and every parameter of the loop.
-    spec : Specification
-        Objective and limits, as asked for.
-    accept : tuple of Defect
-        Defects with which a design is certified all the same.
-    """
+    """A loop, its references and scenarios, its free gains, what is asked of them, and defects that are accepted."""
 
     loop: ClosedLoop
     references: tuple[Reference, ...]
@@ -53,28 +40,30 @@ class TuningTask:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The point that a method found, before rounding.
+    """The point (n,) that a method found, before rounding, with the limits and bounds that are active there.
 
-    Attributes
-    ----------
-    point : ndarray, shape (n,)
-    status : Status
-    active : tuple of str
-        Limits and bounds that are active there.
-    stats : mapping of str to float
-        At least "optimum", the objective there, where the status is "converged".
-    is_complete : bool
-        False where Ctrl-C ended the search.
-    uses_simulator : bool
-        Whether the method has searched on the task's simulator, so that closer samples of that matter to it.
+    `optimum` is the objective there, NaN where the method has none; `stats` are further figures for users;
+    `is_complete` is False where Ctrl-C ended the search; `uses_simulator` says that closer samples of the task's
+    simulator matter to it.
     """
 
     point: Array
     status: Status
     active: tuple[str, ...]
-    stats: Mapping[str, float]
+    stats: Mapping[str, float] = field(default_factory=dict)
+    optimum: float = nan
+    simulations: int = 0
+    agreement: "Agreement | None" = None
     is_complete: bool = True
     uses_simulator: bool = False
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """All figures as a `TuningResult.stats` shows them."""
+        own = {} if self.agreement is None else self.agreement.stats
+        own |= {} if isnan(self.optimum) else {"optimum": self.optimum}
+        own |= {"simulations": float(self.simulations)} if self.simulations else {}
+        return {**self.stats, **own}
 
 
 class LimitPath(Protocol):
@@ -139,20 +128,11 @@ class Method(Protocol):
         attempt: int,
         progress: ProgressCallback,
     ) -> SearchResult:
-        """Search for the best point; Ctrl-C ends a search by simulation with the best so far.
+        """Search for the best point from a start (n,); Ctrl-C ends a search by simulation with the best so far.
 
-        Parameters
-        ----------
-        task : TuningTask
-        simulator : Simulator
-            It simulates the task's cases.
-        spec : Specification
-            The task's specification, tightened by the margin.
-        start : ndarray, shape (n,)
-        attempt : int
-            How often the certificate has failed so far; from 1 on `start` is the point found with less margin.
-        progress : callable
-            Receives a line of text a generation, start or program.
+        `spec` is the task's, tightened by the margin; `attempt` counts the certificates that have failed, and from 1 on
+        `start` is the point found with less margin; `progress` receives a line of text a generation, start or
+        program.
         """
         ...
 
@@ -167,21 +147,13 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class Agreement:
-    """What the objectives in which several starts end tell of optima that were missed.
+    """How many starts end in the best optimum, and what their ends tell of optima that were missed.
 
-    Attributes
-    ----------
-    starts, converged, agreeing : int
-        Starts, those that end in an optimum, and those that end in the best one.
-    optima : int
-        Different optima among them.
-    spread : float
-        Relative excess of the worst of them over the best; NaN without two.
-    unseen : float
-        The chance that one start more ends in an optimum that none has seen, by C. G. E. Boender and A. H. G. Rinnooy
-        Kan, Bayesian stopping rules for multistart global optimization methods, Math. Program. 37 (1987) 59-80: with w
-        optima from n starts ``w (w + 1)/(n (n - 1))``. It takes starts as independent; NaN of fewer than three, which
-        tell nothing.
+    `converged` and `optima`, the starts that end in an optimum and the different ones among them, are None where the
+    method does not tell them apart; `spread` is the relative excess of the worst. `unseen` is the chance that one start
+    more ends in another optimum: of w optima from n independent starts ``w (w + 1)/(n (n - 1))`` (C. G. E. Boender and
+    A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods, Math. Program. 37 (1987)
+    59-80); fewer than three tell nothing, NaN.
 
     Examples
     --------
@@ -191,34 +163,24 @@ class Agreement:
     """
 
     starts: int
-    converged: int
     agreeing: int
-    optima: int
-    spread: float
-    unseen: float
+    converged: int | None = None
+    optima: int | None = None
+    spread: float = nan
+    unseen: float = nan
 
     @property
     def stats(self) -> dict[str, float]:
         """The figures as a result's `stats` names them: "starts", "starts_agreeing" and so on."""
-        figures = {"_converged": self.converged, "_agreeing": self.agreeing, "_optima": self.optima}
-        return {
-            "starts": float(self.starts),
-            **{f"starts{n}": float(v) for n, v in figures.items()},
-            "starts_spread": self.spread,
-            "starts_unseen": self.unseen,
-        }
+        found = {"starts": float(self.starts), "starts_agreeing": float(self.agreeing)}
+        if self.converged is None or self.optima is None:
+            return found
+        found |= {"starts_converged": float(self.converged), "starts_optima": float(self.optima)}
+        return found | {"starts_spread": self.spread, "starts_unseen": self.unseen}
 
 
 def compare_starts(objectives: Sequence[float], tolerance: float) -> Agreement:
-    """Compare the objectives in which starts end.
-
-    Parameters
-    ----------
-    objectives : sequence of float
-        Infinite where a start found nothing.
-    tolerance : float
-        Relative difference of two objectives below which they count as one optimum.
-    """
+    """Compare the objectives in which starts end, infinite where one found nothing, to within a relative tolerance."""
     found = sorted(value for value in objectives if isfinite(value))
     best, n = found[0] if found else inf, len(found)
     optima = list[float]()
@@ -229,23 +191,22 @@ def compare_starts(objectives: Sequence[float], tolerance: float) -> Agreement:
     agreeing = sum(value - best <= tolerance * abs(best) for value in found)
     spread = (found[-1] - best) / abs(best) if n > 1 and best else nan
     unseen = min(1.0, w * (w + 1) / (n * (n - 1))) if n > 2 else nan
-    return Agreement(len(objectives), n, agreeing, w, spread, unseen)
+    return Agreement(len(objectives), agreeing, n, w, spread, unseen)
 
 
-def describe_agreement(stats: Mapping[str, float]) -> tuple[str, str]:
+def describe_agreement(found: Agreement | None) -> tuple[str, str]:
     """Words on the agreement of a result's starts, and a sentence where some do not agree; empty where none has ended.
 
     Examples
     --------
-    >>> print(*describe_agreement(compare_starts([0.94, 0.94, 0.94, 1.223], 1e-3).stats), sep="; ")
+    >>> print(*describe_agreement(compare_starts([0.94, 0.94, 0.94, 1.223], 1e-3)), sep="; ")
     3 of 4 starts agree; others end up to 30 % worse, one start more would find another optimum with a chance of 50 %
     """
-    if not stats.get("starts"):
+    if found is None or not found.starts:
         return "", ""
-    agreeing, starts = stats["starts_agreeing"], stats["starts"]
-    words = f"{agreeing:.0f} of {starts:.0f} starts agree"
-    if agreeing == stats.get("starts_converged", starts) or not stats.get("starts_spread", nan) > 0:
+    words = f"{found.agreeing} of {found.starts} starts agree"
+    if found.agreeing == found.converged or not found.spread > 0:
         return words, ""
-    unseen, worse = stats.get("starts_unseen", nan), f"others end up to {100 * stats['starts_spread']:.2g} % worse"
-    chance = f"one start more would find another optimum with a chance of {100 * unseen:.0f} %"
-    return words, f"{worse}, {chance}" if isfinite(unseen) else worse
+    worse = f"others end up to {100 * found.spread:.2g} % worse"
+    chance = f"one start more would find another optimum with a chance of {100 * found.unseen:.0f} %"
+    return words, f"{worse}, {chance}" if isfinite(found.unseen) else worse

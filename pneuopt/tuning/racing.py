@@ -1,24 +1,17 @@
 """`Racing`: the search by simulation, success-history differential evolution whose trials race over the cases.
 
-It tunes any loop, with friction, clip and sampling, for any requirements and scenarios. A trial is simulated first on
-the case that its parent finds worst, and is dropped as soon as it is certain to lose. Each number of times that a
+It tunes any loop, with friction, clip and sampling, for any requirements and scenarios. Each number of times that a
 response leaves a narrow band makes an optimum of its own: the mean settling time over wide and narrow bands leads the
 search across them, on coarse samples; then the band asked for counts, and at last, for the best points only, on fine
 samples.
 
-`Race`: the merit of points that beat their rivals; the others are dropped as soon as it is certain that they do not.
+`Race`: a trial runs first on the case that its parent finds worst, then on those that lately beat the most others, and
+is dropped as soon as it is certain to lose: by machine code within a response, where the bounds of `RACE_VALUES` pass
+the rival's merit, by the CasADi VM after its first case. Neither changes an answer.
 
-A point runs first on the case that its parent finds worst, then on those that lately beat the most others. Machine
-code drops it within a response, where the bounds of `RACE_VALUES` pass the rival's merit; the CasADi VM after its first
-case. Neither changes an answer: what comes through is read as the `Simulator` reads it.
-
-`SuccessHistory`: differential evolution that learns its step lengths and crossover rates from what succeeded.
-
+`SuccessHistory`: differential evolution that learns its step lengths and crossover rates from what succeeded, by
 R. Tanabe, A. Fukunaga, Success-history based parameter adaptation for differential evolution (SHADE), IEEE Congress on
-Evolutionary Computation 2013, 71-78. It knows no merit function: `propose` gives trial points of the unit cube and
-`select` takes their merits, so that a race may answer with a bound where a trial has lost.
-
-`compute_merits`: how searches by simulation rank points; `search_result`: what they return of the best.
+Evolutionary Computation 2013, 71-78. It knows no merit function, so that a race may answer with a bound.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,10 +40,11 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import check_argument, check_number
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.gradients import Polish
-from pneuopt.tuning.method import SearchResult, TuningTask, check_method_options
+from pneuopt.tuning.method import Agreement, SearchResult, TuningTask, check_method_options
 from pneuopt.tuning.simulator import Responses, Simulator, to_records
-from pneuopt.tuning.space import Space, penalty_settling_time
+from pneuopt.tuning.space import penalty_settling_time
 from pneuopt.tuning.tolerances import (
+    ACTIVE_ROOM,
     AGREEMENT,
     BAND_SHARES,
     BEST_SHARE,
@@ -60,11 +54,10 @@ from pneuopt.tuning.tolerances import (
     KEPT_STATES,
     LAGGING,
     LEAST_CUT,
+    LEAST_IMPROVEMENT,
     LEAST_MEMBERS,
-    LEAST_PROGRESS,
     LEAST_SHORT_TRIALS,
     LEAST_SPREAD,
-    LENGTH_SPREAD,
     LIMIT_TOLERANCE,
     MAX_RECORDED_NUMBERS,
     MEMORY_OF_KILLS,
@@ -72,357 +65,16 @@ from pneuopt.tuning.tolerances import (
     MIN_DISTANCE,
     NEARBY,
     NO_DITHER,
-    PATIENCE,
     POLISHED,
     POLISHED_NEARBY,
-    RATE_SPREAD,
     RUNAWAY_LEVEL,
     SHORT_MEMBERS,
     SIMULATION_PEAK_MARGIN,
+    STALLED_GENERATIONS,
     START_SHARES,
     VIOLATION_PENALTY,
     WORST_MERIT,
 )
-
-# What may be asked for where responses are cut short: nothing of it grows after the response has settled.
-CUT_REQUIREMENTS = (SettlingTime, Overshoot, PeakControl, ControlRate, *ROBUSTNESS_REQUIREMENTS)
-
-
-class Race:
-    """Races on one simulator for one specification.
-
-    Parameters
-    ----------
-    simulator : Simulator
-    spec : Specification
-    scale : float
-        The horizon, which stands for the settling time of what never settles [s].
-
-    Attributes
-    ----------
-    count : int
-        Points that were simulated, on one case or more.
-    is_cut : bool
-        Whether races see less than the whole of a response.
-    """
-
-    def __init__(self, simulator: Simulator, spec: Specification, scale: float) -> None:
-        self._whole, self._spec, self._scale, self.count = simulator, spec, scale, 0
-        self._plain = spec.without(ROBUSTNESS_REQUIREMENTS)
-        self._kills, self._records = np.zeros(len(simulator.cases)), np.empty(0)
-        self._uses_bounds = simulator.rollout.uses_machine_code and not spec.weight(ROBUSTNESS_REQUIREMENTS)
-        self.cut(np.inf)
-
-    def cut(self, duration: float) -> None:
-        """Let races see so much of each response after the step only [s]."""
-        self._simulator = self._whole if duration == np.inf else self._whole.cut(duration)
-        self.is_cut = any(len(a.t) < len(b.t) for a, b in zip(self._simulator.grids, self._whole.grids, strict=True))
-        self._course = _course(self._simulator, self._spec.band)
-
-    def merits(self, points: Array, rivals: Array | None = None) -> tuple[Array, Indices]:
-        """The merit of each point on every case and on the whole response, and its worst case, shapes (m,).
-
-        Where `rivals`, shape (m,), are given, a point that is certain to be worse gets a bound above its rival's merit.
-        """
-        self.count += len(points)
-        responses = self._whole.respond(points, self._spec.band)
-        return self._complete_merits(responses, np.full(len(points), np.inf) if rivals is None else rivals)
-
-    def race(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
-        """The merit of points that are no worse than their rivals; for the others a number above their rival's merit.
-
-        Parameters
-        ----------
-        points : ndarray, shape (m, n)
-        rivals : ndarray, shape (m,)
-            The merits to beat.
-        first : ndarray of int, shape (m,)
-            The case on which each point is simulated first, its rival's worst.
-
-        Returns
-        -------
-        merits : ndarray, shape (m,)
-        worst : ndarray of int, shape (m,)
-            Each point's worst case, or the one by which it lost.
-        """
-        self.count += len(points)
-        compete, most = self._race_cases, len(points)
-        if self._uses_bounds:
-            numbers = len(self._course.length) * self._course.t.shape[1] * self._simulator.rollout.n_outputs
-            compete, most = self._race_lanes, max(1, MAX_RECORDED_NUMBERS // numbers)
-        merits, worst = np.full(len(points), np.inf), first.copy()
-        for k in range(0, len(points), most):
-            part = slice(k, k + most)
-            merits[part], worst[part] = compete(points[part], rivals[part], first[part])
-        lost = np.bincount(worst[merits > rivals], minlength=len(self._kills))
-        self._kills = MEMORY_OF_KILLS * self._kills + lost
-        return merits, worst
-
-    def _race_lanes(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
-        """Race in machine code, and read the responses of what comes through."""
-        simulator, (m, C) = self._simulator, (len(points), len(self._kills))
-        row, case = np.divmod(np.arange(m * C), C)
-        p, starts = simulator.lanes(points, row, case)
-        n, outputs = self._course.t.shape[1], simulator.rollout.n_outputs
-        if self._records.size < m * C * n * outputs:
-            self._records = np.empty(m * C * n * outputs)
-        y = self._records[: m * C * n * outputs].reshape(m, C, n, outputs)
-        field = RaceField(p, starts, simulator.sampled.periods(p), self._order(first), rivals)
-        merit = _merit_bounds(self._plain, simulator.bands(self._spec.band))
-        outcome = race(simulator.rollout, self._course, merit, field, y)
-        merits, worst, through = np.full(m, np.inf), outcome.loser.copy(), outcome.loser < 0
-        if through.any():
-            lanes = through[row]
-            states, ends = (a[through].reshape(-1, *a.shape[2:]) for a in (outcome.x, outcome.x_end))
-            run = states, y[through].reshape(-1, n, outputs), ends
-            responses = simulator.read(p[lanes], case[lanes], run, (int(through.sum()), C), self._spec.band)
-            merits[through], worst[through] = self._complete_merits(responses, rivals[through])
-        return merits, worst
-
-    def _race_cases(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
-        """Race case by case: the first one of every point, then all cases of those that are not beaten by it."""
-        merits, worst, C = np.full(len(points), np.inf), first.copy(), len(self._kills)
-        ahead = np.ones(len(points), dtype=bool)
-        if C > 1 and not self._spec.weight(ROBUSTNESS_REQUIREMENTS):
-            opening = self._simulator.respond(points, self._spec.band, np.arange(C) == first[:, None])
-            ahead = compute_merits(opening.values, self._plain, self._scale) <= rivals
-        if ahead.any():
-            responses = self._simulator.respond(points[ahead], self._spec.band)
-            merits[ahead], worst[ahead] = self._complete_merits(responses, rivals[ahead])
-        return merits, worst
-
-    def _complete_merits(self, responses: Responses, rivals: Array) -> tuple[Array, Indices]:
-        """Merits and worst cases of points that ran on every case.
-
-        Margins, a frequency response each, cost as much as a simulation. A limit on them can only raise a merit, so
-        they are computed for points that can still beat their rival.
-        """
-        merits = np.full(len(rivals), -np.inf)
-        if not self._spec.weight(ROBUSTNESS_REQUIREMENTS):
-            merits = compute_merits(responses.values, self._plain, self._scale)
-        if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
-            ahead = merits <= rivals
-            if ahead.any():
-                merits[ahead] = compute_merits(responses.with_margins(ahead), self._spec, self._scale)
-        return merits, self._worst_cases(responses)
-
-    def _worst_cases(self, responses: Responses) -> Indices:
-        """Each point's case with the largest merit, margins left out, shape (m,)."""
-        if len(self._kills) == 1 or self._spec.weight(ROBUSTNESS_REQUIREMENTS):
-            return np.zeros(len(responses.values["Excess"]), dtype=np.intp)
-        table = responses.to_table(compute_merits(responses.by_case(), self._plain, self._scale))
-        return np.asarray(np.argmax(table, axis=1))
-
-    def _order(self, first: Indices) -> Indices:
-        """Each point's cases in the order in which they run, shape (m, n_cases)."""
-        rank = np.tile(-self._kills, (len(first), 1))
-        rank[np.arange(len(first)), first] = -np.inf
-        return np.asarray(np.argsort(rank, axis=1, kind="stable"))
-
-
-def may_be_cut(spec: Specification) -> bool:
-    """Whether nothing is asked for that happens after a response has settled."""
-    kinds = (*spec.weights, *spec.limits)
-    return all(isinstance(q, SettlingTime) for q in spec.weights) and all(
-        isinstance(q, CUT_REQUIREMENTS) for q in kinds
-    )
-
-
-def _course(simulator: Simulator, band: Band) -> RaceCourse:
-    """The cases of a simulator, as a race in machine code takes them."""
-    grids = simulator.grids
-    n, grid = max(len(g.t) for g in grids), np.array([simulator.grid_index(k) for k in range(len(simulator.cases))])
-    u, t, h = (np.array(arrays) for arrays in zip(*(g.pad(n) for g in grids), strict=True))
-    settings = [
-        (r.final, r.nominal_size, r.initial, g.spacing, g.t[g.step_index] - r.at, float(r.changes), band_unit(band, r))
-        for g, r in ((g, g.reference) for g in grids)
-    ]
-    length, first = np.array([[len(g.t), g.step_index] for g in grids]).T
-    return RaceCourse(
-        u, t, h, grid, length[grid], first[grid], np.array(settings)[grid], max(simulator.substeps), KEPT_STATES
-    )
-
-
-def _merit_bounds(spec: Specification, bands: Sequence[Band]) -> RaceMerit:
-    kinds = [next(kind for kind in REQUIREMENT_KINDS if kind.metric.name == n) for n in RACE_VALUES]
-    weights, limits = np.array([[spec.weight(kind), spec.limit(kind)] for kind in kinds]).T
-    edges = (1 + EDGE_ROUNDING) * np.array([band_number(band) for band in bands])
-    return RaceMerit(edges, weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL)
-
-
-class SuccessHistory:
-    """A population of points of the unit cube with their merits, and what its trials have taught it.
-
-    Parameters
-    ----------
-    population : ndarray, shape (m, n)
-    merits : ndarray, shape (m,)
-        Small is good.
-    rng : numpy.random.Generator
-
-    Attributes
-    ----------
-    population, merits
-    """
-
-    def __init__(self, population: Array, merits: Array, rng: np.random.Generator) -> None:
-        self.population, self.merits, self._rng = population.copy(), merits.copy(), rng
-        self._archive = np.empty((0, population.shape[1]))
-        self._lengths, self._rates, self._entry = np.full(MEMORY_SIZE, 0.5), np.full(MEMORY_SIZE, 0.5), 0
-        self._drawn = (np.empty(0), np.empty(0))
-
-    def propose(self) -> Array:
-        """Draw a trial point for each member, shape (m, n), towards one of the best."""
-        rng, x = self._rng, self.population
-        m, n = x.shape
-        entry: Indices = rng.integers(0, MEMORY_SIZE, len(x))
-        F, rates = self._draw_lengths(entry), np.clip(rng.normal(self._rates[entry], RATE_SPREAD), 0.0, 1.0)
-        best = np.argsort(self.merits, kind="stable")[: max(2, round(BEST_SHARE * m))]
-        towards = x[rng.choice(best, m)]
-        one, other = _others(m, m + len(self._archive), rng)
-        pool = np.vstack([x, self._archive])
-        mutant = x + F[:, None] * (towards - x) + F[:, None] * (x[one] - pool[other])
-        mutant = np.where(mutant < 0, x / 2, np.where(mutant > 1, (1 + x) / 2, mutant))
-        taken = rng.random((m, n)) < rates[:, None]
-        taken[np.arange(m), rng.integers(n, size=m)] = True
-        self._drawn = F, rates
-        return np.where(taken, mutant, x)
-
-    def select(self, trials: Array, merits: Array) -> Mask:
-        """Put trials that are no worse in the place of their parents, and learn from those that are better.
-
-        Parameters
-        ----------
-        trials : ndarray, shape (m, n)
-            Of `propose`.
-        merits : ndarray, shape (m,)
-            A bound above the parent's merit is enough for a trial that has lost.
-
-        Returns
-        -------
-        ndarray of bool, shape (m,)
-            Which members were replaced.
-        """
-        replaced, better = merits <= self.merits, merits < self.merits
-        if better.any():
-            self._learn(better, merits)
-            archive = np.vstack([self._archive, self.population[better]])
-            kept = self._rng.permutation(len(archive))[: len(trials)]
-            self._archive = archive[np.sort(kept)]
-        self.population[replaced], self.merits[replaced] = trials[replaced], merits[replaced]
-        return np.asarray(replaced)
-
-    def _draw_lengths(self, entry: Indices) -> Array:
-        """Step lengths from a Cauchy distribution about the memory, drawn again where not positive, at most 1."""
-        F = np.zeros(len(entry))
-        while (none := F <= 0).any():
-            F[none] = self._lengths[entry[none]] + LENGTH_SPREAD * self._rng.standard_cauchy(int(none.sum()))
-        return np.minimum(F, 1.0)
-
-    def _learn(self, better: Mask, merits: Array) -> None:
-        """Put the successful lengths and rates into the memory, weighted by relative improvement, free of its unit."""
-        F, rates = (drawn[better] for drawn in self._drawn)
-        old, new = self.merits[better], merits[better]
-        with np.errstate(invalid="ignore"):
-            gain = np.where(np.isfinite(old), (old - new) / (np.abs(old) + np.abs(new)), 1.0)
-        weights = gain / gain.sum()
-        self._lengths[self._entry] = (weights @ F**2) / (weights @ F)
-        self._rates[self._entry] = weights @ rates
-        self._entry = (self._entry + 1) % MEMORY_SIZE
-
-
-def first_population(members: int, start: Array, rng: np.random.Generator) -> Array:
-    """Draw a Latin hypercube of the unit cube, with the start as its first point, shape (members, n)."""
-    cells = np.array([rng.permutation(members) for _ in start]).T
-    found: Array = (cells + rng.random(cells.shape)) / members
-    found[0] = np.clip(start, 0.0, 1.0)
-    return found
-
-
-def _others(m: int, size: int, rng: np.random.Generator) -> tuple[Indices, Indices]:
-    """For each of m members another one, and a third out of `size`, shapes (m,): neither is the member itself."""
-    own = np.arange(m)
-    one = (own + rng.integers(1, m, size=m)) % m
-    third: Indices = rng.integers(0, size - 2, size=m)
-    low, high = np.minimum(own, one), np.maximum(own, one)
-    third += third >= low
-    return one, third + (third >= high)
-
-
-WIDEN_BOUNDS = "widen the gains' bounds, or lower their lower ends"  # the remedy where no stable loop is found
-
-
-def compute_merits(values: Mapping[str, Array], spec: Specification, scale: float) -> Array:
-    """The objective of points that keep all limits; of others more than any objective, graded by their violations.
-
-    So limits come first, whatever unit the objective has: K. Deb, An efficient constraint handling method for genetic
-    algorithms, Comput. Methods Appl. Mech. Engrg. 186 (2000) 311-338. Where a settling time is minimised, a response
-    that never settles counts as a violation, the larger the further from the reference it ends, so that a search can
-    start.
-
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (m,)
-        As `Responses` has them.
-    scale : float
-        The horizon, which stands for the settling time of what never settles [s].
-    """
-    filled = {n: np.where(np.isfinite(value), value, WORST_MERIT) for n, value in values.items()}
-    settles, late = np.isfinite(values["SettlingTime"]), penalty_settling_time(scale, filled["Excess"])
-    filled["SettlingTime"] = np.where(settles, filled["SettlingTime"], late)
-    missed = np.where(settles, 0.0, late / scale) if spec.weight(SettlingTime) else np.zeros_like(late)
-    for share in spec.excess(filled).values():
-        missed += VIOLATION_PENALTY * np.maximum(0.0, share)
-    total = np.zeros_like(late)
-    for q, weight in spec.weights.items():
-        total += weight * filled[metric_name(q)]
-    return np.where(missed > 0, WORST_MERIT * (1 + missed), np.minimum(total, WORST_MERIT))
-
-
-def search_result(task: TuningTask, simulator: Simulator, spec: Specification, point: Array) -> SearchResult:
-    """The result of a search by simulation: its best point, of shape (n,), with its status and what is active there.
-
-    Parameters
-    ----------
-    task : TuningTask
-        Whose limits the status is about.
-    simulator : Simulator
-    spec : Specification
-        The tightened one that was searched for.
-    point : ndarray, shape (n,)
-    """
-    values = to_records(simulator.values(point[None], spec))[0]
-    active = _active_limits(task.space, spec, point, values)
-    return SearchResult(point, _search_status(task.spec, values), active, {"optimum": spec.objective(values)})
-
-
-def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
-    """The status of a search: converged where its point keeps the limits; otherwise it says which ones are broken."""
-    broken = [
-        f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"
-        for q in spec.violations(values, LIMIT_TOLERANCE)
-    ]
-    if not broken and spec.with_stability().violations(values):
-        Ms = values["MaxSensitivity"]
-        nearly = f"nearly unstable, with a MaxSensitivity of {Ms:.3g}, more than {STABILITY_SENSITIVITY:g}"
-        verdict = f"the closest found is {nearly if np.isfinite(Ms) else 'no stable loop'}"
-        return Status(Code.INFEASIBLE, (verdict, WIDEN_BOUNDS))
-    if broken:
-        verdict = f"the closest found has {' and '.join(broken)}"
-        return Status(Code.INFEASIBLE, (verdict, "relax a limit or widen the bounds"))
-    if not np.isfinite(spec.objective(values)):
-        return Status(
-            Code.NOT_CONVERGED, ("nothing found settles", "widen the band or the bounds, or lengthen the horizon")
-        )
-    return Status(Code.CONVERGED)
-
-
-def _active_limits(space: Space, spec: Specification, point: Array, values: Mapping[str, float]) -> tuple[str, ...]:
-    """The names of limits that are reached to within 2 %, and of gains within 0.1 % of their range from a bound."""
-    limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= 0.98 * upper_limit(q)]
-    low, up = space.bounds.T
-    near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
-    return (*limits, *(n for n, held in zip(space.names, near, strict=True) if held))
 
 
 @dataclass(frozen=True)
@@ -499,9 +151,13 @@ class Racing:
         method = replace(self, bands=(), trials=max(1, self.trials // 3)) if attempt else self
         best = run_racing(task, simulator, spec, method, start, progress)
         result = search_result(task, simulator, spec, best.point)
-        counts = {"simulations": best.count, "starts": best.starts, "starts_agreeing": best.agreeing}
-        stats = {**result.stats, **{n: float(count) for n, count in counts.items()}}
-        return replace(result, stats=stats, is_complete=best.is_complete, uses_simulator=True)
+        return replace(
+            result,
+            simulations=best.count,
+            agreement=Agreement(best.starts, best.agreeing),
+            is_complete=best.is_complete,
+            uses_simulator=True,
+        )
 
     def shorten(self, margin: float) -> "Racing":
         """The method for a short search from a point that is close."""
@@ -515,33 +171,13 @@ class Racing:
 
 @dataclass(frozen=True, eq=False)
 class RacingResult:
-    """What a search found.
-
-    Parameters
-    ----------
-    point : ndarray, shape (n,)
-        The gains with the least merit.
-    count : int
-        Candidates simulated.
-    is_complete : bool
-        False where Ctrl-C cut the search short.
-    starts, agreeing : int
-        Starts, and how many of them ended within 1 % of the best.
-    """
+    """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best."""
 
     point: Array
     count: int
     is_complete: bool
     starts: int
     agreeing: int
-
-
-class _Phase(NamedTuple):
-    """A part of a search: what it reads, on which samples, and how many trials it may take."""
-
-    name: str
-    simulator: Simulator
-    trials: int
 
 
 def run_racing(
@@ -554,18 +190,8 @@ def run_racing(
 ) -> RacingResult:
     """Search in phases from starts that differ in kind; Ctrl-C ends the search with the best point so far.
 
-    Parameters
-    ----------
-    task : TuningTask
-    simulator : Simulator
-    spec : Specification
-        Already tightened.
-    method : Racing
-        Without `bands` it searches about the start.
-    start : ndarray, shape (n,)
-        A member of the first population.
-    progress : callable
-        Receives a line of text a generation.
+    `spec` is tightened; `start` (n,) is a member of the first population, and a method without `bands` searches about
+    it.
     """
     rng, space = np.random.default_rng(method.seed), simulator.space
     search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress)
@@ -575,6 +201,271 @@ def run_racing(
         best = space.from_unit(search.best_so_far())
         return RacingResult(best, search.count, False, search.starts, search.agreeing)
     return RacingResult(space.from_unit(search.best), search.count, True, search.starts, search.agreeing)
+
+
+# What may be asked for where responses are cut short: nothing of it grows after the response has settled.
+CUT_REQUIREMENTS = (SettlingTime, Overshoot, PeakControl, ControlRate, *ROBUSTNESS_REQUIREMENTS)
+
+
+class Race:
+    """Races on one simulator for one specification.
+
+    `scale`, the horizon [s], stands for the settling time of what never settles; `count` is the number of points
+    simulated, on one case or more; `is_cut` says that races see less than the whole of a response.
+    """
+
+    def __init__(self, simulator: Simulator, spec: Specification, scale: float) -> None:
+        self._whole, self._spec, self._scale, self.count = simulator, spec, scale, 0
+        self._plain = spec.without(ROBUSTNESS_REQUIREMENTS)
+        self._kills, self._records = np.zeros(len(simulator.cases)), np.empty(0)
+        self._uses_bounds = simulator.rollout.uses_machine_code and not spec.weight(ROBUSTNESS_REQUIREMENTS)
+        self.cut(np.inf)
+
+    def cut(self, duration: float) -> None:
+        """Let races see so much of each response after the step only [s]."""
+        self._simulator = self._whole if duration == np.inf else self._whole.cut(duration)
+        self.is_cut = any(len(a.t) < len(b.t) for a, b in zip(self._simulator.grids, self._whole.grids, strict=True))
+        self._course = _course(self._simulator, self._spec.band)
+
+    def merits(self, points: Array, rivals: Array | None = None) -> tuple[Array, Indices]:
+        """The merit of each point on every case and on the whole response, and its worst case, shapes (m,).
+
+        Where `rivals`, shape (m,), are given, a point that is certain to be worse gets a bound above its rival's merit.
+        """
+        self.count += len(points)
+        responses = self._whole.respond(points, self._spec.band)
+        return self._complete_merits(responses, np.full(len(points), np.inf) if rivals is None else rivals)
+
+    def race(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
+        """Merits and worst cases (m,) of points (m, n) no worse than their rivals; of others more than the rival's.
+
+        `first` (m,) is the case on which each point is simulated first, its rival's worst; of a loser the worst case is
+        the one by which it lost.
+        """
+        self.count += len(points)
+        compete, most = self._race_cases, len(points)
+        if self._uses_bounds:
+            numbers = len(self._course.length) * self._course.t.shape[1] * self._simulator.rollout.n_outputs
+            compete, most = self._race_lanes, max(1, MAX_RECORDED_NUMBERS // numbers)
+        merits, worst = np.full(len(points), np.inf), first.copy()
+        for k in range(0, len(points), most):
+            part = slice(k, k + most)
+            merits[part], worst[part] = compete(points[part], rivals[part], first[part])
+        lost = np.bincount(worst[merits > rivals], minlength=len(self._kills))
+        self._kills = MEMORY_OF_KILLS * self._kills + lost
+        return merits, worst
+
+    def _race_lanes(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
+        """Race in machine code, and read the responses of what comes through."""
+        simulator, (m, C) = self._simulator, (len(points), len(self._kills))
+        row, case = np.divmod(np.arange(m * C), C)
+        p, starts = simulator.lanes(points, row, case)
+        n, outputs = self._course.t.shape[1], simulator.rollout.n_outputs
+        if self._records.size < m * C * n * outputs:
+            self._records = np.empty(m * C * n * outputs)
+        y = self._records[: m * C * n * outputs].reshape(m, C, n, outputs)
+        rank = np.tile(-self._kills, (len(first), 1))
+        rank[np.arange(len(first)), first] = -np.inf
+        order = np.argsort(rank, axis=1, kind="stable")  # the first case, then those that beat the most points
+        field = RaceField(p, starts, simulator.sampled.periods(p), order, rivals)
+        kinds = [next(kind for kind in REQUIREMENT_KINDS if kind.metric.name == n) for n in RACE_VALUES]
+        weights, limits = np.array([[self._plain.weight(kind), self._plain.limit(kind)] for kind in kinds]).T
+        edges = (1 + EDGE_ROUNDING) * np.array([band_number(band) for band in simulator.bands(self._spec.band)])
+        merit = RaceMerit(edges, weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL)
+        outcome = race(simulator.rollout, self._course, merit, field, y)
+        merits, worst, through = np.full(m, np.inf), outcome.loser.copy(), outcome.loser < 0
+        if through.any():
+            lanes = through[row]
+            states, ends = (a[through].reshape(-1, *a.shape[2:]) for a in (outcome.x, outcome.x_end))
+            run = states, y[through].reshape(-1, n, outputs), ends
+            responses = simulator.read(p[lanes], case[lanes], run, (int(through.sum()), C), self._spec.band)
+            merits[through], worst[through] = self._complete_merits(responses, rivals[through])
+        return merits, worst
+
+    def _race_cases(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
+        """Race case by case: the first one of every point, then all cases of those that are not beaten by it."""
+        merits, worst, C = np.full(len(points), np.inf), first.copy(), len(self._kills)
+        ahead = np.ones(len(points), dtype=bool)
+        if C > 1 and not self._spec.weight(ROBUSTNESS_REQUIREMENTS):
+            opening = self._simulator.respond(points, self._spec.band, np.arange(C) == first[:, None])
+            ahead = compute_merits(opening.values, self._plain, self._scale) <= rivals
+        if ahead.any():
+            responses = self._simulator.respond(points[ahead], self._spec.band)
+            merits[ahead], worst[ahead] = self._complete_merits(responses, rivals[ahead])
+        return merits, worst
+
+    def _complete_merits(self, responses: Responses, rivals: Array) -> tuple[Array, Indices]:
+        """Merits and worst cases of points that ran on every case, margins left out of the latter.
+
+        Margins, a frequency response each, cost as much as a simulation and can only raise a merit, so they are read of
+        points that can still beat their rival.
+        """
+        merits = np.full(len(rivals), -np.inf)
+        if not self._spec.weight(ROBUSTNESS_REQUIREMENTS):
+            merits = compute_merits(responses.values, self._plain, self._scale)
+        if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
+            ahead = merits <= rivals
+            if ahead.any():
+                merits[ahead] = compute_merits(responses.with_margins(ahead), self._spec, self._scale)
+        if len(self._kills) == 1 or self._spec.weight(ROBUSTNESS_REQUIREMENTS):
+            return merits, np.zeros(len(rivals), dtype=np.intp)
+        table = responses.to_table(compute_merits(responses.by_case(), self._plain, self._scale))
+        return merits, np.asarray(np.argmax(table, axis=1))
+
+
+def may_be_cut(spec: Specification) -> bool:
+    """Whether nothing is asked for that happens after a response has settled."""
+    kinds = (*spec.weights, *spec.limits)
+    return all(isinstance(q, SettlingTime) for q in spec.weights) and all(
+        isinstance(q, CUT_REQUIREMENTS) for q in kinds
+    )
+
+
+def _course(simulator: Simulator, band: Band) -> RaceCourse:
+    """The cases of a simulator, as a race in machine code takes them."""
+    grids = simulator.grids
+    n, grid = max(len(g.t) for g in grids), np.array([simulator.grid_index(k) for k in range(len(simulator.cases))])
+    u, t, h = (np.array(arrays) for arrays in zip(*(g.pad(n) for g in grids), strict=True))
+    settings = [
+        (r.final, r.nominal_size, r.initial, g.spacing, g.t[g.step_index] - r.at, float(r.changes), band_unit(band, r))
+        for g, r in ((g, g.reference) for g in grids)
+    ]
+    length, first = np.array([[len(g.t), g.step_index] for g in grids]).T
+    return RaceCourse(
+        u, t, h, grid, length[grid], first[grid], np.array(settings)[grid], max(simulator.substeps), KEPT_STATES
+    )
+
+
+class SuccessHistory:
+    """Points of the unit cube (m, n) with merits (m,), of which small ones are good, and what trials have taught."""
+
+    def __init__(self, population: Array, merits: Array, rng: np.random.Generator) -> None:
+        self.population, self.merits, self._rng = population.copy(), merits.copy(), rng
+        self._archive = np.empty((0, population.shape[1]))
+        self._lengths, self._rates, self._entry = np.full(MEMORY_SIZE, 0.5), np.full(MEMORY_SIZE, 0.5), 0
+        self._drawn = (np.empty(0), np.empty(0))
+
+    def propose(self) -> Array:
+        """Draw a trial point for each member, shape (m, n), towards one of the best."""
+        rng, x = self._rng, self.population
+        m, n = x.shape
+        entry: Indices = rng.integers(0, MEMORY_SIZE, len(x))
+        F = np.zeros(m)  # Cauchy, and rates normal, about the memory with a spread of 0.1, as published
+        while (none := F <= 0).any():
+            F[none] = self._lengths[entry[none]] + 0.1 * rng.standard_cauchy(int(none.sum()))
+        F, rates = np.minimum(F, 1.0), np.clip(rng.normal(self._rates[entry], 0.1), 0.0, 1.0)
+        best = np.argsort(self.merits, kind="stable")[: max(2, round(BEST_SHARE * m))]
+        towards = x[rng.choice(best, m)]
+        one, other = _others(m, m + len(self._archive), rng)
+        pool = np.vstack([x, self._archive])
+        mutant = x + F[:, None] * (towards - x) + F[:, None] * (x[one] - pool[other])
+        mutant = np.where(mutant < 0, x / 2, np.where(mutant > 1, (1 + x) / 2, mutant))
+        taken = rng.random((m, n)) < rates[:, None]
+        taken[np.arange(m), rng.integers(n, size=m)] = True
+        self._drawn = F, rates
+        return np.where(taken, mutant, x)
+
+    def select(self, trials: Array, merits: Array) -> Mask:
+        """Put trials (m, n) that are no worse in their parents' place, learn from the better ones; who was replaced.
+
+        Of a trial that has lost a bound above its parent's merit is enough.
+        """
+        replaced, better = merits <= self.merits, merits < self.merits
+        if better.any():
+            # what succeeded is remembered by its relative improvement, which is free of the merit's unit
+            F, rates = (drawn[better] for drawn in self._drawn)
+            old, new = self.merits[better], merits[better]
+            with np.errstate(invalid="ignore"):
+                gain = np.where(np.isfinite(old), (old - new) / (np.abs(old) + np.abs(new)), 1.0)
+            weights = gain / gain.sum()
+            self._lengths[self._entry] = (weights @ F**2) / (weights @ F)
+            self._rates[self._entry] = weights @ rates
+            self._entry = (self._entry + 1) % MEMORY_SIZE
+            archive = np.vstack([self._archive, self.population[better]])
+            kept = self._rng.permutation(len(archive))[: len(trials)]
+            self._archive = archive[np.sort(kept)]
+        self.population[replaced], self.merits[replaced] = trials[replaced], merits[replaced]
+        return np.asarray(replaced)
+
+
+def first_population(members: int, start: Array, rng: np.random.Generator) -> Array:
+    """Draw a Latin hypercube of the unit cube, with the start as its first point, shape (members, n)."""
+    cells = np.array([rng.permutation(members) for _ in start]).T
+    found: Array = (cells + rng.random(cells.shape)) / members
+    found[0] = np.clip(start, 0.0, 1.0)
+    return found
+
+
+def _others(m: int, size: int, rng: np.random.Generator) -> tuple[Indices, Indices]:
+    """For each of m members another one, and a third out of `size`, shapes (m,): neither is the member itself."""
+    own = np.arange(m)
+    one = (own + rng.integers(1, m, size=m)) % m
+    third: Indices = rng.integers(0, size - 2, size=m)
+    low, high = np.minimum(own, one), np.maximum(own, one)
+    third += third >= low
+    return one, third + (third >= high)
+
+
+WIDEN_BOUNDS = "widen the gains' bounds, or lower their lower ends"  # the remedy where no stable loop is found
+
+
+def compute_merits(values: Mapping[str, Array], spec: Specification, scale: float) -> Array:
+    """The objective (m,) of points that keep all limits; of others more than any objective, graded by violations.
+
+    So limits come first, whatever unit the objective has: K. Deb, An efficient constraint handling method for genetic
+    algorithms, Comput. Methods Appl. Mech. Engrg. 186 (2000) 311-338. Where a settling time is minimised, a response
+    that never settles counts as a violation, the larger the further from the reference it ends, on the `scale` of the
+    horizon [s], so that a search can start.
+    """
+    filled = {n: np.where(np.isfinite(value), value, WORST_MERIT) for n, value in values.items()}
+    settles, late = np.isfinite(values["SettlingTime"]), penalty_settling_time(scale, filled["Excess"])
+    filled["SettlingTime"] = np.where(settles, filled["SettlingTime"], late)
+    missed = np.where(settles, 0.0, late / scale) if spec.weight(SettlingTime) else np.zeros_like(late)
+    for share in spec.excess(filled).values():
+        missed += VIOLATION_PENALTY * np.maximum(0.0, share)
+    total = np.zeros_like(late)
+    for q, weight in spec.weights.items():
+        total += weight * filled[metric_name(q)]
+    return np.where(missed > 0, WORST_MERIT * (1 + missed), np.minimum(total, WORST_MERIT))
+
+
+def search_result(task: TuningTask, simulator: Simulator, spec: Specification, point: Array) -> SearchResult:
+    """The result of a search by simulation for a tightened `spec`: its best point (n,), and what is active there."""
+    values = to_records(simulator.values(point[None], spec))[0]
+    limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= (1 - ACTIVE_ROOM) * upper_limit(q)]
+    low, up = task.space.bounds.T
+    near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
+    active = (*limits, *(n for n, held in zip(task.space.names, near, strict=True) if held))
+    return SearchResult(point, _search_status(task.spec, values), active, optimum=spec.objective(values))
+
+
+def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
+    """The status of a search: converged where its point keeps the limits; otherwise it says which ones are broken."""
+    broken = [
+        f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"
+        for q in spec.violations(values, LIMIT_TOLERANCE)
+    ]
+    if not broken and spec.with_stability().violations(values):
+        Ms = values["MaxSensitivity"]
+        nearly = f"nearly unstable, with a MaxSensitivity of {Ms:.3g}, more than {STABILITY_SENSITIVITY:g}"
+        verdict = f"the closest found is {nearly if np.isfinite(Ms) else 'no stable loop'}"
+        return Status(Code.INFEASIBLE, (verdict, WIDEN_BOUNDS))
+    if broken:
+        verdict = f"the closest found has {' and '.join(broken)}"
+        return Status(Code.INFEASIBLE, (verdict, "relax a limit or widen the bounds"))
+    if not np.isfinite(spec.objective(values)):
+        return Status(
+            Code.NOT_CONVERGED, ("nothing found settles", "widen the band or the bounds, or lengthen the horizon")
+        )
+    return Status(Code.CONVERGED)
+
+
+class _Phase(NamedTuple):
+    """A part of a search: what it reads, on which samples, and how many trials it may take."""
+
+    name: str
+    simulator: Simulator
+    trials: int
 
 
 def _phases(simulator: Simulator, spec: Specification, method: Racing, share: float) -> Iterator[_Phase]:
@@ -626,7 +517,8 @@ class _RacingSearch:
         names, given = self._space.names, self.best
         population = first_population(method.members, given, self._rng)
         if not method.bands:
-            population[1:] = _near(given, population[1:], self._rng)
+            others = population[1:]  # every other one lies close to the start
+            others[::2] = np.clip(given + NEARBY * self._rng.standard_normal(others.shape), 0.0, 1.0)[::2]
             self._points = POLISHED_NEARBY
         bests = list[float]()
         for share in START_SHARES:
@@ -645,7 +537,7 @@ class _RacingSearch:
         """Search on fine samples: by gradients from the best points, then by trials, and again where those got on."""
         few = np.vstack([self._best_first(population, self._coarse)[0][:FINE_MEMBERS], *self._polished])
         population, merits = self._polish(*self._best_first(few, fine.simulator), fine.simulator, iterations)
-        best = merits[0] * (1 - LEAST_PROGRESS)
+        best = merits[0] * (1 - LEAST_IMPROVEMENT)
         population, merits = self.evolve(population[:FINE_MEMBERS], fine)
         if merits[0] < best:
             self._polish(population, merits, fine.simulator, iterations)
@@ -704,7 +596,9 @@ class _RacingSearch:
         for number in range(-(-phase.trials // len(population))):
             trials = history.propose()
             merits, cases = race.race(self._space.from_unit(trials), history.merits, worst)
-            merits = self._prove(race, trials, merits, best)
+            better = (merits < best) & race.is_cut
+            if better.any():  # a new best is proved on its whole response
+                merits[better] = race.merits(self._space.from_unit(trials[better]))[0]
             worst = np.where(history.select(trials, merits), cases, worst)
             self.count = before + race.count
             if history.merits.min() < best:
@@ -717,24 +611,13 @@ class _RacingSearch:
         order = np.argsort(history.merits, kind="stable")
         return history.population[order], history.merits[order]
 
-    def _prove(self, race: Race, trials: Array, merits: Array, best: float) -> Array:
-        """Merits, those that beat the best one on responses cut short replaced by those on whole responses."""
-        better = (merits < best) & race.is_cut
-        if better.any():
-            merits[better] = race.merits(self._space.from_unit(trials[better]))[0]
-        return merits
-
     def _cut(self, race: Race) -> None:
-        """Cut the responses of a race."""
-        race.cut(self._cut_time())
-
-    def _cut_time(self) -> float:
-        """A multiple of the best settling time [s], where later samples change no merit; elsewhere infinity."""
-        if not may_be_cut(self._spec):
-            return np.inf
-        values = self._coarse.respond(self._space.from_unit(self.best[None]), self._spec.band)
-        settled = float(values.values["SettlingTime"][0])
-        return max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf
+        """Cut a race's responses at a multiple of the best settling time, where later samples change no merit."""
+        settled = np.inf
+        if may_be_cut(self._spec):
+            values = self._coarse.respond(self._space.from_unit(self.best[None]), self._spec.band).values
+            settled = float(values["SettlingTime"][0])
+        race.cut(max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf)
 
 
 def _distinct_points(unit: Array) -> Indices:
@@ -746,15 +629,10 @@ def _distinct_points(unit: Array) -> Indices:
     return np.array(found)
 
 
-def _near(best: Array, others: Array, rng: np.random.Generator) -> Array:
-    """Points about the best one, in place of half of the others."""
-    close = np.clip(best + NEARBY * rng.standard_normal(others.shape), 0.0, 1.0)
-    return np.where((np.arange(len(others)) % 2 == 0)[:, None], close, others)
-
-
 def _is_done(stand: Sequence[tuple[float, float]], merits: Array) -> bool:
     """Whether a population no longer advances: its best and its median stand still, or all its members are alike."""
-    stands = len(stand) > PATIENCE and all(
-        now > before * (1 - LEAST_PROGRESS) for now, before in zip(stand[-1], stand[-1 - PATIENCE], strict=True)
+    stands = len(stand) > STALLED_GENERATIONS and all(
+        now > before * (1 - LEAST_IMPROVEMENT)
+        for now, before in zip(stand[-1], stand[-1 - STALLED_GENERATIONS], strict=True)
     )
     return stands or bool(np.ptp(merits) <= LEAST_SPREAD * abs(merits.min()))

@@ -21,16 +21,15 @@ from pneuopt.evaluation.tolerances import TAIL_SHARE
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import MAX_LOCAL_SIMULATIONS, RELAXED_LIMIT_DIGITS, UNSETTLED_EXCESS
+from pneuopt.tuning.tolerances import MAX_LOCAL_SIMULATIONS, RELAXED_DIGITS, UNSETTLED_EXCESS
 
 
 def relaxation_specification(
     spec: Specification, requirement: Requirement, references: Sequence[Reference]
 ) -> Specification:
-    """The specification of the tuning that makes a limited requirement as small as the other limits allow.
+    """The tuning that makes a limited requirement as small as the other limits allow; the response still settles.
 
-    Where a settling time was minimised, the response still has to settle. The objective is scaled to the size of the
-    horizon, as the searches' penalties are.
+    The objective is scaled to the size of the horizon, as the searches' penalties are.
     """
     limits, horizon = limits_with_settling(spec, references), min(r.horizon - r.at for r in references)
     weights = {with_user_limit(requirement, None): horizon / upper_limit(requirement)}
@@ -51,20 +50,7 @@ def limits_with_settling(
 
 
 def relax_all(simulator: Simulator, space: Space, spec: Specification, points: Sequence[Array]) -> Array:
-    """Find the point for which the limits have to widen by the least common share, by Nelder-Mead.
-
-    Parameters
-    ----------
-    simulator : Simulator
-    space : Space
-    spec : Specification
-    points : sequence of ndarray, shape (n,)
-        Starts, of which the best is taken.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-    """
+    """The point (n,) for which limits widen by the least common share, by Nelder-Mead from the best of the points."""
 
     def share(unit: Array) -> Array:
         return limit_excess(simulator.values(space.from_unit(np.clip(unit, 0.0, 1.0)), spec), spec)
@@ -101,16 +87,9 @@ def limit_excess(values: Mapping[str, Array], spec: Specification) -> Array:
 def relaxation_row(
     requirement: Requirement | None, value: float, point: Array, names: Sequence[str]
 ) -> dict[str, float]:
-    """A row of `TuningResult.relaxations`.
+    """A row of `TuningResult.relaxations`: a requirement with its least value, or (None) all with their least share.
 
-    Parameters
-    ----------
-    requirement : Requirement or None
-        None: all limits together.
-    value : float
-        The least value on the user's scale, NaN where no design was found; for all together the least share.
-    point : ndarray, shape (n,)
-    names : sequence of str
+    The value is on the user's scale, NaN where no design was found.
     """
     gains = dict(zip(names, point.tolist(), strict=True)) if np.isfinite(value) else dict.fromkeys(names, nan)
     if requirement is None:
@@ -142,6 +121,6 @@ def _round_outwards(value: float, *, upwards: bool) -> float:
     """
     if not 0 < abs(value) < inf:
         return value
-    place = 10.0 ** (floor(log10(abs(value))) - RELAXED_LIMIT_DIGITS + 1)
+    place = 10.0 ** (floor(log10(abs(value))) - RELAXED_DIGITS + 1)
     steps = (ceil if upwards else floor)(value / place * (1 - 1e-12 if upwards else 1 + 1e-12))
-    return float(f"{steps * place:.{RELAXED_LIMIT_DIGITS}g}")
+    return float(f"{steps * place:.{RELAXED_DIGITS}g}")

@@ -27,6 +27,7 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, 
 from pneuopt.quantities.results import NOT_SAVED, Result
 from pneuopt.quantities.status import Code, Status, report_status
 from pneuopt.quantities.units import write_value
+from pneuopt.tuning.method import Agreement
 from pneuopt.tuning.relaxation import describe_relaxations
 from pneuopt.tuning.tolerances import ACTIVE_ROOM, MIN_DERIVATIVE_RATIO
 from pneuopt.tuning.validation import DesignValidation, report_validation, report_validation_verdict
@@ -47,20 +48,8 @@ class Refusal(Enum):
 class RequirementRow(TypedDict):
     """A row of `TuningResult.requirements`, an objective or a limit at its worst over the cases.
 
-    Attributes
-    ----------
-    claimed : float
-        Value by the search, as the user writes it: a fraction where `Overshoot.max` is one.
-    certified : float
-        Value by the independent simulation.
-    allowed : float
-        Limit; NaN where there is none.
-    room : float
-        What is left of the limit as a fraction of it; negative where it is broken [1].
-    case : str
-        Where it is worst.
-    active : bool
-        Whether it holds the objective back.
+    Figures are as the user writes them, a fraction where `Overshoot.max` is one; `allowed` is NaN without a limit,
+    `room` what is left of it as a fraction [1], negative where it is broken.
     """
 
     claimed: float
@@ -124,6 +113,8 @@ class TuningResult(Result):
     best : mapping of str to float
         Where the given gains stand, the tuned parameters' values in the best candidate that was found, rounded [SI],
         of which `claimed` and `certified` tell; empty where the design is certified, or none was found.
+    agreement : Agreement, optional
+        How far the starts of the search agree.
     refusal : Refusal, optional
         What the search goes on by where the certificate has refused the design.
     """
@@ -145,6 +136,7 @@ class TuningResult(Result):
     limits: Mapping[str, float] = field(default_factory=dict)
     rest: RestCheck | None = None
     best: Mapping[str, float] = field(default_factory=dict)
+    agreement: Agreement | None = field(default=None, metadata=NOT_SAVED)
     refusal: Refusal | None = field(default=None, metadata=NOT_SAVED)
 
     @property
@@ -237,22 +229,15 @@ def report_tuning(
 ) -> Report:
     """How a tuning ended, and its design; of one that failed what was refused, and how far limits have to give way.
 
-    Parameters
-    ----------
-    result : TuningResult
-    was : DataFrame, optional
-        Metrics with the gains before, to stand beside the certified ones.
-    source : str
-        What stands where the tuning failed; empty where nothing was sought.
+    `was` are the metrics with the gains before, `source` names the gains that stand where it failed, empty where
+    nothing was sought.
     """
-    head = report_status(result.status) if source else report_certificate_status(result.status)
-    return head + (_report_design(result, was) if result.status.converged else report_refusal(result, source))
-
-
-def _report_design(result: TuningResult, was: "pd.DataFrame | None") -> Report:
+    found = report_status(result.status) if source else report_certificate_status(result.status)
+    if not result.status.converged:
+        return found + report_refusal(result, source)
     tried, certificate = result.validation, result.certificate
     beside = ("was", was) if result.on_rig is None else ("on rig", result.on_rig)
-    found = report_validation_verdict(tried) if tried else Report()
+    found += report_validation_verdict(tried) if tried else Report()
     found += report_gains(result.given, result.parameters)
     found += report_metrics(result.certified, result.units, beside=beside, limits=result.limits)
     found += report_active(result.requirements, result.active, result.parameters)
@@ -270,14 +255,7 @@ def report_certificate_status(status: Status) -> Report:
 
 
 def report_refusal(result: TuningResult, source: str) -> Report:
-    """The gains that stand, and what was refused, or is the best so far, with its figures.
-
-    Parameters
-    ----------
-    result : TuningResult
-    source : str
-        What stands; empty where nothing was sought.
-    """
+    """The gains that stand, named by `source`, and what was refused, or is the best so far, with its figures."""
     word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected" if source else "simulated"
     tried = ", ".join(f"{n} {write_value(v, result.parameters[n].unit)}" for n, v in result.best.items())
     lead = Report((Line(f"{source} stand; {word}: {tried or 'none was found'}"),)) if source else Report()
@@ -287,14 +265,7 @@ def report_refusal(result: TuningResult, source: str) -> Report:
 
 
 def report_gains(given: Mapping[str, float], tuned: ParameterSet) -> Report:
-    """Each free parameter before and after tuning, within its bounds, and the gains in another form.
-
-    Parameters
-    ----------
-    given : mapping of str to float
-        Values before; empty where they are unknown.
-    tuned : ParameterSet
-    """
+    """Each free parameter within its bounds before, where known, and after tuning, and the gains in another form."""
     rows = []
     for n in tuned.free_names:
         p, before = tuned[n], [write_value(given[n], tuned[n].unit)] if n in given else [""] * bool(given)
@@ -331,16 +302,7 @@ def _standard_form(gains: ParallelForm) -> str:
 
 
 def report_active(requirements: "pd.DataFrame", active: Sequence[str], parameters: ParameterSet) -> Report:
-    """What keeps the objective from being smaller: limits with the room that is left, and bounds of the gains.
-
-    Parameters
-    ----------
-    requirements : DataFrame
-    active : sequence of str
-        As of a `TuningResult`.
-    parameters : ParameterSet
-        The tuned ones.
-    """
+    """What keeps the objective from being smaller: limits with the room that is left, and bounds of the gains."""
     limits = [f"{n} ({100 * row['room']:.2g} % of room left)" for n, row in requirements.iterrows() if row["active"]]
     at_bounds = [n for n in parameters.free_names if parameters.value(n) in (parameters[n].lower, parameters[n].upper)]
     others = (*at_bounds, *(a for a in active if a not in requirements.index))

@@ -2,9 +2,7 @@
 
 `Responses`: the metrics of simulated candidates, a lane each candidate and case, and their worst over the cases.
 
-`ResponsePoints`: where lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
-
-The points are those of `operating_points` in evaluation/margins.py. A search keeps few states
+`PointFinder`: the operating points of lanes (`operating_points` in evaluation/margins.py). A search keeps few states
 along a response: the fastest sample is read off the outputs, and the states there come from a second run, from the last
 kept ones up to it. Under dither further runs go through the period around it, and through the one after the end, off
 which the ripple is read.
@@ -64,15 +62,8 @@ from pneuopt.tuning.tolerances import (
 class ResponsePoints(NamedTuple):
     """Where m lanes begin, move fastest and end.
 
-    Attributes
-    ----------
-    states : ndarray, shape (m, k, n_states)
-        At every `KEPT_STATES`-th sample.
-    ends : ndarray, shape (m, n_states)
-    fastest : ndarray of int, shape (m,)
-        Sample of the largest speed, under dither of the speed without its ripple.
-    command : ndarray, shape (m,)
-        The commands in which they end.
+    States (m, k, n_states) stand at every `KEPT_STATES`-th sample, `ends` (m, n_states) with the commands (m,) there;
+    `fastest` (m,) is the sample of the largest speed, under dither without its ripple.
     """
 
     states: Array
@@ -87,20 +78,12 @@ class ResponsePoints(NamedTuple):
         return ResponsePoints(*states, np.zeros(m, dtype=np.intp), np.zeros(m))
 
     def select(self, rows: Indices | Mask) -> "ResponsePoints":
-        """The passage of some lanes."""
+        """The points of some lanes."""
         return ResponsePoints(self.states[rows], self.ends[rows], self.fastest[rows], self.command[rows])
 
 
 def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices:
-    """Samples of the largest speed after the step, shape (m,), as `ResponsePoints` has them.
-
-    Parameters
-    ----------
-    grid : ReferenceGrid
-    speed : ndarray, shape (m, n)
-    period : float
-        Of the dither [s]; 0 for none.
-    """
+    """Samples (m,) of the largest of speeds (m, n) after the step, without a dither's ripple of this period [s]."""
     first = grid.step_index
     return np.asarray(first + first_largest(without_ripple(grid.t, speed, period)[:, first:]))
 
@@ -109,13 +92,7 @@ def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices
 class PointFinder:
     """Function that gives the operating points of simulated lanes, by a second run up to the fastest sample.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-    rollout : Rollout
-        Of `loop_pieces`.
-    rate : float
-        The fastest eigenvalue that RK4 has to resolve [1/s].
+    `rate` [1/s] is the fastest eigenvalue that RK4 has to resolve.
     """
 
     loop: ClosedLoop
@@ -123,36 +100,23 @@ class PointFinder:
     rate: float
 
     def __call__(
-        self, grids: Sequence[tuple[ReferenceGrid, Indices]], p: Array, periods: Array, passage: ResponsePoints
+        self, grids: Sequence[tuple[ReferenceGrid, Indices]], p: Array, periods: Array, response_points: ResponsePoints
     ) -> tuple[Array, Array]:
-        """Find the points.
+        """The plant's states (k, m, n_states) and inputs at rest, sliding, and at the end; if affine at the end.
 
-        Parameters
-        ----------
-        grids : sequence of (ReferenceGrid, ndarray of int)
-            Each grid and the lanes that run on it.
-        p : ndarray, shape (m, n_parameters)
-        periods : ndarray, shape (m,)
-            Periods over which lanes are averaged [s]; 0: they are not.
-        passage : ResponsePoints
-
-        Returns
-        -------
-        x : ndarray, shape (k, m, n_plant_states)
-        u : ndarray, shape (k, m, n_plant_inputs)
-            Of k points: at rest, sliding, at the end; of an affine plant the end alone.
+        Each grid comes with its lanes; p (m, n_parameters) and averaging times (m,) [s], 0 without, are the lanes'.
         """
-        found = [self._points(grid, rows, p, periods, passage) for grid, rows in grids]
+        found = [self._points(grid, rows, p, periods, response_points) for grid, rows in grids]
         x, u = (np.empty((len(a), len(p), a.shape[2])) for a in found[0])
         for (_, rows), (own_x, own_u) in zip(grids, found, strict=True):
             x[:, rows], u[:, rows] = own_x, own_u
         return x, u
 
     def _points(
-        self, grid: ReferenceGrid, rows: Indices, p: Array, periods: Array, passage: ResponsePoints
+        self, grid: ReferenceGrid, rows: Indices, p: Array, periods: Array, response_points: ResponsePoints
     ) -> tuple[Array, Array]:
         """Points of lanes on one grid, states and inputs, shapes (k, m, n)."""
-        own, p = passage.select(rows), p[rows]
+        own, p = response_points.select(rows), p[rows]
         states, (end, reach) = list[Array](), self._at_end(grid, p, periods[rows], own)
         if not is_affine(self.loop.plant):
             states.append(self._at_start(grid, p, own))
@@ -193,8 +157,8 @@ class PointFinder:
     ) -> tuple[Array, Array]:
         """The plant's state and the command at a sample of each lane, and the loop's state there.
 
-        Lanes wait there for the latest of them, between two samples of a held controller: at a sample it would act
-        again and again. That of lanes that go on from there has not acted yet.
+        Lanes wait for the latest between two samples of a held controller, which would act again at a sample; it has
+        not acted yet in lanes that go on from there.
         """
         kept, rows = last // KEPT_STATES, np.arange(len(p))
         left = (last - kept * KEPT_STATES)[:, None]
@@ -212,8 +176,8 @@ class PointFinder:
     def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints) -> tuple[Array, Array]:
         """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.
 
-        Under dither one more period is run after the end. Half the change from its start to its end is subtracted from
-        its mean, which puts the mean back to the end.
+        Under dither one period more is run; half the change over it is subtracted from its mean, which so belongs to
+        the end.
         """
         out = np.column_stack([own.ends[:, : len(self.loop.plant.states)], own.command])
         reach = np.zeros_like(out)
@@ -264,20 +228,9 @@ def _put_finite(out: Array, rows: Indices, values: Array) -> None:
 
 
 class Responses:
-    """The metrics of simulated candidates; margins, a frequency response each, are computed only on request.
+    """The metrics of candidates on the cases that were run, `lanes` (m, n_cases); margins come only on request.
 
-    Parameters
-    ----------
-    lanes : ndarray of bool, shape (m, n_cases)
-        Which cases of which candidate were run.
-    p : ndarray, shape (n_lanes, n_parameters)
-    measured : LaneMetrics
-    margins : MarginReader
-
-    Attributes
-    ----------
-    values : dict of str to ndarray, shape (m,)
-        The requirements' values without margins, the worst over the cases that were run.
+    `values` are the requirements' values (m,) without margins, the worst over those cases.
     """
 
     def __init__(self, lanes: Mask, p: Array, measured: "LaneMetrics", margins: "MarginReader") -> None:
@@ -308,7 +261,9 @@ class Responses:
         row, case = np.nonzero(self._lanes)
         wanted = measured.sound & rows[row]
         if wanted.any():
-            for n, value in self._margins.read(self._p[wanted], case[wanted], measured.passage.select(wanted)).items():
+            for n, value in self._margins.read(
+                self._p[wanted], case[wanted], measured.response_points.select(wanted)
+            ).items():
                 found[n][wanted] = value
         return {n: self.to_table(value)[rows] for n, value in found.items()}
 
@@ -321,27 +276,21 @@ class Responses:
 
 @dataclass(frozen=True, eq=False)
 class LaneMetrics:
-    """The metrics of m lanes and their passage.
+    """The metrics (m,) of lanes, which of them do not run away, and the points of their responses.
 
-    Attributes
-    ----------
-    metrics : dict of str to ndarray, shape (m,)
-        Those of `step_metrics`, and "Excess", the mean error near the end, by which responses that never settle are
-        graded; infinite where the response runs away.
-    sound : ndarray of bool, shape (m,)
-        False where the response runs away.
-    passage : ResponsePoints
+    Beside those of `step_metrics` there is "Excess", the mean error near the end, by which responses that never settle
+    are graded; infinite where the response runs away.
     """
 
     metrics: dict[str, Array]
     sound: Mask
-    passage: ResponsePoints
+    response_points: ResponsePoints
 
     @staticmethod
     def empty(m: int, n: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
         """Metrics of m lanes of n samples to be filled in; until then they read as running away."""
-        passage = ResponsePoints.empty(m, n, n_states)
-        return LaneMetrics({name: np.full(m, np.inf) for name in read}, np.zeros(m, dtype=bool), passage)
+        response_points = ResponsePoints.empty(m, n, n_states)
+        return LaneMetrics({name: np.full(m, np.inf) for name in read}, np.zeros(m, dtype=bool), response_points)
 
 
 def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:
@@ -357,15 +306,7 @@ def worst_values(found: Sequence[dict[str, float]]) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class MarginReader:
-    """A function that computes margins and peaks of loops, the worst over their operating points.
-
-    Attributes
-    ----------
-    names : tuple of str
-        The metrics that `read` gives.
-    read : callable
-        Of parameters, shape (m, n_parameters), cases, shape (m,), and the lanes' passage.
-    """
+    """Function of lanes' parameters, cases (m,) and points that gives margins and peaks, the worst over the points."""
 
     names: tuple[str, ...]
     read: Callable[[Array, Indices, ResponsePoints], Mapping[str, Array]]
@@ -380,24 +321,8 @@ LaneRun = tuple[Array, Array, Array]  # states at every `KEPT_STATES`-th sample,
 class Simulator:
     """Simulate many candidates, compiled, on every reference and every scenario's plant, and read their metrics.
 
-    The plant's true signal counts, whatever a sensor shows the controller of it.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : sequence of Reference
-    space : Space
-    scenarios : mapping of str to mapping, optional
-        The plants beside the nominal one.
-    spec : Specification, optional
-        Its kinds of requirements are read beside the common ones.
-
-    Attributes
-    ----------
-    cases : tuple of TuningCase
-    response_metrics, margin_metrics : tuple of str
-        The metrics read off the responses, and off the loop linearised at their operating points.
-    sampled : LoopLanes
+    The plant's true signal counts, whatever a sensor shows the controller of it. The requirements of `spec` are read
+    beside the common ones; margins stand apart, for they cost a frequency response each.
     """
 
     def __init__(
@@ -430,8 +355,8 @@ class Simulator:
     def coarse(self, spec: Specification, bands: Sequence[Band] = ()) -> "Simulator":
         """A copy for use during a search, with half as many samples, which reads only what `spec` asks for.
 
-        With `bands` SettlingTime is the mean over those and the band asked for; a response that does not settle counts
-        as `penalty_settling_time`.
+        With `bands` SettlingTime is the mean over those and the band asked for, `penalty_settling_time` where it does
+        not settle.
         """
         part = copy.copy(self)
         part._wider = tuple(bands)
@@ -506,7 +431,11 @@ class Simulator:
             len(rows), max(len(grid.t) for grid in self.grids), starts.shape[1], self.response_metrics
         )
         for chunk in self._chunks(case):
-            self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
+            u, t, h, steps = self.pad(case[chunk])
+            with np.errstate(all="ignore"):
+                found = self.rollout.run(starts[chunk], u, p[chunk], t, h, substeps=steps, states=KEPT_STATES)
+            assert found.x is not None
+            self._read(measured, chunk, case[chunk], p[chunk], (found.x, found.y, found.x_end), band)
         return Responses(wanted, p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
     def values(self, points: Array, spec: Specification) -> dict[str, Array]:
@@ -524,15 +453,15 @@ class Simulator:
         margins = {n: table[0] for n, table in responses.margin_metrics(np.ones(1, dtype=bool)).items()}
         return to_records({n: responses.table(n)[0] for n in self.response_metrics} | margins)
 
-    def _read_margins(self, p: Array, case: Indices, passage: ResponsePoints) -> dict[str, Array]:
+    def _read_margins(self, p: Array, case: Indices, response_points: ResponsePoints) -> dict[str, Array]:
         """Margins and peaks of loops, the worst over their lanes' operating points."""
-        return self.robustness(p, *self.operating_points(p, case, passage), self.margin_metrics)
+        return self.robustness(p, *self.operating_points(p, case, response_points), self.margin_metrics)
 
-    def operating_points(self, p: Array, case: Indices, passage: ResponsePoints) -> tuple[Array, Array]:
+    def operating_points(self, p: Array, case: Indices, response_points: ResponsePoints) -> tuple[Array, Array]:
         """The plant's states and inputs at the lanes' operating points; see `PointFinder`."""
         own = self._grid_index[case]
         lanes = [(self.grids[g], np.flatnonzero(own == g)) for g in np.unique(own)]
-        return self._find_points(lanes, p, self.sampled.periods(p), passage)
+        return self._find_points(lanes, p, self.sampled.periods(p), response_points)
 
     def lanes(self, points: Array, rows: Indices, case: Indices) -> tuple[Array, Array]:
         """Parameters, shape (m, n_parameters), and start states, shape (m, n_states), of lanes.
@@ -577,22 +506,12 @@ class Simulator:
 
     def _chunks(self, case: Indices) -> Iterator[Indices]:
         """Indices of lanes that run together: all at once if they are few, otherwise those on the same grid."""
-        if len(case) <= MAX_MIXED_LANES:
+        if 0 < len(case) <= MAX_MIXED_LANES:
             yield np.arange(len(case))
             return
-        for g in range(len(self.grids)):
+        for g in np.unique(self._grid_index[case]).tolist():
             own = np.flatnonzero(self._grid_index[case] == g)
             yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
-
-    def _measure(self, out: LaneMetrics, chunk: Indices, case: Indices, starts: Array, p: Array, band: Band) -> None:
-        """Simulate the lanes `chunk` and fill their rows of `out`."""
-        if not len(chunk):
-            return
-        u, t, h, steps = self.pad(case)
-        with np.errstate(all="ignore"):
-            found = self.rollout.run(starts, u, p, t, h, substeps=steps, states=KEPT_STATES)
-        assert found.x is not None
-        self._read(out, chunk, case, p, (found.x, found.y, found.x_end), band)
 
     def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: Band) -> Responses:
         """The responses of candidates on every case that ran elsewhere; `shape` is (m, n_cases).
@@ -609,17 +528,17 @@ class Simulator:
     def _read(self, out: LaneMetrics, chunk: Indices, case: Indices, p: Array, run: LaneRun, band: Band) -> None:
         """Fill the rows `chunk` of `out` from states, outputs and end states."""
         states, outputs, ends = run
-        out.passage.states[chunk, : states.shape[1]], out.passage.ends[chunk] = states, ends
+        out.response_points.states[chunk, : states.shape[1]], out.response_points.ends[chunk] = states, ends
         for g in np.unique(self._grid_index[case]).tolist():
             own, grid, asked = self._grid_index[case] == g, self.grids[g], self.response_metrics
             y = outputs[own, : len(grid.t)]
             sound = is_sound(y, ends[own])
-            out.sound[chunk[own]], out.passage.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
+            out.sound[chunk[own]], out.response_points.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
             found = self.sampled.read(grid, y, p[own], sound, self.bands(band), asked, self._envelope)
             for period, rows, metrics in found:
                 for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value
-                out.passage.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
+                out.response_points.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
 
     def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float) -> Indices:
         """Samples of the largest speed, as `ResponsePoints` has them; zeros for a plant without an axis."""

@@ -1,10 +1,7 @@
-"""`Space`: the box in which the candidates of a tuning lie, their rounding, and the RK4 steps that they need.
+"""`Space`: the box in which the candidates of a tuning lie, and their rounding.
 
-The states in which a tuning's cases wait for the step, where they do not depend on the gains.
-
-The samples on which a search runs its responses, and closer ones where a response is fast.
-
-The outputs that a search runs, the grid on which it samples a reference, and the metrics that it reads there.
+`LoopLanes`: the loop as it is run for many candidates, on `ReferenceGrid`s of samples that `refine_grids` makes closer
+where a response is fast; `read_metrics` reads it. `starts_before_step` finds the states in which its cases wait.
 """
 
 import itertools
@@ -47,7 +44,6 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.tolerances import (
     BOUND_DISTANCE,
-    INTEGRAL_OUTPUT,
     MAX_LOOP_SUBSTEPS,
     MAX_ROUNDING_POINTS,
     RUNAWAY_LEVEL,
@@ -58,15 +54,7 @@ from pneuopt.tuning.tolerances import (
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """The free parameters of a tuning, as a box.
-
-    Parameters
-    ----------
-    parameters : ParameterSet
-        Every parameter of the loop; the free ones span the box.
-    names : tuple of str
-        Those of the free ones that have an effect.
-    """
+    """The free parameters that have an effect, as a box, among all parameters of the loop."""
 
     parameters: ParameterSet
     names: tuple[str, ...]
@@ -181,14 +169,7 @@ def _round_digits(value: float, digits: int) -> float:
 
 
 def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
-    """Check the free parameters and span a `Space` by their bounds, over every parameter of the loop.
-
-    Raises
-    ------
-    InputError
-        If nothing is free, something is free that is not the controller's (dither, feedforward and compensators
-        included), or a bound is missing.
-    """
+    """Span a `Space` by the free parameters; an `InputError` unless all are the controller's and have finite bounds."""
     full = loop.complete(parameters).select(loop.parameters)
     free = tuple(n for n in parameters.free_names if n in loop.parameters)
     require(len(free) > 0, 'nothing is free; mark what may be tuned: parameters.freed("pid.K*", "dither.offset")')
@@ -198,8 +179,8 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
             n.partition(".")[0] in loop.tunable_sections,
             f"{n} is free, but tune changes the controller and the dither only; use parameters.fixed({n!r})",
         )
-        told = f"{n} is free, but it says what a machine does in a fault; use parameters.fixed({n!r})"
-        require(n.removeprefix("pid.") not in loop.pid.fixed_parameters, told)
+        message = f"{n} is free, but it says what a machine does in a fault; use parameters.fixed({n!r})"
+        require(n.removeprefix("pid.") not in loop.pid.fixed_parameters, message)
         p = full[n]
         require(
             bool(np.isfinite([p.lower, p.upper]).all()) and p.lower < p.upper,
@@ -208,7 +189,12 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
         )
         require(n not in divisors or p.lower > 0, f"{n}: its lower bound must be positive, got {p.lower:g} {p.unit}")
         if n == "dither.amplitude":
-            _check_amplitude(loop, full)
+            low, high, whose = command_range(loop, full)
+            message = (
+                f"dither.amplitude may reach {p.upper:g} {p.unit}, but {whose} ends at {low:g} and {high:g} {p.unit}"
+            )
+            peaks = f"which cuts the peaks of more than {(high - low) / 2:g} {p.unit}; lower its upper bound"
+            require(2 * p.upper <= high - low, f"{message}, {peaks}")
         require(
             not p.log or p.lower > 0, f"{n}: a log parameter needs a positive lower bound, got {p.lower:g} {p.unit}"
         )
@@ -223,17 +209,6 @@ def whole_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
 def clip_level(loop: ClosedLoop, p: ParameterSet) -> float:
     """The largest size of a command that the controller's own limits let through [its unit]; inf without limits."""
     return max(abs(p.value("pid.lower")), abs(p.value("pid.upper"))) if loop.pid.limits else float("inf")
-
-
-def _check_amplitude(loop: ClosedLoop, p: ParameterSet) -> None:
-    """Refuse an amplitude's bound with which dither alone, around any offset, exceeds the command's range."""
-    (low, high, whose), most = command_range(loop, p), p["dither.amplitude"].upper
-    unit = p["dither.amplitude"].unit
-    require(
-        2 * most <= high - low,
-        f"dither.amplitude may reach {most:g} {unit}, but {whose} ends at {low:g} and {high:g} {unit}, which cuts the "
-        f"peaks of more than {(high - low) / 2:g} {unit}; lower its upper bound",
-    )
 
 
 def dither_resolution_rate(loop: ClosedLoop, parameters: ParameterSet) -> float:
@@ -256,13 +231,7 @@ def fastest_eigenvalue(loop: ClosedLoop, p: Array, states: Sequence[Array]) -> A
 
 
 def rk4_substeps(rate: float, h: float) -> int:
-    """The number of RK4 steps in a sample of length h [s] with which a mode of this rate [1/s] is integrated stably.
-
-    Raises
-    ------
-    InputError
-        If that takes too many; the message names the remedy.
-    """
+    """RK4 steps in a sample of h [s] for a stable mode of this rate [1/s]; an `InputError` where they are too many."""
     k = int(np.ceil(rate * h / RK4_MAX_H_LAMBDA))
     require(
         k <= MAX_LOOP_SUBSTEPS,
@@ -293,23 +262,17 @@ def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> 
     return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
 
 
-# Indices of the outputs that are run: the measured signal, the command, then the meter's channels one after another.
-SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT = range(3)
+# Indices of the outputs that are run: the measured signal, the command, then the meter's channels one after another;
+# under dither the signal's integral is the last output and the last state.
+SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT, INTEGRAL_OUTPUT = [*range(3), -1]
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceGrid:
-    """The samples at which the response to one reference is run and read.
+    """Samples t (n,) and inputs u (n, n_inputs) at which the response to one reference is run and read.
 
-    Attributes
-    ----------
-    reference : Reference
-    t : ndarray, shape (n,)
-    u : ndarray, shape (n, n_inputs)
-    spacing : float
-        The largest distance between two samples [s]; under dither and of sampled loops it is that of all.
-    sample_time : float or None
-        The controller's, if it is sampled [s].
+    `spacing` [s] is the largest distance of two samples, and that of all under dither and of sampled loops;
+    `sample_time` [s] is the controller's, None for a continuous one.
     """
 
     reference: Reference
@@ -417,9 +380,9 @@ def is_sound(y: Array, x_end: Array) -> Mask:
 
 
 def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
-    """Build the loop's sampled step with the measured signal, the command and channels of the meter as its outputs.
+    """The loop's sampled step, with the measured signal, the command and channels of the meter as its outputs.
 
-    The axis's speed follows, where there is an axis (`speed_output`); under dither the signal's integral, zero at the
+    The axis's speed follows, where there is one (`speed_output`); under dither the signal's integral, zero at the
     start, is one more state and the last output.
     """
     discrete, outputs = loop.discrete(), names(loop.outputs)
@@ -443,23 +406,18 @@ def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
     y = rates(t, z)[1]
     after = rk4(lambda at, z: rates(at, z)[0], t, h, z)
     step = ca.Function("step", [t, h, z, u, p], [after, y], {"cse": True})
-    update = discrete.update and ca.Function(
-        "update", [t, z, u, p], [ca.vertcat(_update_at_sample(loop, t, x, u, p), total)]
-    )
+    update = None
+    if loop.pid.sample_time is not None:  # the controller acts where the instant t is one of its samples
+        near = 0.25 / MAX_READINGS_A_SAMPLE
+        acts = ca.fmod(t / loop.pid.sample_time + near, 1.0) < 2 * near
+        updated = ca.if_else(acts, loop.update(t, x, u, p), x)
+        update = ca.Function("update", [t, z, u, p], [ca.vertcat(updated, total)])
     return Pieces(step, update, ca.Function("ode", [t, z, u, p], [rates(t, z)[0], y]))
 
 
 def speed_output(loop: ClosedLoop, channels: Sequence[str]) -> int | None:
     """Index of the axis's speed among the outputs of `loop_pieces`; None without an axis."""
     return None if loop.plant.axis is None else METER_OUTPUT + len(channels)
-
-
-def _update_at_sample(loop: ClosedLoop, t: ca.SX, x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
-    """The state after the controller's update, if the instant t is one of its samples; otherwise the state itself."""
-    h = loop.pid.sample_time
-    assert h is not None
-    near = 0.25 / MAX_READINGS_A_SAMPLE
-    return ca.if_else(ca.fmod(t / h + near, 1.0) < 2 * near, loop.update(t, x, u, p), x)
 
 
 def has_integral(loop: ClosedLoop) -> bool:
@@ -476,26 +434,10 @@ def read_metrics(
     envelope: Envelope,
     channels: Sequence[str] = (),
 ) -> dict[str, Array]:
-    """Read the metrics `only` off responses that do not run away.
+    """The metrics `only`, shape (m,), of outputs y (m, n, n_outputs) of `loop_pieces` that do not run away.
 
-    Parameters
-    ----------
-    grid : ReferenceGrid
-    y : ndarray, shape (m, n, n_outputs)
-        The outputs of `loop_pieces`.
-    bands : sequence of float or Tolerance
-        Settling bands. Over several SettlingTime is the mean; a response that does not settle
-        counts as `penalty_settling_time`.
-    period : float or None
-        The time over which the signal is averaged [s].
-    only : collection of str
-    envelope : sequence of (float, float, float)
-    channels : sequence of str
-        The meter's, in the order of the outputs.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (m,)
+    Over several bands SettlingTime is the mean, `penalty_settling_time` where it does not settle; `period` [s] is the
+    averaging time.
     """
     reference, signal, since = grid.reference, y[:, :, SIGNAL_OUTPUT], slice(grid.step_index, None)
     late = slice(int(np.searchsorted(grid.t, 0.8 * reference.horizon + 0.2 * reference.at)), None)
@@ -561,15 +503,9 @@ def reference_grids(
 def refine_grids(
     grids: list[ReferenceGrid], cases: Sequence[Mask], read: Callable[[int, ReferenceGrid], Array | None]
 ) -> list[ReferenceGrid]:
-    """Grids whose samples are close enough for the responses of a point; the same list where they are.
+    """Grids close enough for the responses that `read` gives, None where one runs away; the same list where they are.
 
-    Parameters
-    ----------
-    grids : list of ReferenceGrid
-    cases : sequence of ndarray of bool, shape (n_cases,)
-        Which cases run on each grid.
-    read : callable
-        The signal of a case at a grid's samples; None where it runs away.
+    Each grid comes with the cases (n_cases,) that run on it.
     """
     finer = []
     for grid, own in zip(grids, cases, strict=True):

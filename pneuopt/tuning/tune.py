@@ -1,18 +1,18 @@
 """`tune`: find PID gains and dither together, and certify them by a simulation that shares no step with the search.
 
 A linear loop whose response shooting nodes follow closely is tuned by them (`TwoPhase`); any other, with friction, clip
-or sampling, by compiled simulation (`Racing`). The gains are rounded first and certified then, so that the printed
-numbers are proven.
-
-`METHODS`: the methods of `tune`, where a new one is registered; `choose_method` takes the first that suits.
+or sampling, by compiled simulation (`Racing`). `certify` proves given gains likewise, `certify_on_rig` once more on the
+event-accurate model of the rig. A new method is registered in `METHODS`; the first that suits is chosen.
 """
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from math import inf
 from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
@@ -20,27 +20,37 @@ from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.dither import describe_swing
-from pneuopt.evaluation.evaluate import metric_limits, relevant_units
+from pneuopt.evaluation.evaluate import evaluate, metric_limits, relevant_units
+from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.plants import ExpectedPlants, expected_plants
-from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTime
+from pneuopt.evaluation.requirements import (
+    PeakControl,
+    SettlingTime,
+    metric_name,
+    requirement_values,
+    upper_limit,
+    user_value,
+)
 from pneuopt.evaluation.response import cases, check_steps
-from pneuopt.evaluation.rest_check import NoHunting
+from pneuopt.evaluation.rest_check import NoHunting, RestKind, check_rest
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify, specify_limits
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_parameters
 from pneuopt.quantities.status import Code, Progress, ProgressCallback, ProgressReporter, Status
+from pneuopt.quantities.units import write_value
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
-from pneuopt.tuning.on_rig import certify_on_rig, check_rig
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
-from pneuopt.tuning.tolerances import MIN_AGREEING
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuning.validation import validate_design
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["TuningResult", "certify", "prepare_search", "prepare_task", "tune"]
 # Endings of a search whose limits perhaps no design keeps: `tune` then seeks how far they have to give way.
@@ -268,9 +278,9 @@ def _warn_of_swing(task: TuningTask) -> None:
     """Warn, in the name of the caller's caller, of a dither that moves the signal out of its settling band."""
     if not task.spec.concerns(SettlingTime):
         return
-    told = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
-    if told is not None:
-        warnings.warn(told, PhysicsWarning, stacklevel=3)
+    message = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
+    if message is not None:
+        warnings.warn(message, PhysicsWarning, stacklevel=3)
 
 
 def _search(task: TuningTask, method: Method | None, progress: ProgressCallback) -> tuple[Search, TuningResult, bool]:
@@ -281,7 +291,7 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback)
     search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
-    found_once = result.stats.get("starts_agreeing", inf) < MIN_AGREEING
+    found_once = result.agreement is not None and result.agreement.agreeing < 2  # perhaps the nearest of many optima
     doubtful = not result.status.converged or found_once
     if method is not None or successor is None or not doubtful or result.status.code is Code.INTERRUPTED:
         return search, result, False
@@ -312,6 +322,115 @@ def _try_on_plants(
     except ConvergenceError as error:
         return replace(result, status=result.status.with_details(f"not tried on other plants: {error}"))
     return replace(result, validation=found)
+
+
+def check_rig(rig: Rig | None, task: TuningTask) -> None:
+    """Refuse a rig that is not one of this loop, and a limit that only a rig shows without one, by an `InputError`."""
+    if rig is None:
+        message = "NoHunting is read on the event-accurate model of the rig, which sticks; give rig=, or --rig rig.toml"
+        require(task.spec.rest is None, message)
+        return
+    compares = task.spec.rest is not None and np.isfinite(task.spec.rest.repeatability)
+    message = "NoHunting: repeatability is a range over references, and there is one; give more, from several starts"
+    require(not compares or len(task.references) > 1, message)
+    require(rig.loop is not None, "the rig has no controller; make it of the loop, Rig(ClosedLoop(...), sensors)")
+    signals = [(own.feedback.name, own.command.name, own.pid) for own in (rig.loop, task.loop) if own is not None]
+    message = f"the rig's loop controls {signals[0][:2]}, the loop to be tuned {signals[-1][:2]}, or with another PID"
+    require(signals[0] == signals[-1], f"{message}; make the rig of the same loop, with Karnopp's friction")
+
+
+def certify_on_rig(task: TuningTask, result: TuningResult, rig: Rig) -> TuningResult:
+    """The certified result with what the rig shows of it on every reference; a limit that breaks there refutes it.
+
+    Margins are those of the smooth loop, which a rig does not have.
+    """
+    assert rig.loop is not None
+    parameters = task.space.parameters | result.parameters
+    own = parameters.select(n for n in parameters if n in rig.loop.parameters)
+    spec = task.spec
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", PhysicsWarning)
+            found = evaluate(rig, task.references, own, band=spec.band, envelope=spec.envelope, max_steps=np.inf)
+    except ConvergenceError as error:
+        return _reject(task, result, None, (f"the simulation of the rig stops: {error}",))
+    contacts = [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
+    breaks = tuple(dict.fromkeys((*contacts, *_breaks(task, found))))
+    if breaks:
+        return _reject(task, result, found, breaks)
+    result = replace(result, on_rig=found)
+    return result if spec.rest is None else _watch_rest(task, result, rig, own, spec.rest)
+
+
+def _watch_rest(
+    task: TuningTask, result: TuningResult, rig: Rig, parameters: ParameterSet, wanted: NoHunting
+) -> TuningResult:
+    """The result with how the loop ends on the rig; where it does not end as wanted, it is no longer certified."""
+    rest = check_rest(rig, task.references, parameters, duration=wanted.duration)
+    breaks = tuple(f"on the rig {case.sentence}" for case in rest.cases if case.kind is not RestKind.RESTS)
+    if rest.rests and rest.repeatability > wanted.repeatability:
+        reached, limit = (write_value(v, rest.unit, 3) for v in (rest.repeatability, wanted.repeatability))
+        breaks = (f"on the rig its errors at rest range over {reached}, the limit of repeatability is {limit}",)
+    if breaks:
+        return replace(_reject(task, result, result.on_rig, breaks), rest=rest)
+    message = f"on the rig it comes to rest, watched for {wanted.duration:g} s"
+    return replace(result, rest=rest, status=result.status.with_details(message))
+
+
+def _breaks(task: TuningTask, found: "pd.DataFrame") -> Iterator[str]:
+    """What breaks on the rig, a sentence each."""
+    rows = found.to_dict()
+    never = [str(case) for case, row in rows.items() if not np.isfinite(row["SettlingTime"])]
+    if never:
+        size, rate = (rows[never[0]][f"LimitCycle{n}"] for n in ("Amplitude", "Frequency"))
+        hunts = f": it hunts by +-{size:.3g} {task.loop.feedback.unit} at {rate:.3g} Hz" if size > 0 else ""
+        yield f"on the rig it never settles at {' and '.join(never)}{hunts}"
+    for q in task.spec.limits:
+        values = _requirement_rows(metric_name(q), found)
+        worst = max(values, key=lambda case: values[case], default="")
+        if worst and not (metric_name(q) == "SettlingTime" and never) and not values[worst] <= upper_limit(q):
+            value, limit = (_shown(q, v, task) for v in (values[worst], upper_limit(q)))
+            yield f"on the rig {metric_name(q)} is {value} at {worst}, the limit is {limit}"
+
+
+def _remedies(task: TuningTask, result: TuningResult, found: "pd.DataFrame") -> Iterator[str]:
+    """With which limit the search would leave the room that the rig needs, if the rig adds as much again.
+
+    A relaxed limit is named only where the loop settles on the rig, for it mends nothing else.
+    """
+    settles = bool(np.isfinite(found.loc["SettlingTime"].to_numpy(dtype=float)).all())
+    for q in task.spec.limits:
+        n = metric_name(q)
+        on_rig, smooth = (max(_requirement_rows(n, f).values(), default=-np.inf) for f in (found, result.certified))
+        room = upper_limit(q) - (on_rig - smooth)
+        if np.isfinite(on_rig) and on_rig > upper_limit(q) and q.metric.sense is Sense.AT_MOST:
+            added = f"the rig adds {_shown(q, on_rig - smooth, task)} to {n}"
+            if room > 0:
+                yield f"{added}: tune with at most {_shown(q, room, task)}"
+            elif settles:
+                yield f"{added}: relax its limit"
+
+
+def _requirement_rows(metric: str, found: "pd.DataFrame") -> dict[str, float]:
+    """A requirement's value by case; empty where there is no such metric."""
+    rows = {str(case): row for case, row in found.to_dict().items() if metric in row}
+    return {case: float(requirement_values({metric: row[metric]})[metric]) for case, row in rows.items()}
+
+
+def _shown(requirement: Requirement, value: float, task: TuningTask) -> str:
+    """A value with its unit, in percent where tables have percent."""
+    unit = requirement.metric.shown_unit(task.loop.command.unit, task.loop.feedback.unit)
+    return f"{requirement.metric.factor * user_value(requirement, value):.3g} {unit}".strip()
+
+
+def _reject(
+    task: TuningTask, result: TuningResult, found: "pd.DataFrame | None", breaks: tuple[str, ...]
+) -> TuningResult:
+    """The result of a design that the rig refutes: the given gains stand."""
+    smooth = f"on the smooth model it is certified: {result.status.verdict}"
+    remedies = () if found is None else tuple(_remedies(task, result, found))
+    status = Status(Code.NOT_CERTIFIED, (*breaks, smooth, *remedies))
+    return replace(result.refuse(status, task.space.parameters, task.space.names), on_rig=found)
 
 
 def prepare_task(
@@ -357,19 +476,9 @@ def _make_task(
 
 
 def prepare_search(task: TuningTask, method: Method | None = None, progress: ProgressCallback | None = None) -> Search:
-    """The search that a method makes for a task, over the free parameters that have an effect on what it solves.
+    """The search of a method, by default the first that suits, over the free parameters that have an effect on it.
 
-    Parameters
-    ----------
-    task : TuningTask
-    method : Method, optional
-        By default the first that suits the task.
-    progress : callable, optional
-
-    Raises
-    ------
-    InputError
-        If the method cannot tune this task, or nothing that is free has an effect.
+    An `InputError` where the method cannot tune the task, or nothing that is free has an effect.
     """
     if method is None:
         method = choose_method(task)

@@ -1,17 +1,14 @@
 """`TwoPhase`: exact tuning of a linear loop; its settling time is a free duration of a multiple-shooting problem.
 
-The settling-time problem of a linear loop written as a transcription with a free duration.
-
 Phase "transient" is [0, Ts] with Ts unknown, phase "settled" the rest, where |y - r| <= band is a path limit; so the
 settling time is a smooth function of the gains. Each further term of the objective (the overshoot and so on) is one
 more unknown, which its path limit may not exceed. Fast dither leaves a linear loop's average alone; its offset is a
-step at the command.
+step at the command. `transcribe_two_phase` writes that problem.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import ClassVar
 
 import casadi as ca
@@ -54,7 +51,7 @@ from pneuopt.tuning.method import Agreement, SearchResult, TuningTask, check_met
 from pneuopt.tuning.racing import WIDEN_BOUNDS, Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue, rk4_substeps
-from pneuopt.tuning.tolerances import EXACT_PEAK_MARGIN, MAX_STEPS_A_SEGMENT, MIN_STARTS, OPTIMA_TOLERANCE
+from pneuopt.tuning.tolerances import EXACT_PEAK_MARGIN, LEAST_IMPROVEMENT, MAX_STEPS_A_SEGMENT, MIN_STARTS
 
 # Parameters on which the average of a linear loop does not depend.
 PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
@@ -148,13 +145,10 @@ class TwoPhase:
         space = Space(task.space.parameters_at(start), task.space.names)
         optima = _solve_stable(task, replace(task, space=space, spec=spec), method, progress)
         best, values = optima.best, optima.best.parameters
-        stats = {
-            **optima.agreement.stats,
-            "optimum": best.stats.get("cost", np.nan),
-            "iterations": best.stats.get("iterations", 0.0),
-        }
-        point = np.array([values.value(n) for n in task.space.names])
-        return SearchResult(point, best.status, tuple(best.multipliers), stats)
+        stats = {"iterations": best.stats.get("iterations", 0.0)}
+        point, cost = np.array([values.value(n) for n in task.space.names]), best.stats.get("cost", np.nan)
+        active = tuple(best.multipliers)
+        return SearchResult(point, best.status, active, stats, optimum=cost, agreement=optima.agreement)
 
     def shorten(self, margin: float) -> "TwoPhase":
         """The method for a short search from a point that is close."""
@@ -213,7 +207,12 @@ def _solve_stable(task: TuningTask, tightened: TuningTask, method: TwoPhase, pro
     """
     loop, references, space, spec = tightened.loop, tightened.references, tightened.space, tightened.spec
     plain = _without_stability(task, spec)
-    is_allowed = partial(_is_stable, loop, math.inf if plain is spec else spec.limit(MaxSensitivity))
+    free_loop, most = without_clip(loop), math.inf if plain is spec else spec.limit(MaxSensitivity)
+
+    def is_allowed(solution: Solution) -> bool:
+        found = margins(open_loop(free_loop, solution.parameters.select(free_loop.parameters)))
+        return found.stable and found.max_sensitivity <= most
+
     optima = solve_two_phase(loop, references, space, plain, method, progress, is_allowed)
     if plain is spec or optima.agreement.converged:
         return optima
@@ -225,13 +224,6 @@ def _without_stability(task: TuningTask, spec: Specification) -> Specification:
     return spec if task.spec.concerns(MaxSensitivity) else spec.without(MaxSensitivity)
 
 
-def _is_stable(loop: ClosedLoop, most: float, solution: Solution) -> bool:
-    """Whether the loop with a solution's gains is stable, its sensitivity not above `most`."""
-    free_loop = without_clip(loop)
-    found = margins(open_loop(free_loop, solution.parameters.select(free_loop.parameters)))
-    return found.stable and found.max_sensitivity <= most
-
-
 def solve_two_phase(
     loop: ClosedLoop,
     references: Sequence[Reference],
@@ -241,14 +233,9 @@ def solve_two_phase(
     report_progress: ProgressCallback,
     is_allowed: Callable[[Solution], bool] = lambda _: True,
 ) -> Optima:
-    """Solve the two-phase problem from every start; `report_progress` receives a line of text a start.
+    """Solve the two-phase problem from every start; solutions that are not allowed do not count as converged.
 
-    Solutions that are not allowed do not count as converged. The search ends early where most starts fail.
-
-    Raises
-    ------
-    InputError
-        If the loop's rest depends on the gains, or a mode is too fast for the grid.
+    It ends early where most starts fail; an `InputError` where the rest depends on the gains, or a mode is too fast.
     """
     problem = prepare_full_space(transcribe_two_phase(loop, references, space, spec, method.nodes), method.solver)
     parameters = problem.graph.transcription.parameters
@@ -264,7 +251,7 @@ def solve_two_phase(
         report_progress(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
         good += [s for s in found[-1:] if s.status.converged and is_allowed(s)]
     failed = [math.inf] * (len(found) - len(good))
-    agreement = compare_starts([*map(_objective_value, good), *failed], OPTIMA_TOLERANCE)
+    agreement = compare_starts([*map(_objective_value, good), *failed], LEAST_IMPROVEMENT)
     if not good:
         closest = min(found, key=lambda s: s.stats.get("largest_violation", math.inf))
         unstable = Status(Code.INFEASIBLE, ("every optimum found is an unstable loop, or nearly so", WIDEN_BOUNDS))
@@ -275,16 +262,7 @@ def solve_two_phase(
 
 @dataclass(frozen=True, eq=False)
 class TwoPhasePath:
-    """A two-phase problem that is solved for one set of limits after the other, all of the same kinds.
-
-    Parameters
-    ----------
-    problem : FullSpaceProblem
-    names : tuple of str
-        The names of the gains.
-    band : float
-        The settling band as transcribed.
-    """
+    """A two-phase problem that is solved for one set of limits after the other, and its band as transcribed."""
 
     problem: FullSpaceProblem
     names: tuple[str, ...]
@@ -328,23 +306,10 @@ BAND_PARAMETER = "band.share"  # name of the settling band's factor, 1 as transc
 def transcribe_two_phase(
     loop: ClosedLoop, references: Sequence[Reference], space: Space, spec: Specification, nodes: tuple[int, int]
 ) -> Transcription:
-    """Write the two-phase problem, in which the references share one settling time, the largest.
+    """Write the two-phase problem of a linear loop, in which the references share one settling time, the largest.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-        A linear one.
-    references : sequence of Reference
-    space : Space
-    spec : Specification
-        Already tightened.
-    nodes : tuple of int
-        Shooting nodes of the transient and of the settled phase.
-
-    Raises
-    ------
-    InputError
-        If the state before the step depends on the gains, or a mode is too fast for the nodes.
+    `nodes` are those of the transient and of the settled phase; an `InputError` where the state before the step depends
+    on the gains, or a mode is too fast for the nodes.
     """
     free_loop = without_clip(loop)
     averaged = space.parameters.select(free_loop.parameters)
@@ -360,7 +325,13 @@ def transcribe_two_phase(
         *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)),
         *_sensitivity_limit(free_loop, averaged, space, spec, parameters),
     ]
-    return Transcription(system, parameters, tuple(phases), (), _costs(spec, parameters), tuple(limits))
+    q, weights = ca.SX.sym("q", len(parameters)), {k.metric.name: spec.weight(k) for k in REQUIREMENT_KINDS}
+    costs = tuple(  # of the unknowns that stand for the objective's terms
+        Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
+        for n, weight in weights.items()
+        if METRICS[n].exact and weight > 0
+    )
+    return Transcription(system, parameters, tuple(phases), (), costs, tuple(limits))
 
 
 def without_clip(loop: ClosedLoop) -> ClosedLoop:
@@ -393,8 +364,8 @@ def _extra_unknowns(references: Sequence[Reference], spec: Specification) -> Par
 def _durations(references: Sequence[Reference], spec: Specification, settling: Parameter) -> ParameterSet:
     """The durations [s] of each reference, before its step and of its settled phase.
 
-    Where the error at the end counts the settled phase ends with the horizon; otherwise it is as long as the record
-    after the step, which shows more of the band.
+    The settled phase is as long as the record, which shows more of the band, unless the error at the end of it
+    counts.
     """
     found = {f"before.{i}": Parameter(r.at, "s") for i, r in enumerate(references) if r.at > 0}
     for i, r in enumerate(references):
@@ -527,34 +498,14 @@ def _sensitivity_limit(
     """The limit on the sensitivity's peak: Ms^2 |1 + L|^2 >= 1 at every frequency of a grid."""
     if not spec.concerns(MaxSensitivity):
         return []
-    grid = np.unique(
-        np.concatenate(
-            [
-                _sensitivity_frequencies(loop, averaged, space.from_unit(np.full(len(space.names), k)), space)
-                for k in (0.2, 0.8)
-            ]
-        )
-    )
+    own, frequencies = Space(averaged, space.names), list[Array]()
+    for share in (0.2, 0.8):  # around the loop's modes, where the sensitivity peaks [rad/s]
+        point = space.from_unit(np.full(len(space.names), share))
+        full = frequency_grid(open_loop(loop, own.parameters_at(point)), 40)
+        frequencies.append(full[(full > 30 * full[0]) & (full < full[-1] / 30)])
+    grid = np.unique(np.concatenate(frequencies))
     terms = sensitivity_terms(loop, grid, averaged)
     q = ca.SX.sym("q", len(parameters))
     Ms = q[list(parameters).index("MaxSensitivity")]
     value = terms(q[: len(loop.parameters)]) * Ms**2
     return [Limit("MaxSensitivity", ca.Function("limit", [q], [value]), 1.0, math.inf, Where.PARAMETERS)]
-
-
-def _sensitivity_frequencies(loop: ClosedLoop, averaged: ParameterSet, point: Array, space: Space) -> Array:
-    """Frequencies around the loop's modes, where the sensitivity peaks [rad/s]."""
-    own = Space(averaged, space.names).parameters_at(point)
-    full = frequency_grid(open_loop(loop, own), 40)
-    return np.asarray(full[(full > 30 * full[0]) & (full < full[-1] / 30)], dtype=float)
-
-
-def _costs(spec: Specification, parameters: ParameterSet) -> tuple[Cost, ...]:
-    """The objective: a weighted sum of the unknowns that stand for its terms."""
-    q = ca.SX.sym("q", len(parameters))
-    terms = {kind.metric.name: spec.weight(kind) for kind in REQUIREMENT_KINDS if kind.metric.exact}
-    return tuple(
-        Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
-        for n, weight in terms.items()
-        if weight > 0
-    )

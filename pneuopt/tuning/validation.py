@@ -1,7 +1,4 @@
-"""`validate_design`: a design on plants that no search has used: on how many it holds, what breaks, what would help.
-
-`advise`: what would let a design hold on more plants, computed from those on which it was tried.
-"""
+"""`validate_design`: a design on plants that no search has used: on how many it holds, what breaks, what would help."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -16,7 +13,7 @@ from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.certificate import Defect, certificate
 from pneuopt.evaluation.evaluate import metric_cell, metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
-from pneuopt.evaluation.plants import ExpectedPlants, PlantAxis
+from pneuopt.evaluation.plants import CorrelatedParameters, ExpectedPlants
 from pneuopt.evaluation.requirements import METRICS, metric_name, requirement_values, user_limit
 from pneuopt.evaluation.response import TuningCase
 from pneuopt.evaluation.scenarios import Scenarios, apply_scenario
@@ -28,7 +25,7 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, 
 from pneuopt.quantities.results import Result
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import MAX_ADVISED_AXES, RELAXED_DIGITS, SUMMARY_PERCENTILE
+from pneuopt.tuning.tolerances import MAX_TOLD, RELAXED_DIGITS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,7 +53,7 @@ class DesignValidation(Result):
         What the plants differ by.
     advice : tuple of str
         What would help, a sentence each; computed from these plants.
-    suggested : tuple of PlantAxis
+    suggested : tuple of CorrelatedParameters
         What of it to tune over.
     units : mapping of str to str
         The metrics' units.
@@ -68,7 +65,7 @@ class DesignValidation(Result):
     broken: Mapping[str, tuple[str, ...]]
     varied: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
-    suggested: tuple[PlantAxis, ...] = ()
+    suggested: tuple[CorrelatedParameters, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -209,19 +206,13 @@ def report_validation(found: DesignValidation) -> Report:
     figures_heads = number_columns("median", "95 %", "worst", "limit", "broken by")
     table = Table((*text_columns("new plants"), *figures_heads, *text_columns("unit")), tuple(rows))
     lead = Line(f"tried on {found.count} plants that no search has seen, each off by")
-    suggestion = f"to do so, add to the tuning's file: {'; '.join(_scenario_lines(found.suggested))}"
+    lines = list[str]()  # [scenarios.corners] "load.mass" = "5 %"
+    for kind, is_gain in (("corners", False), ("tolerances", True)):
+        keys = [f'"{n}" = "{100 * a.share:.2g} %"' for a in found.suggested if a.is_gain is is_gain for n in a.names]
+        lines += [f"[scenarios.{kind}] {', '.join(keys)}"] if keys else []
+    suggestion = f"to do so, add to the tuning's file: {'; '.join(lines)}"
     advice = (*found.advice, *([suggestion] if found.suggested else []))
     return Report((lead, *(Line(text, indent=2) for text in found.varied), table, *map(Line, advice)))
-
-
-def _scenario_lines(axes: Sequence[PlantAxis]) -> list[str]:
-    """What to write under [scenarios] to tune over these: [scenarios.corners] "load.mass" = "5 %"."""
-    kinds = {"corners": [a for a in axes if not a.is_gain], "tolerances": [a for a in axes if a.is_gain]}
-    return [
-        f"[scenarios.{kind}] " + ", ".join(f'"{n}" = "{100 * a.share:.2g} %"' for a in own for n in a.names)
-        for kind, own in kinds.items()
-        if own
-    ]
 
 
 def _simulate_plants(
@@ -317,7 +308,7 @@ def _figures(
         order = _rank_order(given, metric)
         rows[metric] = {
             "median": _quantile(given, metric, 50.0),
-            "p95": _quantile(given, metric, SUMMARY_PERCENTILE),
+            "p95": _quantile(given, metric, 95.0),
             "worst": float(given[order[-1]]),
             "worst_plant": str(values.columns[order[-1]]),
             "certified": float(certified[case].to_dict()[metric]),
@@ -339,16 +330,7 @@ DEFECT_WORDS = frozenset({NO_REST, *(defect.value for defect in Defect)})
 
 
 def find_breaks(row: Mapping[str, float], spec: Specification, accept: Collection[Defect] = ()) -> tuple[str, ...]:
-    """What breaks on a plant: defects, then limits by the name of their metric.
-
-    Parameters
-    ----------
-    row : mapping of str to float
-        Its metrics, SettlingTime and MaxSensitivity among them.
-    spec : Specification
-    accept : collection of Defect
-        Defects that do not count.
-    """
+    """What breaks on a plant by its metrics: defects that are not accepted, then limits by the metric's name."""
     defects = {n: defect.value for n, defect in LANE_DEFECTS.items() if not math.isfinite(row[n])}
     limits = [metric_name(q) for q in spec.violations(requirement_values(row))]
     named = [word for word in defects.values() if Defect(word) not in accept]
@@ -361,27 +343,11 @@ def advise(
     plants: "pd.DataFrame",
     broken: Mapping[str, tuple[str, ...]],
     certified: "pd.DataFrame",
-    axes: Mapping[PlantAxis, "pd.DataFrame"],
-) -> tuple[tuple[str, ...], tuple[PlantAxis, ...]]:
-    """Advice where a design breaks on plants: what to relax, and what to tune over.
+    axes: Mapping[CorrelatedParameters, "pd.DataFrame"],
+) -> tuple[tuple[str, ...], tuple[CorrelatedParameters, ...]]:
+    """Advice where a design breaks on plants, a sentence each, and what to tune over.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-        Gives the units.
-    spec : Specification
-    plants, certified : DataFrame
-        Of a `DesignValidation`.
-    broken : mapping of str to tuple of str
-        Likewise.
-    axes : mapping of PlantAxis to DataFrame
-        Of what varies the metrics with that alone at its low and its high end, a column each.
-
-    Returns
-    -------
-    sentences : tuple of str
-    suggested : tuple of PlantAxis
-        What of it to tune over.
+    `axes` are the metrics with one thing that varies alone at its low and its high end, a column each.
     """
     if not broken:
         return (), ()
@@ -420,15 +386,17 @@ def _relaxed_limit(requirement: Requirement, values: Sequence[float], loop: Clos
     return f"{metric.name} {'>=' if least else '<='} {value:.{RELAXED_DIGITS}g} {unit}".strip() + f" (now {asked:.4g})"
 
 
-def _culprits(spec: Specification, axes: Mapping[PlantAxis, "pd.DataFrame"]) -> tuple[tuple[PlantAxis, ...], str]:
+def _culprits(
+    spec: Specification, axes: Mapping[CorrelatedParameters, "pd.DataFrame"]
+) -> tuple[tuple[CorrelatedParameters, ...], str]:
     """What breaks a limit on its own, the worst first; else what comes nearest to it."""
     ends = {a: [{str(n): v for n, v in row.items()} for row in found.to_dict().values()] for a, found in axes.items()}
     worst = {a: max((_worst_excess(row, spec) for row in rows), default=math.inf) for a, rows in ends.items()}
     order = sorted(worst, key=lambda a: -worst[a])
     alone = [a for a in order if worst[a] > 0]
     if alone:
-        return tuple(alone[:MAX_ADVISED_AXES]), "what breaks it most, each alone"
-    return tuple(order[:MAX_ADVISED_AXES]), "nothing breaks it alone, most is done by"
+        return tuple(alone[:MAX_TOLD]), "what breaks it most, each alone"
+    return tuple(order[:MAX_TOLD]), "nothing breaks it alone, most is done by"
 
 
 def _worst_excess(row: Mapping[str, float], spec: Specification) -> float:

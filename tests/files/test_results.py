@@ -16,7 +16,7 @@ from pandas.testing import assert_frame_equal
 
 from pneuopt.dynamics.hooks import IdentificationHints, SeparatingRun
 from pneuopt.evaluation.certificate import Certificate, Defect, Finding
-from pneuopt.evaluation.plants import PlantAxis
+from pneuopt.evaluation.plants import CorrelatedParameters
 from pneuopt.evaluation.scenarios import Factor
 from pneuopt.files.results import RESULT_KINDS, load_result
 from pneuopt.identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
@@ -112,7 +112,7 @@ def design() -> TuningResult:
     table = pd.DataFrame({"0 to 1": {"SettlingTime": math.nan, "Overshoot": 0.1 + 0.2}})
     margins = pd.DataFrame([{"case": "0 to 1", "point": "at rest", "MaxSensitivity": math.inf, "stable": False}])
     finding = Finding(Defect.HUNTS, "0 to 1", "it hunts")
-    axis = PlantAxis(("load.mass",), 0.05, {"load.mass": 4.75, "pid.Kp": Factor(0.99)}, {"load.mass": 5.25})
+    axis = CorrelatedParameters(("load.mass",), 0.05, {"load.mass": 4.75, "pid.Kp": Factor(0.99)}, {"load.mass": 5.25})
     figures = pd.DataFrame({"median": [1.0], "worst_plant": ["plant 3"], "violations": [2]}, index=["SettlingTime"])
     return TuningResult(
         ParameterSet({"pid.Kp": Parameter(2.0, "V", 0.0, 9.0, log=False, free=True)}),

@@ -49,7 +49,7 @@ def test_a_search_takes_shorter_steps_where_bristles_need_them(monkeypatch: pyte
     steps, spec = draw_steps(plant, rng), specify(po.ITAE(), [po.Overshoot(0.005)])
     search = prepare_search(prepare_task(plant.loop, steps, plant.parameters, spec))
     gains = {"pid.Kp": 20.97, "pid.Ki": 0.01603, "pid.Kd": 0.03215}
-    found = SearchResult(np.array(list(gains.values())), Status(Code.CONVERGED), (), {"simulations": 1.0})
+    found = SearchResult(np.array(list(gains.values())), Status(Code.CONVERGED), (), simulations=1)
     true = po.evaluate(plant.loop, steps, plant.parameters.with_values(gains)).loc["ITAE"].to_numpy(dtype=float)
 
     def claim() -> float:

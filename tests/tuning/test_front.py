@@ -11,11 +11,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import GainMargin, MaxSensitivity, Overshoot, SettlingTime
+from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.plotting import plot_front
-from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.front import pareto_front
 from pneuopt.tuning.method import Method
@@ -119,16 +118,3 @@ def test_ctrl_c_keeps_what_is_done(ended: int, kept: list[int]) -> None:
     assert [k for k, error in enumerate(found["error"]) if error == ""] == kept
     assert (found["error"].drop(kept) == "interrupted").all()
     assert found["SettlingTime"].notna().tolist() == [k in kept for k in range(3)]
-
-
-def test_bad_input_is_named() -> None:
-    loop, given = oscillator(2e-3)
-    with pytest.raises(InputError, match="both requirements are Overshoot; a front needs two kinds"):
-        pareto_front(loop, STEP, given, minimise=(Overshoot(), Overshoot(0.1)))
-    with pytest.raises(InputError, match="at least 2 points, got 1"):
-        pareto_front(loop, STEP, given, minimise=PAIR, points=1)
-    with pytest.raises(InputError, match=r"a front from MaxSensitivity 1.4 until 1.5 ends before it begins"):
-        pareto_front(loop, STEP, given, minimise=(SettlingTime(), MaxSensitivity(1.4)), until=1.5)
-    limits, method = [GainMargin(1e6)], Racing(8, 20)
-    with pytest.raises(ConvergenceError, match="no front: its end, SettlingTime as good as the limits allow, is NOT"):
-        pareto_front(loop, STEP, given, minimise=PAIR, subject_to=limits, method=method)

@@ -15,7 +15,7 @@ from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.full_space import FullSpace
-from pneuopt.tuning.method import compare_starts, describe_agreement
+from pneuopt.tuning.method import Agreement, compare_starts, describe_agreement
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.tune import TuningResult, tune
@@ -23,11 +23,12 @@ from pneuopt.tuning.two_phase import TwoPhase
 
 
 def test_starts_that_all_agree_warn_of_nothing() -> None:
-    stats = compare_starts([0.5, 0.5001, 0.5, 0.5], 1e-3).stats
+    found = compare_starts([0.5, 0.5001, 0.5, 0.5], 1e-3)
+    stats = found.stats
     assert (stats["starts"], stats["starts_agreeing"], stats["starts_optima"]) == (4, 4, 1)
     assert stats["starts_unseen"] == pytest.approx(2 / 12)
-    assert describe_agreement(stats) == ("4 of 4 starts agree", "")
-    assert describe_agreement({}) == ("", "")
+    assert describe_agreement(found) == ("4 of 4 starts agree", "")
+    assert describe_agreement(None) == ("", "")
 
 
 def test_the_chance_of_another_optimum_is_the_one_seen_in_random_draws() -> None:
@@ -70,7 +71,7 @@ def search(method: TwoPhase, lines: list[str]) -> TuningResult:
 def test_a_result_says_how_many_of_its_starts_agree() -> None:
     found = search(TwoPhase(nodes=(50, 50), starts=2), [])
     assert found.stats["starts"] == 2
-    words, _ = describe_agreement(found.stats)
+    words, _ = describe_agreement(found.agreement)
     assert words
     assert not found.status.converged or words in str(found.status)
 
@@ -101,7 +102,7 @@ def test_where_fewer_than_two_starts_agree_another_search_runs_and_the_better_de
         gain = exact if isinstance(search.method, TwoPhase) else raced
         found = search.certify_point(np.array([1.0 if math.isnan(gain) else gain]))
         lost = replace(found, status=Status(Code.NOT_CONVERGED, ("nothing found",)))
-        return replace(lost if math.isnan(gain) else found, stats={**found.stats, "starts_agreeing": float(agreeing)})
+        return replace(lost if math.isnan(gain) else found, agreement=Agreement(4, agreeing))
 
     monkeypatch.setattr(Search, "run", run)
     found = tune(loop, Step(1.0, horizon=4.0), given, minimise=SettlingTime(), plants={})
@@ -121,7 +122,7 @@ def test_where_the_second_search_is_interrupted_the_first_one_s_design_is_tried_
     def run(search: Search) -> TuningResult:
         found = search.certify_point(np.array([5.0]))
         if isinstance(search.method, TwoPhase):
-            return replace(found, stats={**found.stats, "starts_agreeing": 1.0})
+            return replace(found, agreement=Agreement(4, 1))
         return replace(found, status=Status(Code.INTERRUPTED))
 
     monkeypatch.setattr(Search, "run", run)

@@ -51,7 +51,7 @@ from pneuopt.tuning.racing import (
 )
 from pneuopt.tuning.simulator import Responses, Simulator
 from pneuopt.tuning.space import loop_pieces, search_space
-from pneuopt.tuning.tolerances import PATIENCE
+from pneuopt.tuning.tolerances import STALLED_GENERATIONS
 
 BOUNDS = {"pid.Kp": (50.0, 600.0), "pid.Ki": (100.0, 8000.0)}
 STEP, SPEC = Step(0.1, horizon=0.2), specify(SettlingTime(), [Overshoot(0.1)])
@@ -186,7 +186,7 @@ def test_a_best_point_of_responses_that_were_cut_is_proved_on_the_whole(
 @pytest.mark.parametrize(("last", "ends"), [((1.0, 3.0), True), ((1.0, 2.99), False), ((0.99, 3.0), False)])
 def test_a_phase_ends_where_best_and_median_stand(last: tuple[float, float], ends: bool) -> None:
     """A best one that stands alone is waited for: the others have not yet followed it."""
-    stand = [(1.0, 3.0)] * PATIENCE + [last]
+    stand = [(1.0, 3.0)] * STALLED_GENERATIONS + [last]
     assert _is_done(stand, np.array([1.0, 3.0])) == ends
     assert not _is_done(stand[1:], np.array([1.0, 3.0]))
 
@@ -195,8 +195,9 @@ def test_the_result_says_how_many_starts_agree() -> None:
     task, simulator = posed()
     found = SMALL.find(task, simulator, SPEC.with_stability(), task.space.start, 0, lambda _: None)
     assert found.status.code is Code.CONVERGED
-    assert found.stats["starts"] == 2
-    assert found.stats["starts_agreeing"] in (1, 2)
+    assert found.agreement is not None
+    assert found.agreement.starts == 2
+    assert found.agreement.agreeing in (1, 2)
 
 
 BOUNDS_RACE = {"pid.Kp": (50.0, 600.0), "pid.Ki": (100.0, 8000.0), "pid.Kd": (0.0, 1.0)}

@@ -13,26 +13,31 @@ from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.plants import expected_plants
 from pneuopt.evaluation.requirements import (
     IAE,
+    GainMargin,
     MaxSensitivity,
     Overshoot,
     PeakControl,
     PhaseMargin,
     SettlingTime,
+    requirement_values,
 )
 from pneuopt.evaluation.response import TuningCase
 from pneuopt.evaluation.scenarios import apply_scenario, corners, samples, tolerances
+from pneuopt.evaluation.specification import specify
 from pneuopt.evaluation.tolerances import PLANT_COUNT
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
+from pneuopt.tuning.racing import compute_merits
+from pneuopt.tuning.relaxation import limit_excess
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
+from pneuopt.tuning.tolerances import WORST_MERIT
 from pneuopt.tuning.tune import tune
-from pneuopt.tuning.validation import validate_design
+from pneuopt.tuning.validation import find_breaks, validate_design
 
 STEPS = [Step(1.0, horizon=2.0), Step(-0.5, horizon=1.5)]
 
@@ -100,12 +105,6 @@ def test_gains_off_by_a_tolerance_are_new_plants_too() -> None:
     assert np.ptp(gains) > 0.5
     found = validate_design(loop, STEPS[0], design, minimise=SettlingTime(), scenarios=drawn)
     assert found.plants["SettlingTime"].to_numpy() == pytest.approx(math.log(50) / gains, rel=1e-3)
-
-
-def test_no_plant_is_refused() -> None:
-    loop, design = integrator()
-    with pytest.raises(InputError, match="no new plants"):
-        validate_design(loop, STEPS, design, minimise=SettlingTime(), subject_to=[MaxSensitivity(2.0)], scenarios={})
 
 
 def test_a_plant_that_never_settles_is_unstable_or_has_no_rest_counts_as_broken() -> None:
@@ -212,3 +211,41 @@ def test_a_rest_is_sought_once_a_plant(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(TuningCase, "initial", count)
     Simulator(loop, STEPS, Space(loop.complete(design), ()), samples(design, {"plant.gain": 0.1}, 100))
     assert len(sought) == len(set(sought)) == 101
+
+
+SPEC = specify(SettlingTime(max=0.5), [Overshoot(0.1), MaxSensitivity(1.6), GainMargin(2.0), PhaseMargin(40.0)])
+KEPT = {"SettlingTime": 0.4, "Overshoot": 5.0, "MaxSensitivity": 1.4, "GainMargin": 3.0, "PhaseMargin": 60.0}
+
+
+@pytest.mark.parametrize(
+    ("changed", "broken", "share"),
+    [
+        ({}, None, -0.125),
+        ({"Overshoot": 10.0}, None, 0.0),
+        ({"Overshoot": 12.0}, "Overshoot", 0.2),
+        ({"SettlingTime": 0.6}, "SettlingTime", 0.2),
+        ({"GainMargin": 1.6}, "GainMargin", 0.25),
+        # a loop that may lose two thirds of its gain and a phase margin of either sign: plants counted these as broken,
+        # or let them through, by other rules than the certificate's
+        ({"GainMargin": 0.3}, None, -0.125),
+        ({"GainMargin": 0.8}, "GainMargin", 0.6),
+        ({"PhaseMargin": -60.0}, None, -0.125),
+        ({"PhaseMargin": -32.0}, "PhaseMargin", 0.25),
+    ],
+)
+def test_every_reader_says_which_limit_is_broken(changed: dict[str, float], broken: str | None, share: float) -> None:
+    metrics = {**KEPT, **changed}
+    values = requirement_values(metrics)
+    names = () if broken is None else (broken,)
+    assert tuple(type(q).__name__ for q in SPEC.violations(values)) == names
+    assert max(SPEC.excess(values).values()) == pytest.approx(share)
+    assert find_breaks(metrics, SPEC) == names
+    lanes = {n: np.array([v]) for n, v in {**values, "Excess": 0.0}.items()}
+    assert limit_excess(lanes, SPEC)[0] == pytest.approx(share)
+    assert (compute_merits(lanes, SPEC, 1.0)[0] > WORST_MERIT) == (broken is not None)
+
+
+def test_what_has_no_figure_breaks_its_limit() -> None:
+    values = requirement_values({**KEPT, "Overshoot": math.nan})
+    assert [type(q) for q in SPEC.violations(values)] == [Overshoot]
+    assert find_breaks({**KEPT, "Overshoot": math.nan}, SPEC) == ("Overshoot",)

@@ -2,15 +2,12 @@
 
 from typing import Any
 
-import pytest
-
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import Overshoot, SettlingTime
 from pneuopt.models.linear import FirstOrder
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.tune import tune
 from pneuopt.tuning.without_dither import tune_without_dither
@@ -34,12 +31,3 @@ def test_the_rival_is_the_tuning_of_a_loop_whose_dither_is_off() -> None:
     assert rival.parameters.free_names == ("pid.Kp", "pid.Ki")
     assert [rival.parameters.value(n) for n in RANGES] == [same.parameters.value(n) for n in RANGES]
     assert rival.validation is None
-
-
-def test_without_dither_or_gains_there_is_no_rival() -> None:
-    loop, given = design("dither.amplitude")
-    plain = ClosedLoop(FirstOrder().system(), PID(limits=False))
-    with pytest.raises(InputError, match="free"):
-        tune_without_dither(loop, Step(1.0), given, minimise=SettlingTime())
-    with pytest.raises(InputError, match="no dither to leave out"):
-        tune_without_dither(plain, Step(1.0), plain.parameters, minimise=SettlingTime())
