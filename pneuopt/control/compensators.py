@@ -50,23 +50,17 @@ from pneuopt.quantities.units import difference_unit, unit_ratio
 
 @dataclass(frozen=True)
 class ControllerSnapshot:
-    """What a compensator sees: the time [s], reference and measured signal, and the command so far.
+    """What a compensator sees at an instant."""
 
-    `sample_time` [s] is the controller's, None of a continuous one. `rates` are the motion inputs that the part asks
-    for ("reference_speed", "reference_acceleration"), `readings` the plant's outputs, by name, and `error` that of the
-    signal that the loop is judged by, which in a cascade is the position; a rest, where parts start, has none.
-    `elapsed` [s] is the time since the last good sample of a sampled controller, over which differences are taken.
-    """
-
-    t: Any
+    t: Any  # [s]
     reference: Any
     measured: Any
-    command: Any
-    sample_time: float | None
-    rates: Mapping[str, Any] = field(default_factory=dict)
-    readings: Mapping[str, Any] = field(default_factory=dict)
-    error: Any = 0.0
-    elapsed: Any = None
+    command: Any  # so far, by the parts before
+    sample_time: float | None  # [s], None of a continuous controller
+    rates: Mapping[str, Any] = field(default_factory=dict)  # the motion inputs that the part uses
+    readings: Mapping[str, Any] = field(default_factory=dict)  # the plant's outputs
+    error: Any = 0.0  # of what the loop is judged by, in a cascade the position; a rest, where parts start, has none
+    elapsed: Any = None  # [s] since the last good sample, over which differences are taken
 
 
 @runtime_checkable
@@ -140,10 +134,7 @@ def check_compensators(given: object, on: SensedSignal, axis: Axis | None) -> No
 def check_values(
     compensators: Sequence[Compensator], known: ParameterSet, value: Mapping[str, float], count: float
 ) -> None:
-    """Refuse a compensator's value outside the bounds that it declares, whatever a set's own bounds say.
-
-    And a tolerance that the sensor's count, in the same unit, cannot tell from zero.
-    """
+    """Refuse a value beyond its part's bounds, and a tolerance that `count` of the sensor cannot tell from zero."""
     prefixes = tuple(f"{c.section}." for c in compensators)
     for name, q in known.items():
         runs = not name.startswith(prefixes) or q.lower <= value[name] <= q.upper
@@ -158,23 +149,7 @@ def check_values(
 def compensate(
     compensators: Sequence[Compensator], seen: ControllerSnapshot, x: Symbols, p: Symbols
 ) -> tuple[Signals, ca.SX]:
-    """Let compensators act one after the other.
-
-    Parameters
-    ----------
-    compensators : sequence of Compensator
-    seen : ControllerSnapshot
-        Its command is that of PID and feedforward.
-    x, p : mapping of str to casadi.SX
-        The loop's states and parameters.
-
-    Returns
-    -------
-    moved : dict
-        As `Compensator.act` gives it, by the loop's names.
-    added : casadi.SX
-        The sum of what they add [the command's unit].
-    """
+    """What compensators add, one after the other, to the command, and their states as `Compensator.act` has them."""
     moved, added = Signals(), ca.SX(0)
     for part in compensators:
         now = replace(seen, command=seen.command + added)
@@ -260,9 +235,6 @@ class Knocker:
             "direction": ca.if_else(begins, direction, x["direction"]),
         }
         return now, p["amplitude"] * now["direction"] * (phase < width)
-
-
-# slow motions too little
 
 
 class Direction(Enum):
@@ -523,10 +495,7 @@ class ImpulsiveControl:
 
 
 def _next_peak(e: Any, last: Any, before: Any, ceiling: Any, p: Symbols) -> tuple[ca.SX, ca.SX]:
-    """The signed peak of a pulse that begins at the error e, and the ceiling from then on.
-
-    Known are the last peak (0: none), the error before it, and the ceiling, the last peak that went too far (0: none).
-    """
+    """A pulse's signed peak where it begins at error e, and the ceiling from then on: the last that went too far, or 0."""
     way = ca.fmax((before - e) * ca.if_else(last < 0, -1, 1), LEAST_WAY * p["tolerance"])
     ratio = ca.fmax(PULSE_SHARE * ca.fabs(e), LEAST_WAY * p["tolerance"]) / way
     size, turns = ca.fabs(last), last * e < 0

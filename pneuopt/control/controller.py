@@ -154,11 +154,11 @@ class PositionLoop:
 
 
 class ControllerUpdate(NamedTuple):
-    """What is computed at a sample: the states after it, sensor included, and the terms of the command, by name.
+    """The states after a sample, sensor included, and the terms of the command, by name.
 
-    Terms are "error", "proportional", "integral" (before back-calculation), "derivative", "feedforward", "compensation",
-    "dither", their sum before the limits, "unlimited", the gains of this instant, "Kp_parallel" and so on, and the
-    signals as they are computed with, "reference_read" for instance.
+    Terms are "error", "proportional", "integral" (before back-calculation), "derivative", "feedforward",
+    "compensation", "dither", and "unlimited", their sum before the limits; the gains of this instant, "Kp_parallel"
+    and so on; and the signals as they are computed with, "reference_read" for instance.
     """
 
     states: Signals
@@ -169,8 +169,8 @@ class ControllerUpdate(NamedTuple):
 class Controller:
     """A PID and all that acts beside it; its parts are those of `ClosedLoop`.
 
-    Its methods take states, inputs, outputs and parameters by their names in a loop ("pid.Kp"), in mappings that may
-    hold others, too. A part that fits neither the signals nor another part is refused.
+    Its methods take states, inputs, outputs and parameters by their names in a loop ("pid.Kp"), as numbers or as
+    symbols, in mappings that may hold others, too.
     """
 
     pid: PID
@@ -288,10 +288,7 @@ class Controller:
     def _added_to_command(
         self, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
     ) -> tuple[Signals, Signals, ca.SX]:
-        """What feedforward, compensators and dither add to the PID's command: their states, each term, and the sum.
-
-        Of the states it is the rates, with a sampled PID the next values.
-        """
+        """What feedforward, compensators and dither add to the PID's command: their states, each term, the sum."""
         h = self.pid.sample_time
         elapsed = None if h is None else self.pid.elapsed_time(without_prefix(x, "pid"))
         moved, lead, compensation, wave = Signals(), ca.SX(0), ca.SX(0), ca.SX(0)
@@ -315,20 +312,9 @@ class Controller:
     def start(
         self, u: Mapping[str, Any], measured: Any, y: Mapping[str, Any], command: Any, p: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """The first states, sensor apart, from what the actuator has got so far [output unit], by the loop's names.
+        """The first states, sensor apart, with which the controller goes on from a command [its unit] without a bump.
 
-        Parameters
-        ----------
-        u : mapping of str to float or casadi.SX
-            The inputs as `inner_inputs` gives them.
-        measured : float or casadi.SX
-            As the PID sees it.
-        y : mapping of str to float or casadi.SX
-            The plant's outputs that compensators read.
-        command : float or casadi.SX
-            The PID's, which the compensators that act always add to.
-        p : mapping of str to float or casadi.SX
-            The loop's parameters, with the gains of this instant.
+        The inputs are those of `inner_inputs`, the command the PID's own, and the gains those of this instant.
         """
         unit = Quantity("command", "1")
         pid = self.pid.start(u["reference"], measured, command, without_prefix(p, "pid"))
@@ -357,15 +343,7 @@ class Controller:
         return [*sensor, *map(float, self.start({"reference": wanted}, seen, y, v, value).values())]
 
     def inner_inputs(self, u: Mapping[str, Any], position: Any, p: Mapping[str, Any]) -> dict[str, Any]:
-        """The inputs as PID and compensators see them: a cascade's reference is a speed, and `ERROR` a position's.
-
-        Parameters
-        ----------
-        u, p : mapping of str to float or casadi.SX
-            The loop's inputs and parameters.
-        position : float or casadi.SX
-            What the loop is judged by, as the controller sees it.
-        """
+        """The inputs as PID and compensators see them: a cascade's reference is a speed, and `ERROR` a position's."""
         if self.outer is None:
             return dict(u)
         own = without_prefix(p, self.outer.section)
@@ -375,17 +353,7 @@ class Controller:
     def schedule_gains(
         self, p: Mapping[str, Any], measured: Any, seen: Mapping[str, Any], y: Mapping[str, Any]
     ) -> Mapping[str, Any]:
-        """The loop's parameters with the gains of this instant; as they are without a schedule.
-
-        Parameters
-        ----------
-        p : mapping of str to float or casadi.SX
-            The loop's parameters.
-        measured : float or casadi.SX
-            What the PID sees.
-        seen, y : mapping of str to float or casadi.SX
-            The sensor's states after reading, and the plant's outputs, one of which has the position.
-        """
+        """The loop's parameters with the gains of this instant; `seen` are the sensor's states after reading."""
         if self.schedule is None:
             return p
         if self.schedule.position == self.pid_signal.name:
@@ -551,10 +519,9 @@ class Controller:
 
     @cached_property
     def compensation(self) -> ca.Function:
-        """The compensators that act always, under constant signals and a reference at rest, of the PID's command.
+        """``(command, reference, measured, readings, p) -> [compensated, slope, feedback]`` of what acts always.
 
-        ``(command, reference, measured, readings, p) -> [compensated, slope, feedback]``: the command that they make
-        of the PID's, and its derivatives to the PID's command and to the measured signal.
+        Under constant signals and a reference at rest; the slopes are to the PID's command and to the measured signal.
         """
         v, r, y = (ca.SX.sym(n) for n in ("command", "reference", "measured"))
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
@@ -572,22 +539,9 @@ class Controller:
     def uncompensated_command(
         self, p: Array, reference: Any, measured: Any, command: ArrayLike, readings: ArrayLike = ()
     ) -> Array:
-        """The PID's command of which the compensators that act always make another one.
+        """The PID's command, shape (m,), of which the compensators that act always make another one, shape (m,).
 
-        Parameters
-        ----------
-        p : ndarray, shape (n_parameters,) or (n_parameters, m)
-            In the order of `Controller.parameters`.
-        reference, measured : float or array_like, shape (m,)
-            The signals at that instant.
-        command : float or array_like, shape (m,)
-            What the compensators make, which grows with the PID's command.
-        readings : array_like, shape (n_readings,) or (n_readings, m)
-            The outputs `Controller.readings`.
-
-        Returns
-        -------
-        ndarray, shape (m,)
+        Parameters p have shape (n_parameters,) or (n_parameters, m) in the controller's order, readings likewise.
         """
         wanted = np.atleast_1d(np.asarray(command, dtype=float))
         if not self.acting_always:
@@ -596,21 +550,10 @@ class Controller:
         return invert_increasing(lambda v: self._evaluate_compensation(p, reference, measured, v, shown)[0], wanted)
 
     def compensation_slopes(self, p: Array, measured: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
-        """Slopes of the compensators that act always, at a steady operating point without dither.
+        """Derivatives of the compensated command to the PID's command and to the measured signal, shape (m,) each.
 
-        Parameters
-        ----------
-        p : ndarray, shape (n_parameters,) or (n_parameters, m)
-            In the order of `Controller.parameters`.
-        measured : float or array_like, shape (m,)
-            The measured signal, which the reference equals there.
-        command : float or array_like, shape (m,)
-            What the actuator gets, the dither's offset included.
-
-        Returns
-        -------
-        slope, feedback : ndarray, shape (m,)
-            Derivatives of what they make to the PID's command and to the measured signal.
+        At a steady operating point without dither: the reference equals the measured signal, shape (m,), and the
+        command, shape (m,), is what the actuator gets, the dither's offset included.
         """
         order = list(self.parameters)
         offset = p[order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0

@@ -33,48 +33,26 @@ Matrices = tuple[Array, Array, Array, Array]
 
 
 class OpenLoops(NamedTuple):
-    """m loops cut at their commands.
+    """m loops cut at their commands."""
 
-    Attributes
-    ----------
-    loop : tuple of ndarray
-        Under negative feedback, as `Matrices`; the plant's states come first.
-    noise : tuple of ndarray
-        The controllers from noise on what the PID sees, in a cascade on the position, to the command, without plant.
-    """
-
-    loop: Matrices
+    loop: Matrices  # under negative feedback; the plant's states come first
+    # the controllers alone, from noise on what the PID sees, in a cascade on the position, to the command
     noise: Matrices
 
 
 @dataclass(frozen=True, eq=False)
 class ComposedLoops:
-    """Function that linearises many loops of one kind.
+    """Function that linearises many loops of one kind; machine code of the plant's Jacobian pays for many plants.
 
     Under dither the plant is the mean over its ripple, as in `AveragedPlant`, with a controller that does not react to
     the ripple.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    compiled : bool
-        Whether machine code is made of the plant's Jacobian, which pays for many plants.
     """
 
     loop: ClosedLoop
     compiled: bool = False
 
     def __call__(self, p: Array, x: Array, u: Array) -> OpenLoops:
-        """Linearise.
-
-        Parameters
-        ----------
-        p : ndarray, shape (m, n_parameters)
-            In the order of ``loop.parameters``.
-        x : ndarray, shape (m, n_plant_states)
-        u : ndarray, shape (m, n_plant_inputs)
-            The operating points, the command among the inputs.
-        """
+        """Linearise m loops: parameters p, and the operating points' plant states x and inputs u, (m, ...) each."""
         plant, shown = self._plants(p, x, u)
         law = self._laws(
             self._frozen(p.T, shown.T).full().T,
@@ -135,10 +113,7 @@ class ComposedLoops:
 
     @cached_property
     def _law(self) -> ca.Function:
-        """``(y, v, p) -> A, B, C, D`` of the controller, from the plant's outputs and then the noise to the command.
-
-        v is the PID's command at the operating point.
-        """
+        """``(y, v, p) -> A, B, C, D`` of the controller, from outputs, then noise, to the command; v is the PID's own."""
         law = _linear_law(self.loop.controller)
         y, p = ({n: ca.SX.sym(n) for n in own} for own in (law.signals.outputs, self.loop.parameters))
         v, noise, r = ca.SX.sym("v"), ca.SX.sym("noise"), ca.SX.sym("reference")
@@ -231,10 +206,7 @@ def _resting_states(law: Controller, x: Signals, y: Signals, v: ca.SX, p: Signal
 
 
 def _join(plant: Matrices, controller: Matrices) -> Matrices:
-    """The open loop from the command to what the controller makes of the outputs.
-
-    Joined in continuous form, the matrix keeps its zeros, and a double integral its two poles at zero.
-    """
+    """The open loop from command to fed-back signal; in continuous form a double integral keeps its poles at zero."""
     (A, B, C, D), (Ac, Bc, Cc, Dc) = plant, controller
     joined = np.block([[A, np.zeros((len(A), A.shape[-1], Ac.shape[-1]))], [Bc @ C, Ac]])
     return joined, np.concatenate([B, Bc @ D], axis=1), np.concatenate([Dc @ C, Cc], axis=2), Dc @ D
@@ -357,11 +329,7 @@ def open_loop(
 def noise_path(
     loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
 ) -> Linearisation:
-    """The controller of a loop with further feedback, from noise on what the PID sees to the command.
-
-    In a cascade the noise is the position's, which an `Encoder` differentiates, too.
-    Parameters as for `linear_plant`; frequencies as in `open_loop`.
-    """
+    """The controller of a loop with further feedback, from noise on what it compares with the reference to the command."""
     return _composed_loops(loop, parameters, *operating_point(loop, parameters, x, u))[1]
 
 

@@ -384,15 +384,7 @@ def check_closed_loop(loop: object) -> None:
 
 
 def add_disturbances(loop: ClosedLoop, references: Iterable[Reference]) -> ClosedLoop:
-    """Give the plant an input for each disturbance of the references, named by `disturbance_input`.
-
-    A parameter becomes its value plus that input, an input of the plant likewise; so 0 is the plant as it was.
-
-    Raises
-    ------
-    UnknownNameError
-        If a disturbance is neither a parameter nor an input of the plant.
-    """
+    """Give the plant an input for each disturbance of the references; it adds to that parameter or input."""
     wanted = dict.fromkeys(n for reference in references for n in reference.disturbance)
     new = [n for n in wanted if disturbance_input(n) not in names(loop.plant.inputs)]
     known = [*names(loop.plant.inputs), *loop.plant.parameters]
@@ -426,13 +418,7 @@ def _add_plant_disturbances(plant: System, wanted: list[str]) -> System:
 
 
 def select_signal(kind: str, name: str | None, known: Sequence[Quantity], usual: str | None) -> Quantity:
-    """The signal of that name, by default the usual one or the only one.
-
-    Raises
-    ------
-    ModelError
-        If there are several; `UnknownNameError` if there is none of that name.
-    """
+    """The signal of that name, by default the usual one or the only one."""
     by_name = {q.name: q for q in known}
     if name is None:
         name = usual if usual in by_name else next(iter(by_name)) if len(by_name) == 1 else None
@@ -458,27 +444,11 @@ def check_algebraic_loop(plant: System, command: str, output: str) -> None:
 def find_rest(
     loop: ClosedLoop, parameters: ParameterSet, reference: float, start: Mapping[str, float]
 ) -> tuple[Array, float]:
-    """The plant's state and the command, at rest or in steady motion.
+    """The plant's state and the command, at rest or in steady motion; `start` is what else is known of the plant.
 
     A plant with a `rest_hook` gives them. Otherwise they are the equilibrium of plant and controller; a state that
     neither the rates nor the measured output depend on, such as the position of an axis under speed control, is left
     out and may keep moving.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    parameters : ParameterSet
-    reference : float
-        [unit of the measured signal]
-    start : mapping of str to float
-        What else is known of the plant.
-
-    Raises
-    ------
-    ConvergenceError
-        If there is no equilibrium.
-    InputError
-        If the plant refuses, or does not start from what `start` names.
     """
     plant, measured = loop.plant, loop.feedback.name
     require(measured not in start, f"start: {measured!r} is what the loop controls; give it as initial=")
@@ -504,16 +474,7 @@ def find_rest(
 
 
 def set_sliding_direction(loop: ClosedLoop, parameters: ParameterSet, reference: float) -> ParameterSet:
-    """Set the direction in which Karnopp's friction already slides where the plant moves at the start.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    parameters : ParameterSet
-        Every parameter of the loop.
-    reference : float
-        The speed so far [m/s, or rad/s].
-    """
+    """Set the direction in which Karnopp's friction already slides where the reference is a speed [m/s, rad/s]."""
     if loop.feedback.name != "speed" or FRICTION_DIRECTION not in loop.parameters:
         return parameters
     return parameters.with_values({FRICTION_DIRECTION: float(np.sign(reference))})

@@ -36,24 +36,12 @@ class PlannedMotion(Protocol):
 
 @dataclass(frozen=True)
 class SCurve:
-    """Seven segments of constant jerk, symmetric in time; those that a short move has no room for take no time.
+    """Seven segments of constant jerk, symmetric in time; those that a short move has no room for take no time."""
 
-    Parameters
-    ----------
-    distance : float
-        [measured unit], positive.
-    peak_speed : float
-        [measured unit/s]
-    acceleration_time : float
-        From rest to the peak speed [s].
-    jerk_time : float
-        From no acceleration to the largest [s]; 0 makes it a trapezoid of speed.
-    """
-
-    distance: float
-    peak_speed: float
-    acceleration_time: float
-    jerk_time: float
+    distance: float  # [measured unit], positive
+    peak_speed: float  # [measured unit/s]
+    acceleration_time: float  # from rest to the peak speed [s]
+    jerk_time: float  # from no acceleration to the largest [s]; 0 makes it a trapezoid of speed
 
     @property
     def cruise_time(self) -> float:
@@ -100,17 +88,10 @@ class MinimumJerk:
     """The polynomial of fifth order from rest to rest, which has the least integral of the squared jerk.
 
     T. Flash and N. Hogan, The coordination of arm movements, J. Neurosci. 5(7) (1985) 1688-1703.
-
-    Parameters
-    ----------
-    distance : float
-        [measured unit], positive.
-    duration : float
-        [s]
     """
 
-    distance: float
-    duration: float
+    distance: float  # [measured unit], positive
+    duration: float  # [s]
 
     def motion(self, t: Array) -> tuple[Array, Array, Array]:
         """See `PlannedMotion`."""
@@ -121,17 +102,9 @@ class MinimumJerk:
 
 
 def plan_s_curve(distance: float, speed: float, acceleration: float, jerk: float = inf) -> SCurve:
-    """The fastest move from rest to rest within limits of speed, acceleration and jerk.
+    """The fastest move from rest to rest within limits of speed, acceleration and jerk; without jerk's a trapezoid.
 
-    Without a limit of jerk it is a trapezoid of speed. L. Biagiotti and C. Melchiorri, Trajectory Planning for
-    Automatic Machines and Robots (2008), sections 3.2 and 3.4.
-
-    Parameters
-    ----------
-    distance : float
-        [measured unit], positive, as the limits are.
-    speed, acceleration, jerk : float
-        Limits [measured unit/s, /s^2, /s^3].
+    L. Biagiotti and C. Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), sections 3.2 and 3.4.
 
     Examples
     --------
@@ -158,13 +131,6 @@ def plan_minimum_jerk(distance: float, speed: float, acceleration: float, jerk: 
     """The shortest polynomial of fifth order within limits of speed, acceleration and jerk.
 
     Its peaks are 15/8 d/T of speed, 10/sqrt(3) d/T^2 of acceleration and 60 d/T^3 of jerk (Flash and Hogan 1985).
-
-    Parameters
-    ----------
-    distance : float
-        [measured unit], positive, as the limits are.
-    speed, acceleration, jerk : float
-        Limits [measured unit/s, /s^2, /s^3].
 
     Examples
     --------
@@ -347,18 +313,7 @@ class Move:
 
 
 def sample_motion(reference: Reference, motion: Motion, step: float, *, between: bool = True) -> Trajectory:
-    """The reference, its speed and its acceleration held on a grid, and its disturbances; as `Move.trajectory`.
-
-    Parameters
-    ----------
-    reference : Reference
-    motion : callable
-        Of instants [s] the reference, its speed and its acceleration.
-    step : float
-        Spacing of the grid [s].
-    between : bool
-        Whether the reference may begin to change between two samples.
-    """
+    """A reference and its rates on a grid of `step` [s], with disturbances; `between`: it may begin off the grid."""
     k, first = reference_samples(reference, step, between=between)
     t: Array = np.asarray(k * step, dtype=np.float64)
     columns = dict(zip(("reference", REFERENCE_SPEED, REFERENCE_ACCELERATION), motion(t), strict=True))

@@ -33,7 +33,7 @@ def reset_quantities(measured: Quantity) -> tuple[Quantity, ...]:
 
 
 def reset_integral(x: Symbols, error: Any, p: Symbols) -> dict[str, ca.SX]:
-    """The integral and the own states before the law of a sample is computed.
+    """The integral and the own states before the law of a sample, from the error of what the loop is judged by.
 
     With the error e, the side s_ on which it was (-1 or 1; 0 at the start) and the excursion m_, of the sample before::
 
@@ -50,13 +50,6 @@ def reset_integral(x: Symbols, error: Any, p: Symbols) -> dict[str, ca.SX]:
     systems with Stribeck friction, IEEE Trans. Control Syst. Technol. 30 (2022) 294-310: resets at zero crossings of
     the position error and of the speed, in continuous time. Their rules are here those of a sampled controller that
     sees the error alone: a stop is a sample at which the error no longer grows.
-
-    Parameters
-    ----------
-    x, p : mapping of str to casadi.SX
-        States "integral", "side", "excursion"; parameters "reset_ratio", "reset_band".
-    error : casadi.SX
-        Of the signal that the loop is judged by.
     """
     size, armed = ca.fabs(error), x[EXCURSION] > 0
     beyond = size > p["reset_band"]

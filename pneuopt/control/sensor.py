@@ -21,27 +21,13 @@ REFERENCE_SPEED, REFERENCE_ACCELERATION = "reference_speed", "reference_accelera
 
 @dataclass(frozen=True)
 class SensedSignal:
-    """The signal that a sensor reads, and the controller's sample time.
+    """The signal that a sensor reads, and the controller's sample time."""
 
-    Parameters
-    ----------
-    measured : Quantity
-        The plant's output that the controller wants.
-    outputs : mapping of str to Quantity
-        All of the plant's.
-    sample_time : float, optional
-        The controller's [s].
-    order : int, optional
-        Of the measured signal as a derivative of the axis's position: 0 itself, 1 its speed; None of any other.
-    cascade : bool
-        Whether the controller that wants a speed is the inner one of a cascade, whose reference is a position.
-    """
-
-    measured: Quantity
-    outputs: Mapping[str, Quantity]
-    sample_time: float | None
-    order: int | None = 1
-    cascade: bool = False
+    measured: Quantity  # the plant's output that the controller wants
+    outputs: Mapping[str, Quantity]  # all of the plant's
+    sample_time: float | None  # [s], None of a continuous controller
+    order: int | None = 1  # as a derivative of the axis's position: 0 itself, 1 its speed; None of any other
+    cascade: bool = False  # whether it is the speed of a cascade's inner controller, whose reference is a position
 
     @property
     def speed_unit(self) -> str:
