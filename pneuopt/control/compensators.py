@@ -495,7 +495,7 @@ class ImpulsiveControl:
 
 
 def _next_peak(e: Any, last: Any, before: Any, ceiling: Any, p: Symbols) -> tuple[ca.SX, ca.SX]:
-    """A pulse's signed peak where it begins at error e, and the ceiling from then on: the last that went too far, or 0."""
+    """A pulse's signed peak at the error e, and the ceiling from then on: the last peak that went too far, or 0."""
     way = ca.fmax((before - e) * ca.if_else(last < 0, -1, 1), LEAST_WAY * p["tolerance"])
     ratio = ca.fmax(PULSE_SHARE * ca.fabs(e), LEAST_WAY * p["tolerance"]) / way
     size, turns = ca.fabs(last), last * e < 0

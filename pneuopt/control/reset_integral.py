@@ -10,26 +10,9 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import difference_unit
 
 SIDE, EXCURSION = "side", "excursion"
+
+
 RESET_STATES = (SIDE, EXCURSION)
-
-
-def reset_parameters(unit: str) -> ParameterSet:
-    """The ratio [1], and the error within which no change of sign counts, of a signal of this unit."""
-    return ParameterSet(
-        {
-            "reset_ratio": Parameter(
-                RESET_RATIO, "1", lower=0.0, upper=1.0, meaning="part of the integral that is kept, its sign turned"
-            ),
-            "reset_band": Parameter(
-                0.0, difference_unit(unit), lower=0.0, meaning="error within which no change of its sign counts"
-            ),
-        }
-    )
-
-
-def reset_quantities(measured: Quantity) -> tuple[Quantity, ...]:
-    """The states: the side on which the error was last, and how far it has gone since it changed sides."""
-    return Quantity(SIDE, "1"), Quantity(EXCURSION, difference_unit(measured.unit), measured.nominal)
 
 
 def reset_integral(x: Symbols, error: Any, p: Symbols) -> dict[str, ca.SX]:
@@ -60,3 +43,22 @@ def reset_integral(x: Symbols, error: Any, p: Symbols) -> dict[str, ca.SX]:
     excursion = ca.if_else(crosses, size, ca.if_else(armed, ca.if_else(stops, 0, size), 0))
     side = ca.if_else(ca.logic_or(crosses, begins), ca.if_else(error < 0, -1, 1), x[SIDE])
     return {"integral": integral, SIDE: side, EXCURSION: excursion}
+
+
+def reset_parameters(unit: str) -> ParameterSet:
+    """The ratio [1], and the error within which no change of sign counts, of a signal of this unit."""
+    return ParameterSet(
+        {
+            "reset_ratio": Parameter(
+                RESET_RATIO, "1", lower=0.0, upper=1.0, meaning="part of the integral that is kept, its sign turned"
+            ),
+            "reset_band": Parameter(
+                0.0, difference_unit(unit), lower=0.0, meaning="error within which no change of its sign counts"
+            ),
+        }
+    )
+
+
+def reset_quantities(measured: Quantity) -> tuple[Quantity, ...]:
+    """The states: the side on which the error was last, and how far it has gone since it changed sides."""
+    return Quantity(SIDE, "1"), Quantity(EXCURSION, difference_unit(measured.unit), measured.nominal)
