@@ -1,8 +1,8 @@
-"""`ClosedLoop`: a plant and its controller, as a `System` or a `DiscreteSystem` for the solvers; where it rests.
+"""`ClosedLoop`: a plant and its controller as one `System` or `DiscreteSystem` for the solvers, and where it rests.
 
-Where the parts meet: the reference r and the measured output y, or what a sensor shows of it, enter the PID,
-feedforward, compensators and dither are added to its command, the sum is clipped, and the result, the output "control",
-drives the actuated input.
+The plant's outputs go to the controller, whose command, the loop's output "control", drives the plant's actuated input.
+`ClosedLoop.system` wires the two in continuous time; with a sampled controller `ClosedLoop.hold_system` is the plant on
+a held command, and `ClosedLoop.update` what happens at a sample. What the controller computes stands in `Controller`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.pid import PID, ParallelForm, integrates
 from pneuopt.control.reference import Reference, disturbance_input
-from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag, Signals
+from pneuopt.control.sensor import Encoder, SensorLag, Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.runnable import PlantField
 from pneuopt.dynamics.system import (
@@ -145,11 +145,6 @@ class ClosedLoop:
         return self.controller.pid_signal
 
     @property
-    def sensed_signal(self) -> SensedSignal:
-        """What the sensor reads."""
-        return self.controller.sensed_signal
-
-    @property
     def readings(self) -> tuple[str, ...]:
         """The plant's outputs that the controller reads beside what its PID controls, in the plant's order."""
         return self.controller.readings
@@ -158,11 +153,6 @@ class ClosedLoop:
     def motion_inputs(self) -> tuple[Quantity, ...]:
         """Of "reference_speed" and "reference_acceleration" those that a compensator uses."""
         return self.controller.motion_inputs
-
-    @property
-    def tunable_sections(self) -> tuple[str, ...]:
-        """Prefixes of the parameters that a tuning may change: the controller's, not the sensor's or the plant's."""
-        return self.controller.tunable_sections
 
     @property
     def is_composed(self) -> bool:
@@ -202,13 +192,18 @@ class ClosedLoop:
         ModelError
             If the PID is sampled: use `discrete`, or `hold_system` and `update`.
         """
-        h = self.pid.sample_time
-        require(
-            h is None,
-            f"a loop sampled every {h} s is no ODE; use discrete(), or hold_system() between samples",
-            ModelError,
-        )
-        return define(self.states, self.inputs, self.outputs, self.parameters, self._continuous_rates)
+        h, of = self.pid.sample_time, self.controller
+        sampled = f"a loop sampled every {h} s is no ODE; use discrete(), or hold_system() between samples"
+        require(h is None, sampled, ModelError)
+
+        def rates(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+            no_command = ca.SX(0)  # what the controller measures does not depend on its command
+            measured = self.evaluate_plant(t, x, u, p, no_command)[1]
+            controller_rates, command = of.rates(t, x, u, measured, p)
+            plant_rates, y = self.evaluate_plant(t, x, u, p, command)
+            return plant_rates | controller_rates | of.sensor_rates(x, y, p), y | {"control": command}
+
+        return define(self.states, self.inputs, self.outputs, self.parameters, rates)
 
     def hold_system(self) -> System:
         """Between two samples of a sampled PID: the plant runs on the held command, the controller's states rest.
@@ -216,7 +211,19 @@ class ClosedLoop:
         An analogue dither is in here, as a function of time; a sampled one is part of the held command.
         """
         require(self.pid.sample_time is not None, "a continuous loop holds nothing; use system()", ModelError)
-        return define(self.states, self.inputs, self.outputs, self.parameters, self._held_rates)
+        at_rest = tuple(f"{section}." for section in self.controller.tunable_sections)
+
+        def rates(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+            command = x["pid.command"]
+            if self.dither and self.dither.analogue:
+                wave = self.dither.wave(t, without_prefix(p, "dither"))
+                command = self.pid.clip(command + wave, without_prefix(p, "pid"))
+            plant_rates, y = self.evaluate_plant(t, x, u, p, command)
+            controller_rates = {n: ca.SX(0) for n in x if n.startswith(at_rest)}
+            sensor_rates = self.controller.sensor_rates(x, y, p)
+            return plant_rates | controller_rates | sensor_rates, y | {"control": command}
+
+        return define(self.states, self.inputs, self.outputs, self.parameters, rates)
 
     @cached_property
     def update(self) -> ca.Function:
@@ -224,27 +231,9 @@ class ClosedLoop:
         require(self.pid.sample_time is not None, "a continuous loop has no update; use system()", ModelError)
         t, x, u = ca.SX.sym("t"), symbols(self.states), symbols(self.inputs)
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        y = self.evaluate_plant(t, x, u, p, ca.SX(0))[1]
-        after = stack({**x, **self.controller.update(t, x, u, y, p).states})
+        measured = self.evaluate_plant(t, x, u, p, ca.SX(0))[1]
+        after = stack({**x, **self.controller.update(t, x, u, measured, p).states})
         return ca.Function("update", [t, *map(stack, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
-
-    def _continuous_rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        """Rates and outputs of a loop with a continuous PID."""
-        shown = self.evaluate_plant(t, x, u, p, ca.SX(0))[1]
-        own, command = self.controller.rates(t, x, u, shown, p)
-        xdot, y = self.evaluate_plant(t, x, u, p, command)
-        return xdot | own | self.controller.sensor_rates(x, y, p), y | {"control": command}
-
-    def _held_rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        """Rates and outputs of a loop with a sampled PID while its command is held."""
-        command = x["pid.command"]
-        if self.dither and self.dither.analogue:
-            wave = self.dither.wave(t, without_prefix(p, "dither"))
-            command = self.pid.clip(command + wave, without_prefix(p, "pid"))
-        xdot, y = self.evaluate_plant(t, x, u, p, command)
-        held = tuple(f"{n}." for n in self.tunable_sections)
-        own = {n: ca.SX(0) for n in x if n.startswith(held)} | self.controller.sensor_rates(x, y, p)
-        return xdot | own, y | {"control": command}
 
     def evaluate_plant(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
         """Rates and outputs of the plant under a command."""
@@ -316,10 +305,6 @@ class ClosedLoop:
     def sensor_lag(self, p: Array) -> Any:
         """The sensor's time constant in the loop linearised [s]; p of shape (n_parameters,) or (n_parameters, m)."""
         return self.controller.sensor_lag(dict(zip(self.parameters, p, strict=True)))
-
-    def sensor_resolution(self, parameters: ParameterSet) -> float:
-        """What one count of the sensor changes its reading by [feedback's unit]; 0 of a sensor without counts."""
-        return self.controller.sensor_resolution(parameters)
 
     def dither_period(self, parameters: ParameterSet) -> float | None:
         """The time over which averages and ripple are taken [s] (`Dither.period`); None without dither."""

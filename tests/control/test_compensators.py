@@ -369,7 +369,7 @@ def test_several_act_one_on_the_others_command(section: str) -> None:
     assert after["knocker.command"] == pytest.approx(v)
     assert (w > 0.9, after["pid.command"]) == (True, 0.9)
     assert after["pid.integral"] == pytest.approx(H / 0.02 * (0.9 - w))
-    assert section in loop.tunable_sections
+    assert section in loop.controller.tunable_sections
 
 
 def sent_by(loop: ClosedLoop, p: ParameterSet, reference: np.ndarray, h: float) -> np.ndarray:

@@ -188,7 +188,7 @@ def test_signals_and_units_are_those_of_position_and_speed() -> None:
     ]
     units = {n: loop.parameters[n].unit for n in ("position_loop.Kp", "pid.Kp", "friction_feedforward.smoothing")}
     assert units == {"position_loop.Kp": "1/s", "pid.Kp": "V*s/m", "friction_feedforward.smoothing": "m/s"}
-    assert "position_loop" in loop.tunable_sections
+    assert "position_loop" in loop.controller.tunable_sections
     assert cascade(sensor=Encoder()).readings == ()
     assert loop.readings == ("position",)
 

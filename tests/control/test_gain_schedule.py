@@ -76,7 +76,7 @@ def test_signals_and_parameters() -> None:
     assert loop.readings == ("position",)
     assert cascade(Encoder())[0].readings == ()
     assert (p["schedule.low"].unit, p["schedule.load"].unit, p["schedule.Kp_slope"].unit) == ("m", "kg", "1")
-    assert "schedule" in loop.tunable_sections
+    assert "schedule" in loop.controller.tunable_sections
     speed = ClosedLoop(loop.plant, PID(H), schedule=GainSchedule(("pid.Kp",), 0.0, 0.2))
     assert speed.readings == ("position",)
     assert "schedule.load" not in speed.parameters
