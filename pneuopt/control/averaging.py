@@ -25,10 +25,8 @@ from pneuopt.control.linear_controller import controller_response
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.tolerances import (
     BALANCE_TOLERANCE,
-    MAX_BALANCE_STEPS,
-    MAX_NEWTON_ITERATIONS,
-    MIN_BALANCE_FRACTION,
-    MIN_NEWTON_STEP,
+    MAX_NEWTON_STEPS,
+    MIN_NEWTON_FRACTION,
     NEWTON_TOLERANCE,
     RIPPLE_PHASES,
 )
@@ -125,9 +123,14 @@ def ripple(
         By state: the peak, and the phase by which it leads the sine, or the triangle.
     """
     dithered = _add_dither(model, parameters, actuated, waveform)
-    given = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
-    swing = _first_harmonic(dithered, given, _operating_point(dithered, given, at, reference), nodes)
-    return dict(zip(names(dithered.system.states), swing.tolist(), strict=True))
+    complete = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
+    states, inputs = names(dithered.system.states), names(dithered.system.inputs)
+    if at is None:
+        point = dithered.steady_motion(complete, reference)
+    else:
+        check_names("state or input", at, [*states, *inputs], "average_dither: at")
+        point = np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
+    return dict(zip(states, _first_harmonic(dithered, complete, point, nodes).tolist(), strict=True))
 
 
 def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Array:
@@ -188,7 +191,10 @@ class _DitheredSystem:
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
             A, z = p[DITHER_AMPLITUDE], stack(x)
             found = [self.rates(t, z + A * ca.DM(X), u, p, A * w) for w, X in zip(waves.tolist(), swings, strict=True)]
-            rates, outputs = (_sum_with_weights(column, weights) for column in zip(*found, strict=True))
+            rates, outputs = (
+                sum((w * v for w, v in zip(weights.tolist(), column, strict=True)), start=ca.SX(0))
+                for column in zip(*found, strict=True)
+            )
             return _by_name(system.states, rates), _by_name(system.outputs, outputs)
 
         mean = define(system.states, system.inputs, system.outputs, self.parameters, rhs)
@@ -261,17 +267,6 @@ def _dithered_plant(
     return _DitheredSystem(plant, plant.parameters | added, frequency, name, own, steady_motion)
 
 
-def _operating_point(
-    dithered: _DitheredSystem, parameters: ParameterSet, at: Mapping[str, float] | None, reference: float
-) -> tuple[Array, Array]:
-    """The operating point: states and inputs."""
-    if at is None:
-        return dithered.steady_motion(parameters, reference)
-    states, inputs = names(dithered.system.states), names(dithered.system.inputs)
-    check_names("state or input", at, [*states, *inputs], "average_dither: at")
-    return np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
-
-
 def _first_harmonic(
     dithered: _DitheredSystem, parameters: ParameterSet, point: tuple[Array, Array], nodes: int
 ) -> NDArray[np.complex128]:
@@ -304,9 +299,9 @@ def _newton_root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: 
         return left.full().ravel() / scale, slope.full() * scale / scale[:, None]
 
     left, slope = residual_and_slope(z)
-    for _ in range(MAX_NEWTON_ITERATIONS):
+    for _ in range(MAX_NEWTON_STEPS):
         step, size, part = np.linalg.solve(slope, -left), np.abs(left).max(), 1.0
-        while not np.abs(residual_and_slope(z + part * step)[0]).max() < size and part > MIN_NEWTON_STEP:
+        while not np.abs(residual_and_slope(z + part * step)[0]).max() < size and part > MIN_NEWTON_FRACTION:
             part /= 2
         z = z + part * step
         if part * np.abs(step).max() <= NEWTON_TOLERANCE * np.abs(z).max():
@@ -321,10 +316,6 @@ def phase_quadrature(nodes: int, waveform: Waveform) -> tuple[Array, Array]:
         return (2 * np.arange(1, nodes + 1) - 1) * pi / nodes, np.full(nodes, 1 / nodes)
     at, weights = np.polynomial.legendre.leggauss(nodes // 2)
     return np.concatenate([at * pi / 2, at * pi / 2 + pi]), np.tile(weights / 4, 2)
-
-
-def _sum_with_weights(values: Sequence[ca.SX], weights: Array) -> ca.SX:
-    return sum((w * v for w, v in zip(weights.tolist(), values, strict=True)), start=ca.SX(0))
 
 
 def _by_name(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
@@ -511,7 +502,7 @@ class AveragedPlant:
         left = _imbalance(best, waves)
         step, size = _newton_step(best, waves, left), np.linalg.norm(left, axis=1)
         fraction, k = np.ones(len(x)), np.arange(len(x))
-        for _ in range(MAX_BALANCE_STEPS):
+        for _ in range(MAX_NEWTON_STEPS):
             moved = fraction[k, None] * step[k]
             trial = self._moments(q[k], x[k], u[k], waves.select(k), best.swing[k] + moved)
             left = _imbalance(trial, waves.select(k))
@@ -521,7 +512,7 @@ class AveragedPlant:
                 mine[k[better]] = theirs[better]
             size[k[better]], fraction[k] = after[better], np.where(better, 1.0, fraction[k] / 2)
             done = np.abs(moved).max(axis=1) <= BALANCE_TOLERANCE * np.abs(trial.swing).max(axis=1)
-            goes_on = ~done & (fraction[k] >= MIN_BALANCE_FRACTION)
+            goes_on = ~done & (fraction[k] >= MIN_NEWTON_FRACTION)
             new = np.flatnonzero(better & goes_on)
             step[k[new]] = _newton_step(trial.select(new), waves.select(k[new]), left[new])
             k = k[goes_on]

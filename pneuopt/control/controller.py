@@ -36,8 +36,7 @@ from pneuopt.control.tolerances import (
     LARGEST_SIGNAL,
     MAX_BISECTIONS,
     MAX_DOUBLINGS,
-    MIN_FEEDFORWARD_TIME,
-    POSITION_GAIN,
+    SHORTEST_TIME,
 )
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, stack
@@ -81,8 +80,8 @@ class Feedforward:
 
     def __post_init__(self) -> None:
         require(
-            MIN_FEEDFORWARD_TIME <= self.time < inf,
-            f"Feedforward: time must be at least {MIN_FEEDFORWARD_TIME:g} s, got {self.time:g} s",
+            SHORTEST_TIME <= self.time < inf,
+            f"Feedforward: time must be at least {SHORTEST_TIME:g} s, got {self.time:g} s",
         )
 
     def parameters(self, input_unit: str, output_unit: str) -> ParameterSet:
@@ -99,7 +98,7 @@ class Feedforward:
         return ParameterSet(
             {
                 "gain": gain,
-                "time": Parameter(self.time, "s", lower=MIN_FEEDFORWARD_TIME, meaning="time constant of that decay"),
+                "time": Parameter(self.time, "s", lower=SHORTEST_TIME, meaning="time constant of that decay"),
             }
         )
 
@@ -143,7 +142,7 @@ class PositionLoop:
         gain = unit_ratio(speed_unit, difference_unit(position_unit))
         return ParameterSet(
             {
-                "Kp": Parameter(POSITION_GAIN, gain, lower=0.0, meaning="speed per error of the position"),
+                "Kp": Parameter(10.0, gain, lower=0.0, meaning="speed per error of the position"),
                 "weight": Parameter(1.0, "1", lower=0.0, meaning="weight of the reference's speed"),
             }
         )

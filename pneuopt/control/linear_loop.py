@@ -148,18 +148,24 @@ class ComposedLoops:
 
     def __call__(self, p: Array, x: Array, u: Array) -> OpenLoops:
         """Linearise m loops: parameters p, and the operating points' plant states x and inputs u, (m, ...) each."""
+        loop, order = self.loop, list(self.loop.parameters)
         plant, shown = self._plants(p, x, u)
-        law = self._laws(
-            self._frozen(p.T, shown.T).full().T,
-            shown,
-            u[:, names(self.loop.plant.inputs).index(self.loop.command.name)],
-        )
-        h, direct = self.loop.pid.sample_time, np.zeros((*plant[2].shape[:2], 1))
+        p = self._frozen(p.T, shown.T).full().T
+        offset = p[:, order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0
+        command = u[:, names(loop.plant.inputs).index(loop.command.name)] - offset
+        y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
+        seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])
+        v = loop.controller.uncompensated_command(loop.controller_part(p.T), seen, seen, command, read)
+        law = _Laws(*(_split_columns(M.full(), len(p)) for M in self._law(shown.T, v[None], p.T)))
+        h, direct = loop.pid.sample_time, np.zeros((*plant[2].shape[:2], 1))
         if h is None:
             return OpenLoops(_join((*plant, direct), law.feedback), law.noise)
         held = _bilinear((*_hold(*plant[:2], h), plant[2], direct), h)
         joined = _join(held, _bilinear(law.feedback, h))
-        return OpenLoops(_delay(joined, h) if self.loop.pid.delay else joined, _bilinear(law.noise, h))
+        if loop.pid.delay:  # a sample behind it, 1/z = (1 - s h/2)/(1 + s h/2)
+            one = np.ones((len(p), 1, 1))
+            joined = _join(joined, (-2 / h * one, 2 / np.sqrt(h) * one, 2 / np.sqrt(h) * one, -one))
+        return OpenLoops(joined, _bilinear(law.noise, h))
 
     def _plants(self, p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array], Array]:
         """A, B and C of the plants with a sensor's lag, in scaled states, and their outputs, shape (m, n_outputs)."""
@@ -197,24 +203,19 @@ class ComposedLoops:
         y = self.loop.plant.ode(0, x, u, p)[1]
         return ca.Function("outputs", [x, u, p], [ca.densify(ca.jacobian(y, x)), y])
 
-    def _laws(self, p: Array, shown: Array, command: Array) -> "_Laws":
-        """The controllers at outputs of shape (m, n_outputs) and commands of shape (m,)."""
-        loop, order = self.loop, list(self.loop.parameters)
-        bare = command - (p[:, order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0)
-        y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
-        seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])
-        v = loop.controller.uncompensated_command(loop.controller_part(p.T), seen, seen, bare, read)
-        return _Laws(*(_split_columns(M.full(), len(p)) for M in self._law(shown.T, v[None], p.T)))
-
     @cached_property
     def _law(self) -> ca.Function:
         """``(y, v, p) -> A, B, C, D`` of the controller, from outputs and noise to the command; v is the PID's own."""
-        law = _linear_law(self.loop.controller)
+        # without what a linearisation leaves out: limits, dead band, resets, counts, dither, pulses
+        whole, sensor = self.loop.controller, self.loop.sensor
+        sensor = replace(sensor, resolution=0.0) if isinstance(sensor, Encoder) else sensor
+        pid, acting = replace(whole.pid, limits=False, dead_band=False, reset=False), whole.acting_always
+        law = replace(whole, pid=pid, sensor=sensor, dither=None, compensators=acting, schedule=None)
         y, p = ({n: ca.SX.sym(n) for n in own} for own in (law.signals.outputs, self.loop.parameters))
         v, noise, r = ca.SX.sym("v"), ca.SX.sym("noise"), ca.SX.sym("reference")
         apart = (*_COMMANDS, "sensor.reading") if isinstance(law.sensor, SensorLag) else _COMMANDS
         x: Signals = {n: ca.SX.sym(n) for n in names(law.states) if n not in apart}
-        moved, w = _controller(law, x, r, y, noise, p)
+        moved, w = _unlimited_law(law, x, r, y, noise, p)
         at = _resting_states(law, x, y, v, p)
         z = ca.vertcat(stack(x), stack(y), noise)
         J = ca.jacobian(ca.vertcat(stack({n: moved[n] for n in x}), w), z)
@@ -265,16 +266,10 @@ def _split_columns(joined: Array, m: int) -> Array:
     return joined.reshape(len(joined), m, joined.shape[1] // m).transpose(1, 0, 2)
 
 
-def _linear_law(controller: Controller) -> Controller:
-    """A controller without what its linearisation leaves out: limits, dead band, resets, counts, dither, pulses."""
-    sensor = controller.sensor
-    sensor = replace(sensor, resolution=0.0) if isinstance(sensor, Encoder) else sensor
-    pid, acting = replace(controller.pid, limits=False, dead_band=False, reset=False), controller.acting_always
-    return replace(controller, pid=pid, sensor=sensor, dither=None, compensators=acting, schedule=None)
-
-
-def _controller(law: Controller, x: Signals, r: ca.SX, y: Signals, noise: ca.SX, p: Signals) -> tuple[Signals, ca.SX]:
-    """Rates or next values of a controller's states, and its command before the clip, under a reference at rest."""
+def _unlimited_law(
+    law: Controller, x: Signals, r: ca.SX, y: Signals, noise: ca.SX, p: Signals
+) -> tuple[Signals, ca.SX]:
+    """Rates or next values of a controller's states, and its command before the limits, under a reference at rest."""
     own = without_prefix(x, "sensor")
     noisy = law.feedback.name
     y = {**y, noisy: y[noisy] + noise} if law.outer else y
@@ -317,12 +312,6 @@ def _join(plant: Matrices, controller: Matrices) -> Matrices:
     (A, B, C, D), (Ac, Bc, Cc, Dc) = plant, controller
     joined = np.block([[A, np.zeros((len(A), A.shape[-1], Ac.shape[-1]))], [Bc @ C, Ac]])
     return joined, np.concatenate([B, Bc @ D], axis=1), np.concatenate([Dc @ C, Cc], axis=2), Dc @ D
-
-
-def _delay(system: Matrices, h: float) -> Matrices:
-    """Systems with a delay of a sample behind them: ``1/z = (1 - s h/2)/(1 + s h/2)``."""
-    one = np.ones((len(system[0]), 1, 1))
-    return _join(system, (-2 / h * one, 2 / np.sqrt(h) * one, 2 / np.sqrt(h) * one, -one))
 
 
 def _hold(A: Array, B: Array, h: float) -> tuple[Array, Array]:

@@ -13,12 +13,9 @@ from scipy.interpolate import PchipInterpolator
 
 from pneuopt.control.reference import Reference, describe_circumstances, disturbance_columns, reference_samples
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
-from pneuopt.control.tolerances import LABEL_DECIMALS, MAX_LABELLED_STOPS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
-
-Motion = Callable[[Array], tuple[Array, Array, Array]]
 
 
 class PlannedMotion(Protocol):
@@ -307,12 +304,10 @@ class MoveSequence:
     @property
     def label(self) -> str:
         """How a table heads it."""
-        stops = [self.origin, *(move.final for move in self.chain)]
-        shown = [
-            f"{round(stop, LABEL_DECIMALS) + 0.0:g}"
-            for stop in (stops if len(stops) <= MAX_LABELLED_STOPS else stops[-2:])
-        ]
-        lead = f"move {len(self.moves)}, " if len(stops) > MAX_LABELLED_STOPS else ""
+        # sums of distances leave digits of a zero, which no label shows
+        stops = [f"{round(stop, 9) + 0.0:g}" for stop in (self.origin, *(move.final for move in self.chain))]
+        is_long = len(stops) > 4
+        lead, shown = (f"move {len(self.moves)}, ", stops[-2:]) if is_long else ("", stops)
         return ", ".join([lead + " to ".join(shown), *describe_circumstances(self)])
 
     def motion(self, t: Array) -> tuple[Array, Array, Array]:
@@ -334,11 +329,8 @@ class MoveSequence:
 
     def with_horizon(self, horizon: float) -> Self:
         """The same with another end of the experiment [s]."""
-        return type(self)([*self.moves[:-1], replace(self.moves[-1], dwell=self._dwell(horizon))])
-
-    def _dwell(self, horizon: float) -> float:
         last = self.chain[-1]
-        return horizon - last.at - last.duration
+        return type(self)([*self.moves[:-1], replace(self.moves[-1], dwell=horizon - last.at - last.duration)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -475,7 +467,9 @@ class MotionPath:
         return replace(self, dwell=horizon - float(self.t[-1]))
 
 
-def sample_motion(reference: Reference, motion: Motion, step: float, *, between: bool = True) -> Trajectory:
+def sample_motion(
+    reference: Reference, motion: Callable[[Array], tuple[Array, Array, Array]], step: float, *, between: bool = True
+) -> Trajectory:
     """A reference and its rates on a grid of `step` [s], with disturbances; `between`: it may begin off the grid."""
     k, first = reference_samples(reference, step, between=between)
     t: Array = np.asarray(k * step, dtype=np.float64)

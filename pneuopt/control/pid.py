@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 
 from pneuopt.control.reset_integral import RESET_STATES, reset_parameters, reset_quantities
-from pneuopt.control.tolerances import FAULT_SAMPLES, LEAST_KI, MOST_EMPTYING, UNUSED_FILTER_TIME
+from pneuopt.control.tolerances import FAULT_SAMPLES, LEAST_KI, MOST_EMPTYING, SHORTEST_TIME, UNUSED_FILTER_TIME
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -159,7 +159,7 @@ class PID:
         ['Kp', 'Ti', 'Td', 'N', 'b', 'c']
         """
         h, gain = self.sample_time or 0.0, unit_ratio(output_unit, input_unit)
-        shortest = h or 1e-6
+        shortest = h or SHORTEST_TIME
         known = {
             "Kp": Parameter(1.0, gain, meaning="proportional gain"),
             "K": Parameter(1.0, gain, meaning="gain of the series form"),

@@ -4,7 +4,6 @@ from typing import Any
 
 import casadi as ca
 
-from pneuopt.control.tolerances import RESET_RATIO
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import difference_unit
@@ -50,7 +49,7 @@ def reset_parameters(unit: str) -> ParameterSet:
     return ParameterSet(
         {
             "reset_ratio": Parameter(
-                RESET_RATIO, "1", lower=0.0, upper=1.0, meaning="part of the integral that is kept, its sign turned"
+                1.0, "1", lower=0.0, upper=1.0, meaning="part of the integral that is kept, its sign turned"
             ),
             "reset_band": Parameter(
                 0.0, difference_unit(unit), lower=0.0, meaning="error within which no change of its sign counts"

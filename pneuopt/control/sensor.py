@@ -7,7 +7,7 @@ from typing import Any
 
 import casadi as ca
 
-from pneuopt.control.tolerances import MIN_SENSOR_LAG
+from pneuopt.control.tolerances import SHORTEST_TIME
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -68,8 +68,8 @@ class SensorLag:
 
     def __post_init__(self) -> None:
         require(
-            MIN_SENSOR_LAG <= self.lag < inf,
-            f"SensorLag: lag must be at least {MIN_SENSOR_LAG:g} s, got {self.lag:g} s; "
+            SHORTEST_TIME <= self.lag < inf,
+            f"SensorLag: lag must be at least {SHORTEST_TIME:g} s, got {self.lag:g} s; "
             "without a lag leave the sensor out",
         )
 
@@ -81,7 +81,7 @@ class SensorLag:
         return ParameterSet(
             {
                 "lag": Parameter(
-                    self.lag, "s", lower=MIN_SENSOR_LAG, meaning="lag with which the controller sees the signal"
+                    self.lag, "s", lower=SHORTEST_TIME, meaning="lag with which the controller sees the signal"
                 )
             }
         )
