@@ -129,15 +129,7 @@ def describe_refusal(
 def run_as_block(
     loop: ClosedLoop, parameters: ParameterSet, block: Block
 ) -> tuple[ClosedLoop, ParameterSet, list[str]]:
-    """A loop whose controller is another maker's block with the same gains.
-
-    Returns
-    -------
-    loop : ClosedLoop
-    parameters : ParameterSet
-    differences : list of str
-        In what that differs from the design; empty where the block runs it as it is.
-    """
+    """A loop whose controller is a maker's block with the same gains, its parameters, and in what it differs."""
     form, found = BLOCK_FORMS[block], list[str]()
     acting = acting_controller(loop.controller, parameters)
     integrates = loop.parallel_form(parameters).Ki != 0
@@ -280,21 +272,11 @@ def _advice(own: ClosedLoop, values: ParameterSet) -> list[str]:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What stands around a block.
+    """What stands around a block, or around the two of a cascade."""
 
-    Attributes
-    ----------
-    lines : tuple of str
-        From the sensor to the wire.
-    inner : BlockDesign
-        The block itself.
-    outer : BlockDesign or None
-        A cascade's outer block, whose output is the setpoint of the inner one.
-    """
-
-    lines: tuple[str, ...]
+    lines: tuple[str, ...]  # from the sensor to the wire
     inner: BlockDesign
-    outer: BlockDesign | None
+    outer: BlockDesign | None  # whose output is the setpoint of the inner one
 
 
 def acting_controller(controller: Controller, parameters: ParameterSet) -> Controller:
@@ -326,26 +308,7 @@ def find_surroundings(
     centre: float,
     measured_span: float | None,
 ) -> Surroundings:
-    """What stands around a block, as lines, and the numbers of the block or of the two of a cascade.
-
-    Parameters
-    ----------
-    controller : Controller
-        Of `acting_controller`.
-    parameters : ParameterSet
-    form : BlockForm
-    references : sequence of Reference
-        Whose values the range of the process value holds.
-    centre : float
-        Of the valve [the command's unit].
-    measured_span : float, optional
-        Of the process value [its unit]; by default of the references and their travel again beyond either end.
-
-    Raises
-    ------
-    InputError
-        If a part of the design has no counterpart among the maker's standard blocks.
-    """
+    """What stands around a block, and the numbers of it or of a cascade's two; refuses what no block holds."""
     value = controller.values(parameters)
     low, high = _process_range(references, measured_span, controller.feedback.unit)
     outer = _outer_design(controller, value, references, (low, high))

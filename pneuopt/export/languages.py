@@ -53,16 +53,74 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
 
+class Language(Enum):
+    """In what a controller is written."""
+
+    C = "c"
+    STRUCTURED_TEXT = "st"
+    PYTHON = "python"
+
+
+def export_controller(
+    loop: ClosedLoop | Controller,
+    parameters: ParameterSet,
+    language: Language,
+    *,
+    name: str = "controller",
+    centre: float = 0.0,
+    origin: Sequence[str] = (),
+) -> dict[str, str]:
+    """Write the sampled controller of a loop in another language.
+
+    Parameters
+    ----------
+    loop : ClosedLoop or Controller
+        With a sample time. Of a loop, its controller alone is written.
+    parameters : ParameterSet
+        A missing one has the loop's default.
+    language : Language
+        C99 with a test, one function block of IEC 61131-3 structured text, or a Python class without dependencies.
+    name : str
+        Of the structure, block or class, and of the files.
+    centre : float
+        On the wire to the valve while the command is zero [the command's unit].
+    origin : sequence of str
+        What the files shall say of where the gains come from; any text.
+
+    Returns
+    -------
+    dict of str to str
+        Texts by the names of the files.
+
+    Raises
+    ------
+    InputError
+        If the name is no identifier, is reserved in a language, or is that of a number in the block; if the parameters
+        cannot run; `ModelError` if the controller is continuous.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.linear import FirstOrder
+    >>> loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, limits=False))
+    >>> list(export_controller(loop, loop.parameters, Language.C))
+    ['controller.h', 'controller.c', 'controller_test.c']
+    """
+    if isinstance(loop, Controller):
+        controller = loop
+    else:
+        check_closed_loop(loop)
+        loop.check(parameters)
+        controller = loop.controller
+    program = controller_program(controller, parameters, centre)
+    header = make_header(name, controller, parameters, centre, origin)
+    _check_block_name(header, program)
+    return _WRITERS[language](program, header)
+
+
 @dataclass(frozen=True)
 class ReferenceRun:
-    """A run of a controller.
-
-    Attributes
-    ----------
-    inputs : ndarray, shape (n_samples, n_inputs)
-    outputs : ndarray, shape (n_samples,)
-        The first output, with the parameters of the program.
-    """
+    """A run of a controller: inputs, shape (n_samples, n_inputs), and its first output, shape (n_samples,)."""
 
     inputs: Array
     outputs: Array
@@ -71,8 +129,8 @@ class ReferenceRun:
 def make_reference_run(program: ControllerProgram) -> ReferenceRun:
     """A step of the reference, half of which drives the output to its limits, with a measured signal that swings in.
 
-    What else the controller gets, rates of the reference and further readings, are waves. One sample of the measured
-    signal is no number, and then so many in a row that the controller begins anew.
+    Rates of the reference and further readings are waves. One sample of the measured signal is no number, and then so
+    many in a row that the controller begins anew.
     """
     k = np.arange(RUN_SAMPLES)
     size = _step_size(program)
@@ -86,17 +144,7 @@ def make_reference_run(program: ControllerProgram) -> ReferenceRun:
 
 
 def run_program(program: ControllerProgram, inputs: Array) -> Array:
-    """The outputs of a program as CasADi computes them, started with the first sample.
-
-    Parameters
-    ----------
-    program : ControllerProgram
-    inputs : ndarray, shape (n_samples, n_inputs)
-
-    Returns
-    -------
-    ndarray, shape (n_samples, n_outputs)
-    """
+    """What CasADi computes of inputs (n_samples, n_inputs), started with the first: outputs (n_samples, n_outputs)."""
     p, count, found = program.values, len(program.outputs), []
     centre = program.originals[CENTRE].value if CENTRE in program.originals else 0.0
     x = program.start([*inputs[0], centre], p)
@@ -132,6 +180,8 @@ C99 = Syntax(
     truth=OperationSyntax("({0} ? 1.0 : 0.0)", needs=(Binding.COMPARISON,)),
     condition=OperationSyntax("{0} != 0.0", Binding.COMPARISON, (Binding.SUM,)),
 )
+
+
 _HELPERS = {
     ca.OP_FMIN: "static double least(double a, double b)\n{\n    return a < b ? a : b;\n}\n",
     ca.OP_FMAX: "static double largest(double a, double b)\n{\n    return a > b ? a : b;\n}\n",
@@ -250,6 +300,8 @@ def _number(value: float) -> str:
 
 
 _WHOLE = "LINT_TO_LREAL(LREAL_TO_LINT({0}))"
+
+
 _TANH = "(1.0 - 2.0 / (EXP(2.0 * MAX(-20.0, MIN(20.0, {0}))) + 1.0))"  # beyond 20 it is 1 in 16 digits
 
 
@@ -452,19 +504,7 @@ def write_loop_javascript(loop: ClosedLoop) -> str:
     at ``points + 1`` equal instants; null where the loop is too stiff or leaves what its model describes. Parameters,
     states and outputs are those of the loop, in its order, which ``LOOP`` names. The reference is ``{at, initial,
     final, inputs}``, the last one optional: what other inputs are from that instant on, ``[[place, value], ...]``.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    NotImplementedError
-        If the loop has an operation that JavaScript has no word for, or a friction that sticks (`Karnopp`).
+    A loop with an operation that JavaScript has no word for, or a friction that sticks, raises `NotImplementedError`.
     """
     if FRICTION_DIRECTION in loop.parameters:
         raise NotImplementedError("a friction that sticks is simulated from event to event, which the page does not do")
@@ -509,78 +549,6 @@ def _method(name: str, signature: str, function: ca.Function, results: Sequence[
     return coefficients, [*lines, "    },"]
 
 
-class Language(Enum):
-    """In what a controller is written."""
-
-    C = "c"
-    STRUCTURED_TEXT = "st"
-    PYTHON = "python"
-
-
-_WRITERS: Mapping[Language, Callable[[ControllerProgram, Header], dict[str, str]]] = {
-    Language.C: lambda program, header: write_c99(program, header, make_reference_run(program)),
-    Language.STRUCTURED_TEXT: write_structured_text,
-    Language.PYTHON: write_python,
-}
-
-
-def export_controller(
-    loop: ClosedLoop | Controller,
-    parameters: ParameterSet,
-    language: Language,
-    *,
-    name: str = "controller",
-    centre: float = 0.0,
-    origin: Sequence[str] = (),
-) -> dict[str, str]:
-    """Write the sampled controller of a loop in another language.
-
-    Parameters
-    ----------
-    loop : ClosedLoop or Controller
-        With a sample time. Of a loop, its controller alone is written.
-    parameters : ParameterSet
-        A missing one has the loop's default.
-    language : Language
-        C99 with a test, one function block of IEC 61131-3 structured text, or a Python class without dependencies.
-    name : str
-        Of the structure, block or class, and of the files.
-    centre : float
-        On the wire to the valve while the command is zero [the command's unit].
-    origin : sequence of str
-        What the files shall say of where the gains come from; any text.
-
-    Returns
-    -------
-    dict of str to str
-        Texts by the names of the files.
-
-    Raises
-    ------
-    InputError
-        If the name is no identifier, is reserved in a language, or is that of a number in the block; if the parameters
-        cannot run; `ModelError` if the controller is continuous.
-
-    Examples
-    --------
-    >>> from pneuopt.control.pid import PID
-    >>> from pneuopt.models.linear import FirstOrder
-    >>> loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, limits=False))
-    >>> list(export_controller(loop, loop.parameters, Language.C))
-    ['controller.h', 'controller.c', 'controller_test.c']
-    """
-    if isinstance(loop, Controller):
-        controller = loop
-    else:
-        check_closed_loop(loop)
-        loop.check(parameters)
-        controller = loop.controller
-    program = controller_program(controller, parameters, centre)
-    header = make_header(name, controller, parameters, centre, origin)
-    _check_block_name(header, program)
-    return _WRITERS[language](program, header)
-
-
 def _check_block_name(header: Header, program: ControllerProgram) -> None:
     """Refuse a name that a language, the file system or a number of the block has."""
     within = {n.casefold() for n in program.names}
@@ -589,3 +557,10 @@ def _check_block_name(header: Header, program: ControllerProgram) -> None:
     what = reserved_as(header.name) or reserved or (f"{taken[0]}, a number of the block" if taken else None)
     free = Identifiers([*program.names, *RESERVED_FILES]).claim(f"{header.name}_control", f"{header.name}_block")
     require(what is None, f"--name {header.name}: is {what}; take another, as --name {free}")
+
+
+_WRITERS: Mapping[Language, Callable[[ControllerProgram, Header], dict[str, str]]] = {
+    Language.C: lambda program, header: write_c99(program, header, make_reference_run(program)),
+    Language.STRUCTURED_TEXT: write_structured_text,
+    Language.PYTHON: write_python,
+}

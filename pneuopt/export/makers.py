@@ -16,58 +16,44 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.units import difference_unit, write_value
 
 BEHIND_OFFSET = "Behind the block: offset"
+
+
 BEHIND_FACTOR = "Behind the block: factor"
 """Settings of what the user's own program does with a block's output: ``wire = offset + factor output``."""
 
 
+class Block(Enum):
+    """Whose PID block takes the gains."""
+
+    SIEMENS = "siemens"
+    ROCKWELL = "rockwell"
+    BECKHOFF = "beckhoff"
+    CODESYS = "codesys"
+    SIMULINK = "simulink"
+
+
 @dataclass(frozen=True)
 class BlockDesign:
-    """The numbers of a tuned controller that a block takes, in SI units.
-
-    Parameters
-    ----------
-    gains : ParallelForm
-    b, c : float
-    Tt : float
-        Of back-calculation [s]; nan where the design has another anti-windup or none.
-    low, high : float
-        Ends of the output on the wire [the command's unit]; infinite for none.
-    centre : float
-        On the wire while the command is zero.
-    sample_time : float
-    measured, measured_unit, command_unit : str
-    pv_low, pv_high : float
-        The range of the process value that the block counts on [the measured unit].
-    start : float
-        The process value where the references begin [the measured unit].
-    is_added_to : bool
-        Whether a feedforward or a dither is added to what the block computes, before the limits.
-    goes : str
-        Where the output goes.
-    zero : str
-        What the command zero is.
-    reach : str
-        What the range of the process value holds.
-    """
+    """The numbers of a tuned controller that a block takes, in SI units."""
 
     gains: ParallelForm
     b: float
     c: float
-    Tt: float
-    low: float
-    high: float
-    centre: float
-    sample_time: float
+    Tt: float  # [s] of back-calculation; nan where the design has another anti-windup or none
+    low: float  # end of the output on the wire [the command's unit]; infinite for none
+    high: float  # the other end
+    centre: float  # on the wire while the command is zero
+    sample_time: float  # [s]
     measured: str
     measured_unit: str
     command_unit: str
-    pv_low: float = -0.5
+    pv_low: float = -0.5  # range of the process value that the block counts on [the measured unit]
     pv_high: float = 0.5
-    start: float = 0.0
-    is_added_to: bool = False
-    goes: str = "on the wire"
-    zero: str = "the centre"
-    reach: str = "the references and as far again"
+    start: float = 0.0  # process value where the references begin
+    is_added_to: bool = False  # whether a feedforward or a dither is added before the limits
+    goes: str = "on the wire"  # where the output goes
+    zero: str = "the centre"  # what the command zero is
+    reach: str = "the references and as far again"  # what the range of the process value holds
 
     @property
     def span(self) -> float:
@@ -120,42 +106,21 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class BlockForm:
-    """What is known of a block.
-
-    Attributes
-    ----------
-    title, formula : str
-    sources : tuple of str
-    settings : callable
-        From a `BlockDesign`; raises `InputError` for gains that the block cannot have.
-    states : callable
-        What the output is at rest, at a fault and while the block is stopped, from a `BlockDesign`.
-    manual : str
-        How it is held in manual at the centre.
-    added : callable, optional
-        Where a signal in the command's unit is added before the limits, from a `BlockDesign`; None: the block has no
-        such input.
-    weights : callable
-        The set-point weights b and c that the block has in place of a design's own.
-    has_filter : bool
-        Whether its derivative has a filter of first order that can be set.
-    clamps : bool
-        Whether its integral is clamped at a limit, or may be taken to be.
-    time_grain : float
-        What its times are rounded to [s]; 0 for nothing.
-    """
+    """What is known of a maker's PID block."""
 
     title: str
     formula: str
     sources: tuple[str, ...]
-    settings: Callable[[BlockDesign], list[Setting]]
-    states: Callable[[BlockDesign], list[str]]
-    manual: str
+    settings: Callable[[BlockDesign], list[Setting]]  # refuses gains that the block cannot have
+    states: Callable[[BlockDesign], list[str]]  # what the output is at rest, at a fault and while stopped
+    manual: str  # how it is held in manual at the centre
+    # where a signal in the command's unit is added before the limits; None: there is no such input
     added: Callable[[BlockDesign], str] | None = None
+    # set-point weights b, c that it has in their place
     weights: Callable[[BlockDesign], tuple[float, float]] = lambda d: (d.b, d.c)
-    has_filter: bool = True
-    clamps: bool = True
-    time_grain: float = 0.0
+    has_filter: bool = True  # whether its derivative has a filter of first order that can be set
+    clamps: bool = True  # whether its integral is clamped at a limit, or may be taken to be
+    time_grain: float = 0.0  # what its times are rounded to [s]; 0 for nothing
 
     @property
     def maker(self) -> str:
@@ -196,13 +161,7 @@ def check_limits(design: BlockDesign, block: str) -> None:
 
 
 def standard_times(design: BlockDesign, block: str) -> tuple[float, float]:
-    """Ti, infinite for no integral, and Td [s] of a block whose gain multiplies all its terms.
-
-    Raises
-    ------
-    InputError
-        If Kp = 0 while another gain is not.
-    """
+    """Ti, infinite for no integral, and Td [s] of a block whose gain multiplies all its terms; refuses Kp = 0 there."""
     Kp, Ki, Kd = design.gains.Kp, design.gains.Ki, design.gains.Kd
     told = f"{block} multiplies its integral and its derivative by its gain"
     given = f"this design has Kp = 0, Ki = {Ki:g}, Kd = {Kd:g}"
@@ -690,16 +649,6 @@ SIMULINK_FORM = BlockForm(
     clamps=False,
 )
 """The block with two degrees of freedom: its output is 0 at rest, and a Bias block behind it adds the centre."""
-
-
-class Block(Enum):
-    """Whose PID block takes the gains."""
-
-    SIEMENS = "siemens"
-    ROCKWELL = "rockwell"
-    BECKHOFF = "beckhoff"
-    CODESYS = "codesys"
-    SIMULINK = "simulink"
 
 
 BLOCK_FORMS: Mapping[Block, BlockForm] = {
