@@ -6,8 +6,9 @@ structured text, a Python class; and JavaScript, in which a page runs the whole 
 
 import json
 import math
+import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from importlib import resources
@@ -20,20 +21,11 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.dynamics.system import FRICTION_DIRECTION
 from pneuopt.export.identifiers import RESERVED_FILES, Identifiers, reserved_as
 from pneuopt.export.program import CENTRE, ControllerProgram, Variable, controller_program
-from pneuopt.export.tolerances import (
-    DROPOUT,
-    GAP,
-    LARGEST_LITERAL,
-    LONGEST_GAP,
-    RISE,
-    RUN_SAMPLES,
-    RUN_TOLERANCE,
-    SELECT,
-    SMALLEST_LITERAL,
-)
+from pneuopt.export.tolerances import LARGEST_LITERAL, RUN_SAMPLES, RUN_TOLERANCE, SELECT, SMALLEST_LITERAL
 from pneuopt.export.writer import (
     ARITHMETIC,
     COMPARED,
+    Assignment,
     Binding,
     Header,
     Names,
@@ -114,7 +106,12 @@ def export_controller(
         controller = loop.controller
     program = controller_program(controller, parameters, centre)
     header = make_header(name, controller, parameters, centre, origin)
-    _check_block_name(header, program)
+    within = {n.casefold() for n in program.names}
+    taken = [n for n in header.own_names if n.casefold() in within]
+    reserved = "a file that compilers or Windows have" if header.name.casefold() in RESERVED_FILES else None
+    what = reserved_as(name) or reserved or (f"{taken[0]}, a number of the block" if taken else None)
+    free = Identifiers([*program.names, *RESERVED_FILES]).claim(f"{name}_control", f"{name}_block")
+    require(what is None, f"--name {name}: is {what}; take another, as --name {free}")
     return _WRITERS[language](program, header)
 
 
@@ -133,12 +130,16 @@ def make_reference_run(program: ControllerProgram) -> ReferenceRun:
     many in a row that the controller begins anew.
     """
     k = np.arange(RUN_SAMPLES)
-    size = _step_size(program)
+    value = {n: v.value for n, v in program.originals.items()}
+    gain, upper = abs(value.get("pid.Kp", value.get("pid.K", 1.0))), value.get("pid.upper", np.inf)
+    has_limit = np.isfinite(upper) and upper > 0 and gain > 0
+    size = float(1.5 * upper / gain) if has_limit else 1.0  # beyond its limits for a while
     reference = np.where((k >= 5) & (k < 150), size, -0.3 * size)
-    measured = size * (1 - np.exp(-np.maximum(k - 5, 0) / RISE)) + 0.02 * size * np.sin(0.9 * k)
+    # a faster rise hides the integral, a slower one the approach
+    measured = size * (1 - np.exp(-np.maximum(k - 5, 0) / 25.0)) + 0.02 * size * np.sin(0.9 * k)
     others = [size * np.sin(0.1 * (n + 1) * k) for n in range(len(program.inputs) - 2)]
-    count = {v.name: v.value for v in program.parameters}["fault_samples"]
-    measured[DROPOUT] = measured[GAP : GAP + int(min(count, LONGEST_GAP)) + 1] = np.nan
+    gap = int(min(value["pid.fault_samples"], 30)) + 1
+    measured[60] = measured[100 : 100 + gap] = np.nan
     inputs = np.column_stack([reference, measured, *others])
     return ReferenceRun(inputs, run_program(program, inputs)[:, 0])
 
@@ -153,13 +154,6 @@ def run_program(program: ControllerProgram, inputs: Array) -> Array:
         found.append(results[:count])
         x = results[count:]
     return np.array(found)
-
-
-def _step_size(program: ControllerProgram) -> float:
-    """A step that drives the output beyond its limits for a while; 1 where it has none."""
-    value = {n: v.value for n, v in program.originals.items()}
-    gain, upper = abs(value.get("pid.Kp", value.get("pid.K", 1.0))), value.get("pid.upper", np.inf)
-    return float(1.5 * upper / gain) if np.isfinite(upper) and upper > 0 and gain > 0 else 1.0
 
 
 C99 = Syntax(
@@ -251,28 +245,25 @@ def _source(program: ControllerProgram, header: Header, body: ProgramText) -> st
     values = [f"    {C99.literal(v.value)}, /* {v.name} [{comment_text(v.unit)}] */" for v in program.parameters]
     lines += [f"const {name}_parameters {name}_tuned = {{", *values, "};", "", prepare, "{", "    c->p = *p;"]
     lines += [f"    c->{a.name} = {a.text};" for a in body.coefficients]
-    unread = [v.name for v in program.start_inputs if not _reads((*body.start_locals, *body.start), v.name)]
+
+    def unused(variables: Iterable[Variable], *assignments: Assignment) -> list[str]:
+        text = " ".join(a.text for a in assignments)  # in which a name stands as a whole word, or not at all
+        return [v.name for v in variables if not re.search(rf"(?<![\w>.]){v.name}\b", text)]
+
+    unread = unused(program.start_inputs, *body.start_locals, *body.start)
     lines += ["}", "", start, "{", *(f"    (void)({n});" for n in unread)]
     lines += [f"    const double {a.name} = {a.text};" for a in body.start_locals]
     lines += [f"    c->{a.name} = {a.text};" for a in body.start]
-    unused = [v.name for v in program.inputs if not _reads(body.locals, v.name)]
-    lines += ["}", "", step, "{", *(f"    (void)({n});" for n in unused)]
+    lines += ["}", "", step, "{", *(f"    (void)({n});" for n in unused(program.inputs, *body.locals))]
     lines += [*(f"    const double {a.name} = {a.text};" for a in body.locals), ""]
     lines += [f"    c->{n} = {text};" for n, text in {**body.outputs, **body.states}.items()]
     return "\n".join([*lines, f"    return c->{program.outputs[0].name};", "}"]) + "\n"
 
 
-def _reads(assignments: tuple[tuple[str, str], ...], name: str) -> bool:
-    """Whether a name stands in one of the expressions, as a whole word."""
-    import re
-
-    return any(re.search(rf"(?<![\w>.]){name}\b", text) for _, text in assignments)
-
-
 def _test(program: ControllerProgram, header: Header, run: ReferenceRun) -> str:
     name, columns = header.name, len(program.inputs) + 1
     rows = [
-        "    {" + ", ".join(_number(v) for v in (*given, out)) + "},"
+        "    {" + ", ".join("NAN" if math.isnan(v) else C99.literal(v) for v in (*given, out)) + "},"
         for given, out in zip(run.inputs, run.outputs, strict=True)
     ]
     read = ", ".join(f"run[k][{i}]" for i in range(columns - 1))
@@ -292,11 +283,6 @@ def _test(program: ControllerProgram, header: Header, run: ReferenceRun) -> str:
     lines += ['    printf("largest difference %.3g of %.3g\\n", worst, largest);']
     lines += [f"    return worst <= {C99.literal(RUN_TOLERANCE)} * largest ? 0 : 1;", "}"]
     return "\n".join(lines) + "\n"
-
-
-def _number(value: float) -> str:
-    """A number of the test's run, or none."""
-    return "NAN" if math.isnan(value) else C99.literal(value)
 
 
 _WHOLE = "LINT_TO_LREAL(LREAL_TO_LINT({0}))"
@@ -434,11 +420,12 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     ]
     lines += ["    ----------"]
     for v in program.parameters:
-        lines += textwrap.wrap(comment_text(_told(v)), 110, initial_indent="    ", subsequent_indent="        ")
+        lines += textwrap.wrap(comment_text(_described(v)), 110, initial_indent="    ", subsequent_indent="        ")
     lines += ['    """', "", "    def __init__(", "        self,", "        *,"]
     lines += [f"        {v.name}: float = {PYTHON.literal(v.value)}," for v in program.parameters]
     lines += ["    ) -> None:", *(f"        self.{v.name} = {v.name}" for v in program.parameters)]
-    lines += [_first_value(v) for v in (*program.states, *program.outputs)]
+    for v in (*program.states, *program.outputs):
+        lines += [f"        self.{v.name} = {'False' if v.is_flag else '0.0'}  # {comment_text(_described(v))}"]
     zeros = ", ".join("0.0" for _ in program.start_inputs[:-1])
     lines += ["        self.prepare()", f"        self.start({zeros})", ""]
     lines += ["    def prepare(self) -> None:", '        """Take over parameters that were changed."""']
@@ -461,11 +448,7 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     return {f"{header.name}.py": "\n".join([*lines, f"        return self.{out.name}"]) + "\n"}
 
 
-def _first_value(v: Variable) -> str:
-    return f"        self.{v.name} = {'False' if v.is_flag else '0.0'}  # {comment_text(_told(v))}"
-
-
-def _told(v: Variable) -> str:
+def _described(v: Variable) -> str:
     return f"{v.name} [{v.unit}]: {v.meaning}" if v.meaning else f"{v.name} [{v.unit}]"
 
 
@@ -547,16 +530,6 @@ def _method(name: str, signature: str, function: ca.Function, results: Sequence[
     lines += [f"      const {a.name} = {a.text};" for a in found.statements]
     lines += [f"      {place} = {text};" for place, text in zip(results, found.results.values(), strict=True)]
     return coefficients, [*lines, "    },"]
-
-
-def _check_block_name(header: Header, program: ControllerProgram) -> None:
-    """Refuse a name that a language, the file system or a number of the block has."""
-    within = {n.casefold() for n in program.names}
-    taken = [n for n in header.own_names if n.casefold() in within]
-    reserved = "a file that compilers or Windows have" if header.name.casefold() in RESERVED_FILES else None
-    what = reserved_as(header.name) or reserved or (f"{taken[0]}, a number of the block" if taken else None)
-    free = Identifiers([*program.names, *RESERVED_FILES]).claim(f"{header.name}_control", f"{header.name}_block")
-    require(what is None, f"--name {header.name}: is {what}; take another, as --name {free}")
 
 
 _WRITERS: Mapping[Language, Callable[[ControllerProgram, Header], dict[str, str]]] = {

@@ -22,7 +22,7 @@ from pneuopt.control.tolerances import LARGEST_SIGNAL
 from pneuopt.dynamics.compiled.c_writer import DIVISIONS, Instruction, read_instructions
 from pneuopt.export.identifiers import Identifiers
 from pneuopt.export.program import C_NAMES, ControllerProgram
-from pneuopt.export.tolerances import MAX_BLOCK_NAME, MAX_COMMENT, MAX_INLINE, SELECT
+from pneuopt.export.tolerances import MAX_COMMENT, MAX_IDENTIFIER, MAX_INLINE, SELECT
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import provenance
@@ -405,7 +405,7 @@ def check_name(name: str) -> None:
     proper = re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) is not None
     told = "letters, digits and single underscores between them, a letter first"
     require(
-        proper and len(name) <= MAX_BLOCK_NAME, f"--name {name!r}: a block's name has {told}, {MAX_BLOCK_NAME} at most"
+        proper and len(name) <= MAX_IDENTIFIER, f"--name {name!r}: a block's name has {told}, {MAX_IDENTIFIER} at most"
     )
 
 

@@ -26,7 +26,7 @@ from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.export.blocks import export_settings, run_as_block
 from pneuopt.export.languages import Language, export_controller
-from pneuopt.export.makers import BLOCK_FORMS, Block
+from pneuopt.export.makers import MAKER_BLOCKS, Block
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive
@@ -134,7 +134,7 @@ def test_beckhoffs_times_are_whole_milliseconds() -> None:
 
 
 def test_every_block_says_its_formula_and_sources() -> None:
-    for form in BLOCK_FORMS.values():
+    for form in MAKER_BLOCKS.values():
         assert form.formula
         assert len(form.sources) >= 2
         assert all(text.isascii() and len(text) < 140 for text in (form.formula, *form.sources))
@@ -412,7 +412,7 @@ def test_the_first_lines_are_the_verdict_and_a_force_is_said_to_be_one() -> None
         )
         assert ("differs" in lines[0]) == ("As the block runs it, the design differs:" in lines)
         assert lines[1].startswith("THE OUTPUT IS NEWTONS, not volts")
-        assert lines[3].startswith(BLOCK_FORMS[block].title)
+        assert lines[3].startswith(MAKER_BLOCKS[block].title)
     valve = ClosedLoop(position_drive(), PID(H), measured="speed")
     limited = valve.parameters.with_values({"pid.lower": -5.0, "pid.upper": 5.0})
     assert "NEWTONS" not in sheet(valve, limited, Block.SIEMENS, 5.0)
