@@ -224,12 +224,8 @@ def _header(program: ControllerProgram, header: Header, body: ProgramText) -> st
     lines += [f"}} {name};", "", f"extern const {name}_parameters {name}_tuned;", ""]
     lines += ["/* Take over parameters, at first or while it runs. */", f"{prepare};", ""]
     lines += [f"/* Begin, or go on without a bump; {last.name} {comment_text(f'[{last.unit}]: {last.meaning}')}. */"]
-    lines += [
-        f"{start};",
-        "",
-        "/*",
-        f" * Compute a sample; returns {out.name} {comment_text(f'[{out.unit}]: {out.meaning}')}.",
-    ]
+    lines += [f"{start};", "", "/*"]
+    lines += [f" * Compute a sample; returns {out.name} {comment_text(f'[{out.unit}]: {out.meaning}')}."]
     lines += [*signals, " */", f"{step};", "", "#endif"]
     return "\n".join(lines) + "\n"
 
@@ -410,15 +406,9 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     signature = ", ".join(f"{v.name}: float" for v in program.inputs)
     begin = ", ".join(f"{v.name}: float" for v in program.start_inputs[:-1])
     period = PYTHON.literal(program.sample_time)
-    lines = ['"""', *header.lines, '"""', "", "import math", "", f"SAMPLE_TIME = {period}  # s", ""]
-    lines += [
-        "",
-        f"class {name}:",
-        '    """The controller: start it, then call step once a sample.',
-        "",
-        "    Parameters",
-    ]
-    lines += ["    ----------"]
+    lines = ['"""', *header.lines, '"""', "", "import math", "", f"SAMPLE_TIME = {period}  # s", "", ""]
+    lines += [f"class {name}:", '    """The controller: start it, then call step once a sample.', ""]
+    lines += ["    Parameters", "    ----------"]
     for v in program.parameters:
         lines += textwrap.wrap(comment_text(_described(v)), 110, initial_indent="    ", subsequent_indent="        ")
     lines += ['    """', "", "    def __init__(", "        self,", "        *,"]
@@ -438,11 +428,8 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     lines += [f"        {a.name} = {a.text}" for a in body.start_locals]
     lines += [f"        self.{a.name} = {a.text}" for a in body.start]
     out = program.outputs[0]
-    lines += [
-        "",
-        f"    def step(self, {signature}) -> float:",
-        f'        """Compute a sample: {out.meaning} [{comment_text(out.unit)}]."""',
-    ]
+    lines += ["", f"    def step(self, {signature}) -> float:"]
+    lines += [f'        """Compute a sample: {out.meaning} [{comment_text(out.unit)}]."""']
     lines += [f"        {a.name} = {a.text}" for a in body.locals]
     lines += [f"        self.{n} = {text}" for n, text in {**body.outputs, **body.states}.items()]
     return {f"{header.name}.py": "\n".join([*lines, f"        return self.{out.name}"]) + "\n"}

@@ -112,7 +112,7 @@ def controller_program(controller: Controller, parameters: ParameterSet, centre:
     """
     check_sampled(controller)
     controller.check(parameters)
-    return _assemble(_law(controller), controller, parameters, centre)
+    return _assemble(_symbolic_law(controller), controller, parameters, centre)
 
 
 def check_sampled(controller: Controller) -> None:
@@ -134,7 +134,7 @@ class _WrappedDither(Dither):
 
 
 @dataclass(frozen=True)
-class _Law:
+class _SymbolicLaw:
     """The controller symbolically, by the loop's names."""
 
     inputs: Signals  # "measured", "output" and "reading NAME", too
@@ -146,7 +146,7 @@ class _Law:
     terms: Signals
 
 
-def _law(controller: Controller) -> _Law:
+def _symbolic_law(controller: Controller) -> _SymbolicLaw:
     """What is computed at a sample, and at the start."""
     sensor, dither = controller.sensor, controller.dither
     counts = isinstance(sensor, Encoder) and sensor.differentiates(controller.sensed_signal)
@@ -166,7 +166,7 @@ def _law(controller: Controller) -> _Law:
     renamed = {"reference_read": "setpoint_read", f"{measured.name}_read": "measured_read"}
     renamed |= {n: f"{n}_term" for n in ADDED_TERMS}
     terms = {renamed.get(n, n): v for n, v in found.terms.items() if n not in _NOT_READ}
-    return _Law(u, x, p, measured, after, _start(computed, u, measured.name, readings, p), terms)
+    return _SymbolicLaw(u, x, p, measured, after, _start(computed, u, measured.name, readings, p), terms)
 
 
 def _reading(name: str) -> str:
@@ -194,7 +194,7 @@ def _start(computed: Controller, u: Signals, measured: str, readings: Iterable[s
     return {**begun, f"pid.{BAD_SAMPLES}": ca.if_else(good, 0, own["fault_samples"]), SAMPLE: ca.SX(0)}
 
 
-def _assemble(law: _Law, controller: Controller, parameters: ParameterSet, centre: float) -> ControllerProgram:
+def _assemble(law: _SymbolicLaw, controller: Controller, parameters: ParameterSet, centre: float) -> ControllerProgram:
     """The program of a law, with the states and parameters that it needs and no others."""
     outputs = _outputs(law, controller, centre)
     states = _needed_states(ca.vertcat(*(v for v, _ in outputs.values())), law.states, law.after)
@@ -228,7 +228,7 @@ def _assemble(law: _Law, controller: Controller, parameters: ParameterSet, centr
     )
 
 
-class _Names(NamedTuple):
+class _ClaimedNames(NamedTuple):
     """What is called how, by the loop's names."""
 
     parameters: Mapping[str, str]
@@ -239,12 +239,12 @@ class _Names(NamedTuple):
 
 def _claim_names(
     controller: Controller, outputs: Iterable[str], given: Iterable[str], states: Iterable[str], terms: Iterable[str]
-) -> _Names:
+) -> _ClaimedNames:
     """The shortest name of each that is free: the block's signals first, so that they are called alike everywhere."""
     taken = Identifiers([*FIXED_NAMES, *outputs, *(_rate_name(q.name) for q in controller.motion_inputs)])
     parameters = {n: taken.claim(_short_name(n), n) for n in sorted(given, key=lambda n: n != CENTRE)}
     taken.take(*C_NAMES)
-    return _Names(
+    return _ClaimedNames(
         parameters,
         {n: taken.claim(_short_name(n), n) for n in states},
         {n: taken.claim(n, f"{n}_reading") for n in controller.readings},
@@ -268,7 +268,7 @@ def _more_inputs(controller: Controller, names: Mapping[str, str]) -> tuple[Vari
     return (*rates, *(Variable(names[n], units[n], f"{told}, as its sensor shows it") for n, told in read))
 
 
-def _outputs(law: _Law, controller: Controller, centre: float) -> dict[str, tuple[ca.SX, str]]:
+def _outputs(law: _SymbolicLaw, controller: Controller, centre: float) -> dict[str, tuple[ca.SX, str]]:
     """What the controller gives: the value, and what it is."""
     delayed, wire = bool(controller.pid.delay), law.parameters[CENTRE] if centre else ca.SX(0)
     command = law.after["pid.pending" if delayed else "pid.command"]
