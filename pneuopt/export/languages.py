@@ -242,15 +242,15 @@ def _source(program: ControllerProgram, header: Header, body: ProgramText) -> st
     lines += [f"const {name}_parameters {name}_tuned = {{", *values, "};", "", prepare, "{", "    c->p = *p;"]
     lines += [f"    c->{a.name} = {a.text};" for a in body.coefficients]
 
-    def unused(variables: Iterable[Variable], *assignments: Assignment) -> list[str]:
+    def unread_names(variables: Iterable[Variable], *assignments: Assignment) -> list[str]:
         text = " ".join(a.text for a in assignments)  # in which a name stands as a whole word, or not at all
         return [v.name for v in variables if not re.search(rf"(?<![\w>.]){v.name}\b", text)]
 
-    unread = unused(program.start_inputs, *body.start_locals, *body.start)
+    unread = unread_names(program.start_inputs, *body.start_locals, *body.start)
     lines += ["}", "", start, "{", *(f"    (void)({n});" for n in unread)]
     lines += [f"    const double {a.name} = {a.text};" for a in body.start_locals]
     lines += [f"    c->{a.name} = {a.text};" for a in body.start]
-    lines += ["}", "", step, "{", *(f"    (void)({n});" for n in unused(program.inputs, *body.locals))]
+    lines += ["}", "", step, "{", *(f"    (void)({n});" for n in unread_names(program.inputs, *body.locals))]
     lines += [*(f"    const double {a.name} = {a.text};" for a in body.locals), ""]
     lines += [f"    c->{n} = {text};" for n, text in {**body.outputs, **body.states}.items()]
     return "\n".join([*lines, f"    return c->{program.outputs[0].name};", "}"]) + "\n"
@@ -410,12 +410,12 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     lines += [f"class {name}:", '    """The controller: start it, then call step once a sample.', ""]
     lines += ["    Parameters", "    ----------"]
     for v in program.parameters:
-        lines += textwrap.wrap(comment_text(_described(v)), 110, initial_indent="    ", subsequent_indent="        ")
+        lines += textwrap.wrap(comment_text(_description(v)), 110, initial_indent="    ", subsequent_indent="        ")
     lines += ['    """', "", "    def __init__(", "        self,", "        *,"]
     lines += [f"        {v.name}: float = {PYTHON.literal(v.value)}," for v in program.parameters]
     lines += ["    ) -> None:", *(f"        self.{v.name} = {v.name}" for v in program.parameters)]
     for v in (*program.states, *program.outputs):
-        lines += [f"        self.{v.name} = {'False' if v.is_flag else '0.0'}  # {comment_text(_described(v))}"]
+        lines += [f"        self.{v.name} = {'False' if v.is_flag else '0.0'}  # {comment_text(_description(v))}"]
     zeros = ", ".join("0.0" for _ in program.start_inputs[:-1])
     lines += ["        self.prepare()", f"        self.start({zeros})", ""]
     lines += ["    def prepare(self) -> None:", '        """Take over parameters that were changed."""']
@@ -435,7 +435,7 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     return {f"{header.name}.py": "\n".join([*lines, f"        return self.{out.name}"]) + "\n"}
 
 
-def _described(v: Variable) -> str:
+def _description(v: Variable) -> str:
     return f"{v.name} [{v.unit}]: {v.meaning}" if v.meaning else f"{v.name} [{v.unit}]"
 
 
