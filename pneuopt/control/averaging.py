@@ -25,10 +25,8 @@ from pneuopt.control.linear_controller import controller_response
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.tolerances import (
     BALANCE_TOLERANCE,
-    MAX_BALANCE_STEPS,
-    MAX_NEWTON_ITERATIONS,
-    MIN_BALANCE_FRACTION,
-    MIN_NEWTON_STEP,
+    MAX_NEWTON_STEPS,
+    MIN_NEWTON_FRACTION,
     NEWTON_TOLERANCE,
     RIPPLE_PHASES,
 )
@@ -125,9 +123,14 @@ def ripple(
         By state: the peak, and the phase by which it leads the sine, or the triangle.
     """
     dithered = _add_dither(model, parameters, actuated, waveform)
-    given = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
-    swing = _first_harmonic(dithered, given, _operating_point(dithered, given, at, reference), nodes)
-    return dict(zip(names(dithered.system.states), swing.tolist(), strict=True))
+    complete = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
+    states, inputs = names(dithered.system.states), names(dithered.system.inputs)
+    if at is None:
+        point = dithered.steady_motion(complete, reference)
+    else:
+        check_names("state or input", at, [*states, *inputs], "average_dither: at")
+        point = np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
+    return dict(zip(states, _first_harmonic(dithered, complete, point, nodes).tolist(), strict=True))
 
 
 def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Array:
@@ -157,16 +160,14 @@ def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Arra
 
 @dataclass(frozen=True, eq=False)
 class _DitheredSystem:
-    """A system and where the wave enters: an input, or, of a loop, the dither's offset.
-
-    `steady_motion` gives states and inputs from the parameters and the reference.
-    """
+    """A system and where the wave enters: an input, or, of a loop, the dither's offset."""
 
     system: System
     parameters: ParameterSet
-    frequency: float
-    dithered_input: str | None
+    frequency: float  # [Hz]
+    dithered_input: str | None  # None of a loop
     waveform: Waveform
+    # from parameters and reference, the states and inputs
     steady_motion: Callable[[ParameterSet, float], tuple[Array, Array]]
 
     def rates(self, t: ca.SX, x: ca.SX, u: Symbols, p: Symbols, wave: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -190,7 +191,10 @@ class _DitheredSystem:
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
             A, z = p[DITHER_AMPLITUDE], stack(x)
             found = [self.rates(t, z + A * ca.DM(X), u, p, A * w) for w, X in zip(waves.tolist(), swings, strict=True)]
-            rates, outputs = (_sum_with_weights(column, weights) for column in zip(*found, strict=True))
+            rates, outputs = (
+                sum((w * v for w, v in zip(weights.tolist(), column, strict=True)), start=ca.SX(0))
+                for column in zip(*found, strict=True)
+            )
             return _by_name(system.states, rates), _by_name(system.outputs, outputs)
 
         mean = define(system.states, system.inputs, system.outputs, self.parameters, rhs)
@@ -263,17 +267,6 @@ def _dithered_plant(
     return _DitheredSystem(plant, plant.parameters | added, frequency, name, own, steady_motion)
 
 
-def _operating_point(
-    dithered: _DitheredSystem, parameters: ParameterSet, at: Mapping[str, float] | None, reference: float
-) -> tuple[Array, Array]:
-    """The operating point: states and inputs."""
-    if at is None:
-        return dithered.steady_motion(parameters, reference)
-    states, inputs = names(dithered.system.states), names(dithered.system.inputs)
-    check_names("state or input", at, [*states, *inputs], "average_dither: at")
-    return np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
-
-
 def _first_harmonic(
     dithered: _DitheredSystem, parameters: ParameterSet, point: tuple[Array, Array], nodes: int
 ) -> NDArray[np.complex128]:
@@ -306,9 +299,9 @@ def _newton_root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: 
         return left.full().ravel() / scale, slope.full() * scale / scale[:, None]
 
     left, slope = residual_and_slope(z)
-    for _ in range(MAX_NEWTON_ITERATIONS):
+    for _ in range(MAX_NEWTON_STEPS):
         step, size, part = np.linalg.solve(slope, -left), np.abs(left).max(), 1.0
-        while not np.abs(residual_and_slope(z + part * step)[0]).max() < size and part > MIN_NEWTON_STEP:
+        while not np.abs(residual_and_slope(z + part * step)[0]).max() < size and part > MIN_NEWTON_FRACTION:
             part /= 2
         z = z + part * step
         if part * np.abs(step).max() <= NEWTON_TOLERANCE * np.abs(z).max():
@@ -325,36 +318,20 @@ def phase_quadrature(nodes: int, waveform: Waveform) -> tuple[Array, Array]:
     return np.concatenate([at * pi / 2, at * pi / 2 + pi]), np.tile(weights / 4, 2)
 
 
-def _sum_with_weights(values: Sequence[ca.SX], weights: Array) -> ca.SX:
-    return sum((w * v for w, v in zip(weights.tolist(), values, strict=True)), start=ca.SX(0))
-
-
 def _by_name(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
     return {q.name: column[k] for k, q in enumerate(quantities)}
 
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """The waves on the commands of m plants at one frequency, phase by phase.
+    """The waves on the commands of m plants at one frequency, at n phases."""
 
-    Attributes
-    ----------
-    frequency : float
-        [rad/s]; 0 where nothing swings.
-    amplitudes : ndarray, shape (m,)
-        [command's unit]
-    phases, weights, shape : ndarray, shape (n,)
-        Phases [rad] and their weights in a mean, and the wave there as the plant gets it, of amplitude 1.
-    feedback : ndarray of complex, shape (m,)
-        The controller's response to the measured output at this frequency.
-    """
-
-    frequency: float
-    amplitudes: Array
-    phases: Array
-    weights: Array
-    shape: Array
-    feedback: NDArray[np.complex128]
+    frequency: float  # [rad/s]; 0 where nothing swings
+    amplitudes: Array  # (m,) [command's unit]
+    phases: Array  # (n,) [rad]
+    weights: Array  # (n,) of the phases in a mean
+    shape: Array  # (n,) the wave as the plant gets it, of amplitude 1
+    feedback: NDArray[np.complex128]  # (m,) the controller's response to the measured output at this frequency
 
     def select(self, rows: Indices) -> "Waves":
         """The waves on some of the commands."""
@@ -362,26 +339,14 @@ class Waves:
 
 
 class Moments(NamedTuple):
-    """Means over the phases of m plants, in states scaled by their nominal values; J is [A B], B the command's column.
+    """Means over the phases of m plants, their n states scaled by nominal values; J is [A B], B the command's."""
 
-    Attributes
-    ----------
-    swing : ndarray, shape (m, 2 n)
-        The swing ``a sin theta + b cos theta``, a before b.
-    rates : ndarray, shape (m, 2 n)
-        The rates times sin theta, then times cos theta.
-    J, J_ss, J_sc : ndarray, shape (m, n, n + 1)
-        The Jacobian, and that times ``sin^2`` and times ``sin cos``.
-    output : ndarray, shape (m, n + 2)
-        [C D] of the measured output, then the output itself.
-    """
-
-    swing: Array
-    rates: Array
-    J: Array
-    J_ss: Array
-    J_sc: Array
-    output: Array
+    swing: Array  # (m, 2 n): a sin theta + b cos theta, a before b
+    rates: Array  # (m, 2 n): the rates times sin theta, then times cos theta
+    J: Array  # (m, n, n + 1): the Jacobian
+    J_ss: Array  # likewise, times sin^2
+    J_sc: Array  # likewise, times sin cos
+    output: Array  # (m, n + 2): [C D] of the measured output, then the output itself
 
     def select(self, rows: Indices) -> "Moments":
         """The moments of some of the plants."""
@@ -390,14 +355,7 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RippleMoments:
-    """Function that computes `Moments`: a rollout in which a phase takes the place of a sample.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    compiled : bool
-        Machine code in place of the CasADi VM.
-    """
+    """Function that computes `Moments`: a rollout in which a phase takes the place of a sample."""
 
     loop: ClosedLoop
     compiled: bool = False
@@ -408,17 +366,7 @@ class RippleMoments:
         return np.array([q.nominal for q in self.loop.plant.states])
 
     def __call__(self, q: Array, x: Array, u: Array, waves: Waves, swing: Array) -> Moments:
-        """Sum up.
-
-        Parameters
-        ----------
-        q : ndarray, shape (m, n_plant_parameters)
-        x : ndarray, shape (m, n)
-        u : ndarray, shape (m, n_plant_inputs)
-            Means, the command among the inputs.
-        waves : Waves
-        swing : ndarray, shape (m, 2 n)
-        """
+        """Moments of m plants of parameters q, mean states x (m, n), mean inputs u, and the swing (m, 2 n)."""
         (m, n), count = x.shape, len(waves.phases)
         start = np.zeros((m, self._rollout.n_states))
         start[:, : 3 * n] = np.concatenate([x, swing], axis=1)
@@ -483,13 +431,7 @@ class PlantMatrices(NamedTuple):
 class AveragedPlant:
     """Function that linearises the plants of many loops, averaged over the ripple of their dithers.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-    compiled : bool
-        Whether machine code is made of the plant's Jacobian, which pays for many plants, not for one.
-    phases : int
-        Phases over which is averaged, at least.
+    Machine code of the plant's Jacobian pays for many plants, not for one.
     """
 
     loop: ClosedLoop
@@ -497,20 +439,7 @@ class AveragedPlant:
     phases: int = RIPPLE_PHASES
 
     def __call__(self, p: Array, x: Array, u: Array) -> PlantMatrices:
-        """Linearise.
-
-        Parameters
-        ----------
-        p : ndarray, shape (m, n_parameters)
-            In the order of ``loop.parameters``.
-        x : ndarray, shape (m, n_plant_states)
-        u : ndarray, shape (m, n_plant_inputs)
-            Means under dither, the command among the inputs.
-
-        Returns
-        -------
-        PlantMatrices
-        """
+        """Linearise m plants: loop parameters p, and under dither the means of states x and inputs u, (m, ...) each."""
         (m, n), scale = x.shape, self._moments.scale
         J, output = np.empty((m, n, n + 1)), np.empty((m, n + 2))
         for rows, found in self._balances(p, x, u):
@@ -573,7 +502,7 @@ class AveragedPlant:
         left = _imbalance(best, waves)
         step, size = _newton_step(best, waves, left), np.linalg.norm(left, axis=1)
         fraction, k = np.ones(len(x)), np.arange(len(x))
-        for _ in range(MAX_BALANCE_STEPS):
+        for _ in range(MAX_NEWTON_STEPS):
             moved = fraction[k, None] * step[k]
             trial = self._moments(q[k], x[k], u[k], waves.select(k), best.swing[k] + moved)
             left = _imbalance(trial, waves.select(k))
@@ -583,7 +512,7 @@ class AveragedPlant:
                 mine[k[better]] = theirs[better]
             size[k[better]], fraction[k] = after[better], np.where(better, 1.0, fraction[k] / 2)
             done = np.abs(moved).max(axis=1) <= BALANCE_TOLERANCE * np.abs(trial.swing).max(axis=1)
-            goes_on = ~done & (fraction[k] >= MIN_BALANCE_FRACTION)
+            goes_on = ~done & (fraction[k] >= MIN_NEWTON_FRACTION)
             new = np.flatnonzero(better & goes_on)
             step[k[new]] = _newton_step(trial.select(new), waves.select(k[new]), left[new])
             k = k[goes_on]
@@ -608,10 +537,7 @@ def _imbalance(found: Moments, waves: Waves) -> Array:
 
 
 def _newton_step(found: Moments, waves: Waves, imbalance: Array) -> Array:
-    """Newton's step of the swing that removes the imbalance, shape (m, 2 n).
-
-    The command swings by -feedback times the output.
-    """
+    """Newton's step of the swing, shape (m, 2 n), that removes the imbalance; the command swings by -feedback y."""
     n, w = found.J.shape[1], waves.frequency
     C, real, imaginary = found.output[:, None, :n], waves.feedback.real, waves.feedback.imag
     ss, sc, cc = (2 / w * M for M in (found.J_ss, found.J_sc, found.J - found.J_ss))

@@ -67,27 +67,22 @@ def bumpless_transfer(
     require(state.shape == (len(order),), f"x has shape {state.shape}, the loop has {len(order)} states")
     remembered = order.index("pid.filter" if loop.pid.sample_time is None else "pid.previous_error")
     c, c_new = (loop.parameter_vector(p)[list(loop.parameters).index("pid.c")] for p in (old, new))
-    before = _next_command(loop, state, old, reference)
+    wanted = _next_command(loop, state, old, reference)
     if loop.outer is None:  # the speed that a cascade's PID has been given is not known here
         state[remembered] += (c_new - c) * reference
     integral = order.index("pid.integral")
     if loop.pid.sample_time is not None and integrates(loop.parallel_form(new).Ki):
         shares = [_distance_share(loop, state, p, reference) for p in (old, new)]
         state[order.index("pid.transfer")] += shares[0] - shares[1]
-    state[integral] += before - _next_command(loop, state, new, reference)
-    if loop.compensators:
-        state[integral] = _integral_for(loop, state, new, reference, before)
+    state[integral] += wanted - _next_command(loop, state, new, reference)
+    if loop.compensators:  # they bend the command: the integral is sought that gives the one wanted
+        is_integral, x_new = np.array(order) == "pid.integral", state.copy()
+
+        def commands(integrals: Array) -> Array:
+            return np.array([_next_command(loop, np.where(is_integral, i, x_new), new, reference) for i in integrals])
+
+        state[integral] = invert_increasing(commands, np.array([wanted]))[0]
     return state
-
-
-def _integral_for(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float, command: float) -> float:
-    """The integral with which the next command is a given one."""
-    own = np.array(names(loop.states)) == "pid.integral"
-
-    def commands(integrals: Array) -> Array:
-        return np.array([_next_command(loop, np.where(own, i, x), parameters, reference) for i in integrals])
-
-    return float(invert_increasing(commands, np.array([command]))[0])
 
 
 def _distance_share(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:
@@ -103,7 +98,7 @@ def _distance_share(loop: ClosedLoop, x: Array, parameters: ParameterSet, refere
 
 
 def _next_command(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:
-    """The next one that is computed, before the clip; at t = 0, where a dither's wave is zero."""
+    """The next command that is computed, before the limits; at t = 0, where a dither's wave is zero."""
     free = replace(loop, pid=replace(loop.pid, limits=False))
     u, p = np.zeros(len(loop.inputs)), free.parameter_vector(parameters)
     u[0] = reference

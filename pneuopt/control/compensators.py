@@ -15,30 +15,14 @@ import casadi as ca
 
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, SensedSignal, Signals
 from pneuopt.control.tolerances import (
-    BRAKE,
-    CHANGE_SMOOTHING,
-    COMMAND_SMOOTHING,
-    DERIVATIVE_FILTER_TIME,
-    DIRECTION_SMOOTHING,
-    FALL,
-    GROWTH,
-    LEAST_LIMIT,
-    LEAST_PEAK,
+    FALL_EXPONENT,
+    LEAST_DIVISOR,
     LEAST_RISE,
-    LEAST_SMOOTHING,
-    LEAST_TOLERANCE,
     LEAST_WAY,
     MIN_FILTER_TIME,
-    MIN_PASSED_TIME,
-    PASSED_TIME,
-    PAUSE,
-    PERIOD_SAMPLES,
-    PRESSURE_NOMINAL,
-    PULSE_SAMPLES,
     PULSE_SHARE,
-    PULSE_TOLERANCE,
-    PULSE_WIDTH,
-    RISE,
+    RISE_EXPONENT,
+    SHORTEST_TIME,
     STANDSTILL_SHARE,
 )
 from pneuopt.dynamics.hooks import Axis
@@ -50,23 +34,17 @@ from pneuopt.quantities.units import difference_unit, unit_ratio
 
 @dataclass(frozen=True)
 class ControllerSnapshot:
-    """What a compensator sees: the time [s], reference and measured signal, and the command so far.
+    """What a compensator sees at an instant."""
 
-    `sample_time` [s] is the controller's, None of a continuous one. `rates` are the motion inputs that the part asks
-    for ("reference_speed", "reference_acceleration"), `readings` the plant's outputs, by name, and `error` that of the
-    signal that the loop is judged by, which in a cascade is the position; a rest, where parts start, has none.
-    `elapsed` [s] is the time since the last good sample of a sampled controller, over which differences are taken.
-    """
-
-    t: Any
+    t: Any  # [s]
     reference: Any
     measured: Any
-    command: Any
-    sample_time: float | None
-    rates: Mapping[str, Any] = field(default_factory=dict)
-    readings: Mapping[str, Any] = field(default_factory=dict)
-    error: Any = 0.0
-    elapsed: Any = None
+    command: Any  # so far, by the parts before
+    sample_time: float | None  # [s], None of a continuous controller
+    rates: Mapping[str, Any] = field(default_factory=dict)  # the motion inputs that the part uses
+    readings: Mapping[str, Any] = field(default_factory=dict)  # the plant's outputs
+    error: Any = 0.0  # of what the loop is judged by, in a cascade the position; a rest, where parts start, has none
+    elapsed: Any = None  # [s] since the last good sample, over which differences are taken
 
 
 @runtime_checkable
@@ -140,10 +118,7 @@ def check_compensators(given: object, on: SensedSignal, axis: Axis | None) -> No
 def check_values(
     compensators: Sequence[Compensator], known: ParameterSet, value: Mapping[str, float], count: float
 ) -> None:
-    """Refuse a compensator's value outside the bounds that it declares, whatever a set's own bounds say.
-
-    And a tolerance that the sensor's count, in the same unit, cannot tell from zero.
-    """
+    """Refuse a value beyond its part's bounds, and a tolerance that `count` of the sensor cannot tell from zero."""
     prefixes = tuple(f"{c.section}." for c in compensators)
     for name, q in known.items():
         runs = not name.startswith(prefixes) or q.lower <= value[name] <= q.upper
@@ -158,23 +133,7 @@ def check_values(
 def compensate(
     compensators: Sequence[Compensator], seen: ControllerSnapshot, x: Symbols, p: Symbols
 ) -> tuple[Signals, ca.SX]:
-    """Let compensators act one after the other.
-
-    Parameters
-    ----------
-    compensators : sequence of Compensator
-    seen : ControllerSnapshot
-        Its command is that of PID and feedforward.
-    x, p : mapping of str to casadi.SX
-        The loop's states and parameters.
-
-    Returns
-    -------
-    moved : dict
-        As `Compensator.act` gives it, by the loop's names.
-    added : casadi.SX
-        The sum of what they add [the command's unit].
-    """
+    """What compensators add, one after the other, to the command, and their states as `Compensator.act` has them."""
     moved, added = Signals(), ca.SX(0)
     for part in compensators:
         now = replace(seen, command=seen.command + added)
@@ -217,17 +176,13 @@ class Knocker:
         >>> [(n, p.value, p.unit) for n, p in found.items()]
         [('amplitude', 0.0, 'V'), ('width', 0.002, 's'), ('period', 0.01, 's'), ('smoothing', 0.01, 'V')]
         """
+        change = "change of the command that decides a pulse's direction"
         return ParameterSet(
             {
                 "amplitude": Parameter(0.0, unit, lower=0.0, meaning="height of the pulses"),
-                "width": Parameter(PULSE_SAMPLES * on.h, "s", lower=on.h, meaning="length of a pulse"),
-                "period": Parameter(PERIOD_SAMPLES * on.h, "s", lower=on.h, meaning="time from pulse to pulse"),
-                "smoothing": Parameter(
-                    CHANGE_SMOOTHING,
-                    unit,
-                    lower=LEAST_SMOOTHING,
-                    meaning="change of the command that decides a pulse's direction",
-                ),
+                "width": Parameter(2 * on.h, "s", lower=on.h, meaning="length of a pulse"),
+                "period": Parameter(10 * on.h, "s", lower=on.h, meaning="time from pulse to pulse"),
+                "smoothing": Parameter(0.01, unit, lower=LEAST_DIVISOR, meaning=change),
             }
         )
 
@@ -260,9 +215,6 @@ class Knocker:
             "direction": ca.if_else(begins, direction, x["direction"]),
         }
         return now, p["amplitude"] * now["direction"] * (phase < width)
-
-
-# slow motions too little
 
 
 class Direction(Enum):
@@ -316,16 +268,11 @@ class FrictionFeedforward:
         >>> [(n, p.unit) for n, p in FrictionFeedforward().parameters(on, "V").items()]
         [('level', 'V'), ('smoothing', 'm/s')]
         """
-        within = Parameter(
-            DIRECTION_SMOOTHING,
-            on.speed_unit,
-            lower=LEAST_SMOOTHING,
-            meaning="speed within which the added command turns its sign",
-        )
+        turn = "speed within which the added command turns its sign"
         return ParameterSet(
             {
                 "level": Parameter(0.0, unit, lower=0.0, meaning="command that Coulomb friction takes"),
-                "smoothing": within,
+                "smoothing": Parameter(1e-3, on.speed_unit, lower=LEAST_DIVISOR, meaning=turn),
             }
         )
 
@@ -373,13 +320,11 @@ class DeadZoneInverse:
 
     def parameters(self, _on: SensedSignal, unit: str) -> ParameterSet:
         """Half the dead zone's width, zero by default, and the command within which the sign turns over [unit]."""
-        within = Parameter(
-            COMMAND_SMOOTHING, unit, lower=LEAST_SMOOTHING, meaning="command within which what is added turns its sign"
-        )
+        turn = "command within which what is added turns its sign"
         return ParameterSet(
             {
                 "width": Parameter(0.0, unit, lower=0.0, meaning="half the valve's dead zone, added to the command"),
-                "smoothing": within,
+                "smoothing": Parameter(0.02, unit, lower=LEAST_DIVISOR, meaning=turn),
             }
         )
 
@@ -460,12 +405,12 @@ class ImpulsiveControl:
         return ParameterSet(
             {
                 "amplitude": above(0.0, 0.0, unit, "peak of the first pulse"),
-                "limit": above(LEAST_LIMIT, inf, unit, "peak beyond which pulses grow longer, not higher"),
-                "width": above(on.h, PULSE_WIDTH, "s", "length of a pulse"),
-                "pause": above(on.h, PAUSE, "s", "standstill before a pulse"),
-                "tolerance": above(LEAST_TOLERANCE, PULSE_TOLERANCE, on.error_unit, "error within which none comes"),
-                "growth": above(1.0, GROWTH, "1", "factor by which the peak grows from pulse to pulse at most"),
-                "brake": above(0.0, BRAKE, "1", "height of a pulse's second half over that of its first"),
+                "limit": above(LEAST_DIVISOR, inf, unit, "peak beyond which pulses grow longer, not higher"),
+                "width": above(on.h, 0.018, "s", "length of a pulse"),
+                "pause": above(on.h, 0.016, "s", "standstill before a pulse"),
+                "tolerance": above(1e-12, 1e-4, on.error_unit, "error within which none comes"),
+                "growth": above(1.0, 1.1, "1", "factor by which the peak grows from pulse to pulse at most"),
+                "brake": above(0.0, 0.6, "1", "height of a pulse's second half over that of its first"),
             }
         )
 
@@ -523,17 +468,14 @@ class ImpulsiveControl:
 
 
 def _next_peak(e: Any, last: Any, before: Any, ceiling: Any, p: Symbols) -> tuple[ca.SX, ca.SX]:
-    """The signed peak of a pulse that begins at the error e, and the ceiling from then on.
-
-    Known are the last peak (0: none), the error before it, and the ceiling, the last peak that went too far (0: none).
-    """
+    """A pulse's signed peak at the error e, and the ceiling from then on: the last peak that went too far, or 0."""
     way = ca.fmax((before - e) * ca.if_else(last < 0, -1, 1), LEAST_WAY * p["tolerance"])
     ratio = ca.fmax(PULSE_SHARE * ca.fabs(e), LEAST_WAY * p["tolerance"]) / way
     size, turns = ca.fabs(last), last * e < 0
     known = ca.if_else(turns, 0, ca.if_else(ratio < 1, size, ceiling))
-    halfway = ca.fmax(ca.sqrt(known / ca.fmax(size, LEAST_PEAK)), LEAST_RISE)
+    halfway = ca.fmax(ca.sqrt(known / ca.fmax(size, LEAST_DIVISOR)), LEAST_RISE)
     most = ca.if_else(known > 0, ca.fmin(p["growth"], halfway), p["growth"])
-    factor = ca.fmin(most, ca.exp(ca.if_else(ratio > 1, RISE, FALL) * ca.log(ratio)))
+    factor = ca.fmin(most, ca.exp(ca.if_else(ratio > 1, RISE_EXPONENT, FALL_EXPONENT) * ca.log(ratio)))
     found = ca.if_else(size <= 0, p["amplitude"], size * factor)
     return ca.if_else(e < 0, -found, found), known
 
@@ -643,7 +585,7 @@ class PressureFeedback:
             {
                 "gain": Parameter(0.0, gain, meaning="command taken back per differential pressure"),
                 "time": Parameter(
-                    PASSED_TIME, "s", lower=MIN_PASSED_TIME, meaning="time in which a steady pressure is forgotten"
+                    0.1, "s", lower=SHORTEST_TIME, meaning="time in which a steady pressure is forgotten"
                 ),
             }
         )
@@ -658,7 +600,7 @@ class PressureFeedback:
 
     def states(self, on: SensedSignal, _command: Quantity) -> tuple[Quantity, ...]:
         """The slow part of the differential pressure."""
-        return (Quantity("slow", difference_unit(_pressure_quantity(on).unit), PRESSURE_NOMINAL),)
+        return (Quantity("slow", difference_unit(_pressure_quantity(on).unit), 1e5),)
 
     def start(self, _on: SensedSignal, seen: ControllerSnapshot) -> list[Any]:
         """The pressures so far are the slow part."""
@@ -720,10 +662,7 @@ class AccelerationFeedback:
                     0.0, unit_ratio(f"{unit}*s", on.speed_unit), meaning="command taken back per acceleration"
                 ),
                 "filter": Parameter(
-                    DERIVATIVE_FILTER_TIME,
-                    "s",
-                    lower=MIN_FILTER_TIME,
-                    meaning="time constant of each derivative's filter",
+                    5e-3, "s", lower=MIN_FILTER_TIME, meaning="time constant of each derivative's filter"
                 ),
             }
         )

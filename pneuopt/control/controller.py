@@ -1,7 +1,12 @@
-"""`Controller`: everything of a loop but the plant, its parameters, its states and one law for loops and exports.
+"""`Controller`: everything of a loop but its plant, from the reference and the measurement to the command.
 
-Read `Controller.update` first: what is computed at a sample. A `ClosedLoop` joins a controller to its plant, an export
-writes it for another machine.
+The signals' way, which `Controller.rates` follows in continuous time and `Controller.update` from sample to sample::
+
+    reference ---> outer loop ---> PID ---> + feedforward ---> + compensators ---> + dither ---> limits ---> command
+                        ^           ^
+    measurement ---> sensor --------+       (a schedule sets the gains of each instant)
+
+A `ClosedLoop` joins a controller to its plant, an export writes it for another machine; both run this one law.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,8 +36,7 @@ from pneuopt.control.tolerances import (
     LARGEST_SIGNAL,
     MAX_BISECTIONS,
     MAX_DOUBLINGS,
-    MIN_FEEDFORWARD_TIME,
-    POSITION_GAIN,
+    SHORTEST_TIME,
 )
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, stack
@@ -41,34 +45,19 @@ from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, with_prefix, without_prefix
 from pneuopt.quantities.units import difference_unit, unit_ratio
 
-ERROR = "error"
-"""Beside the inputs of a cascade's inner controller: the error of the outer one."""
+ERROR = "error"  # beside the inputs of a cascade's inner controller: the error of the outer one
 _COUNT = f"pid.{BAD_SAMPLES}"
 
 
 @dataclass(frozen=True)
 class PlantSignals:
-    """What a controller knows of a plant: the signals between the two.
-
-    Parameters
-    ----------
-    command : Quantity
-        The plant's input that the controller drives.
-    feedback : Quantity
-        The plant's output that the loop is judged by.
-    outputs : mapping of str to Quantity
-        All of the plant's, some of which the controller reads.
-    axis : Axis, optional
-        What the outputs of an axis are called.
-    load_unit : str
-        Of the axis's mass or inertia.
-    """
+    """What a controller knows of a plant: the input that it drives, the output that it is judged by, and the others."""
 
     command: Quantity
     feedback: Quantity
     outputs: Mapping[str, Quantity]
-    axis: Axis | None = None
-    load_unit: str = "1"
+    axis: Axis | None = None  # what the outputs of an axis are called
+    load_unit: str = "1"  # of the axis's mass or inertia
 
 
 @dataclass(frozen=True)
@@ -91,8 +80,8 @@ class Feedforward:
 
     def __post_init__(self) -> None:
         require(
-            MIN_FEEDFORWARD_TIME <= self.time < inf,
-            f"Feedforward: time must be at least {MIN_FEEDFORWARD_TIME:g} s, got {self.time:g} s",
+            SHORTEST_TIME <= self.time < inf,
+            f"Feedforward: time must be at least {SHORTEST_TIME:g} s, got {self.time:g} s",
         )
 
     def parameters(self, input_unit: str, output_unit: str) -> ParameterSet:
@@ -109,7 +98,7 @@ class Feedforward:
         return ParameterSet(
             {
                 "gain": gain,
-                "time": Parameter(self.time, "s", lower=MIN_FEEDFORWARD_TIME, meaning="time constant of that decay"),
+                "time": Parameter(self.time, "s", lower=SHORTEST_TIME, meaning="time constant of that decay"),
             }
         )
 
@@ -153,7 +142,7 @@ class PositionLoop:
         gain = unit_ratio(speed_unit, difference_unit(position_unit))
         return ParameterSet(
             {
-                "Kp": Parameter(POSITION_GAIN, gain, lower=0.0, meaning="speed per error of the position"),
+                "Kp": Parameter(10.0, gain, lower=0.0, meaning="speed per error of the position"),
                 "weight": Parameter(1.0, "1", lower=0.0, meaning="weight of the reference's speed"),
             }
         )
@@ -164,16 +153,11 @@ class PositionLoop:
 
 
 class ControllerUpdate(NamedTuple):
-    """What is computed at a sample, by name.
+    """The states after a sample, sensor included, and the terms of the command, by name.
 
-    Attributes
-    ----------
-    states : dict of str to casadi.SX
-        The states of sensor, PID, feedforward and compensators after the sample, by the loop's names.
-    terms : dict of str to casadi.SX
-        What the command is made of: "error", "proportional", "integral" (before back-calculation), "derivative",
-        "feedforward", "compensation", "dither", and their sum before the clip, "unlimited"; the gains of this instant,
-        "Kp_parallel" and so on; and the signals as they are computed with, "reference_read" for instance.
+    Terms are "error", "proportional", "integral" (before back-calculation), "derivative", "feedforward",
+    "compensation", "dither", and "unlimited", their sum before the limits; the gains of this instant, "Kp_parallel"
+    and so on; and the signals as they are computed with, "reference_read" for instance.
     """
 
     states: Signals
@@ -182,24 +166,10 @@ class ControllerUpdate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """A PID and all that acts beside it.
+    """A PID and all that acts beside it; its parts are those of `ClosedLoop`.
 
-    Its methods take states, inputs, outputs and parameters by their names in a loop ("pid.Kp"), in mappings that may
-    hold others, too.
-
-    Parameters
-    ----------
-    pid : PID
-    signals : PlantSignals
-    dither, sensor, feedforward, compensators, outer, schedule
-        As for `ClosedLoop`.
-
-    Raises
-    ------
-    ModelError
-        If a part does not fit the signals or another part.
-    InputError
-        If the dither cannot be sampled.
+    Its methods take states, inputs, outputs and parameters by their names in a loop ("pid.Kp"), as numbers or as
+    symbols, in mappings that may hold others, too.
     """
 
     pid: PID
@@ -224,6 +194,170 @@ class Controller:
         own = self.parameters  # raises where a part cannot be built: a dither beyond the Nyquist frequency, say
         if self.schedule:
             self.schedule.check(own)
+
+    def rates(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+        """The law of a continuous controller: the rates of its states, the sensor's apart, and its command."""
+        measured = x["sensor.reading"] if self.sensor else y[self.pid_signal.name]
+        p = self.schedule_gains(p, measured, {}, y)
+        u = self.inner_inputs(u, y[self.feedback.name], p)
+        moved, _, added = self._added_to_command(t, x, u, measured, y, p)
+        pid = without_prefix(x, "pid"), u["reference"], measured, added, without_prefix(p, "pid")
+        rates, command = self.pid.rates(*pid)
+        return with_prefix(rates, "pid") | moved, command
+
+    def sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
+        """The rates of the sensor's states between samples."""
+        if self.sensor is None:
+            return {}
+        reading = without_prefix(x, "sensor"), y, self.sensed_signal, without_prefix(p, "sensor")
+        return with_prefix(self.sensor.rates(*reading), "sensor")
+
+    def update(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> ControllerUpdate:
+        """What a sampled controller computes at a sample, from the loop's states and inputs and the plant's outputs.
+
+        A sample is bad where a signal that the controller reads is no number, or beyond `LARGEST_SIGNAL`. At a bad
+        sample all states stay as they are, and with them the output; `PID.hold` counts it, and gives the safe output
+        once fault_samples have been bad in a row. The next good sample goes on from those states if there were fewer,
+        with what takes a difference or filters counting the time since the last good one; else it begins anew as at a
+        start, from the output that was sent last. Time, and a dither with it, goes on.
+        """
+        signals = tuple(zip((x, u, y), self._read_names(u), strict=True))
+        is_good = signals_are_good([v for group, read in signals for n, v in group.items() if n in read])
+        count = ca.if_else(is_good, 0, x[_COUNT] + 1)
+        good = count <= 0  # read where it is needed; the condition above is computed once
+        # In place of a bad sample's signals stands a number, so that no operation sees what is none: any but 0, with
+        # which CasADi would put products of the signals into the choice.
+        x_read, u_read, y_read = (
+            {n: ca.if_else(good, v, 1) if n in read else v for n, v in group.items()} for group, read in signals
+        )
+        law = self._sampled_law(t, x_read, u_read, y_read, p)
+        held = {**x, **with_prefix(self.pid.hold(without_prefix(x, "pid"), count, without_prefix(p, "pid")), "pid")}
+        states = _choose(good, law.states, held) | {_COUNT: count}
+        return ControllerUpdate(states, {f"{n}_read": v for n, v in (*u_read.items(), *y_read.items())} | law.terms)
+
+    def _read_names(self, u: Symbols) -> tuple[set[str], set[str], set[str]]:
+        """Which states, inputs and outputs of the plant are signals that the controller reads."""
+        inputs = {"reference", REFERENCE_SPEED, REFERENCE_ACCELERATION} & set(u)
+        if isinstance(self.sensor, SensorLag):
+            return {"sensor.reading"}, inputs, set(self.readings)
+        return set(), inputs, {*self.readings, self.sensor.position if self.sensor else self.pid_signal.name}
+
+    def _sampled_law(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> ControllerUpdate:
+        """The law at a good sample, along the signals' way."""
+        anew = x[_COUNT] >= p["pid.fault_samples"]
+
+        # What the controller sees of the plant.
+        x, seen = self._read_sensor(anew, x, y, p)
+        measured = seen["reading"] if seen else y[self.pid_signal.name]
+        position = measured if self.outer is None else seen["count"] if "count" in seen else y[self.feedback.name]
+
+        # The gains of this instant, and what the PID shall follow: the reference, or what an outer loop makes of it.
+        p = dict(self.schedule_gains(p, measured, seen, y))
+        inner = self.inner_inputs(u, position, p)
+        gains = without_prefix(p, "pid")
+
+        # Where the PID goes on from: its states, those of a start after too many bad samples, or a reset integral.
+        begun = self.start(inner, measured, y, self.pid.sent(without_prefix(x, "pid")), p)
+        kept = ("pid.command", "pid.pending", _COUNT)  # what was sent stays; the count matters at bad samples alone
+        x = {**x, **_choose(anew, {n: v for n, v in begun.items() if n not in kept}, x)}
+        if self.pid.reset:
+            x |= with_prefix(reset_integral(without_prefix(x, "pid"), u["reference"] - position, gains), "pid")
+
+        # The command: the PID's own, and what is added to it, limited.
+        moved, added_terms, added = self._added_to_command(t, x, inner, measured, y, p)
+        pid = without_prefix(x, "pid"), inner["reference"], measured
+        states = with_prefix(self.pid.update(*pid, added, gains), "pid") | moved
+        if not isinstance(self.sensor, SensorLag):  # whose reading moves between samples, by `sensor_rates`
+            states = with_prefix(seen, "sensor") | states
+        terms = {"error": inner["reference"] - measured, **self.pid.terms(*pid, gains), **added_terms}
+        parallel = zip(Form.PARALLEL.gains, parallel_gains(self.pid.form, gains), strict=True)
+        terms |= {f"{n}_parallel": value for n, value in parallel}
+        return ControllerUpdate(states, terms | {"unlimited": self.pid.output(*pid, gains) + added})
+
+    def _read_sensor(self, anew: ca.SX, x: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+        """The loop's states, those of an encoder at rest where it begins anew; and the sensor's after the sample."""
+        if self.sensor is None:
+            return {**x}, {}
+        signal, own = self.sensed_signal, without_prefix(p, "sensor")
+        if isinstance(self.sensor, Encoder):
+            x = {**x, **_choose(anew, with_prefix(self.sensor.rest(y, signal, own), "sensor"), x)}
+        elapsed = self.pid.elapsed_time(without_prefix(x, "pid"))
+        return {**x}, self.sensor.update(without_prefix(x, "sensor"), y, signal, own, elapsed)
+
+    def _added_to_command(
+        self, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
+    ) -> tuple[Signals, Signals, ca.SX]:
+        """What feedforward, compensators and dither add to the PID's command: their states, each term, the sum."""
+        h = self.pid.sample_time
+        elapsed = None if h is None else self.pid.elapsed_time(without_prefix(x, "pid"))
+        moved, lead, compensation, wave = Signals(), ca.SX(0), ca.SX(0), ca.SX(0)
+        if self.feedforward is not None:
+            own = without_prefix(x, "feedforward"), u["reference"], without_prefix(p, "feedforward")
+            filtered, lead = self.feedforward.rates(*own) if elapsed is None else self.feedforward.update(*own, elapsed)
+            moved |= with_prefix(filtered, "feedforward")
+        if self.compensators:
+            v = self.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
+            rates = {n: u[n] for n in (REFERENCE_SPEED, REFERENCE_ACCELERATION) if n in u}
+            error = u.get(ERROR, u["reference"] - measured)
+            seen = ControllerSnapshot(t, u["reference"], measured, v + lead, h, rates, y, error, elapsed)
+            remembered, compensation = compensate(self.compensators, seen, x, p)
+            moved |= remembered
+        if self.dither is not None:  # of an analogue one behind a sampled controller its generator adds the wave
+            own_p = without_prefix(p, "dither")
+            is_apart = self.dither.analogue and h is not None
+            wave = own_p["offset"] if is_apart else own_p["offset"] + self.dither.wave(t, own_p)
+        return moved, {"feedforward": lead, "compensation": compensation, "dither": wave}, wave + (lead + compensation)
+
+    def start(
+        self, u: Mapping[str, Any], measured: Any, y: Mapping[str, Any], command: Any, p: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """The first states, sensor apart, with which the controller goes on from a command [its unit] without a bump.
+
+        The inputs are those of `inner_inputs`, the command the PID's own, and the gains those of this instant.
+        """
+        unit = Quantity("command", "1")
+        pid = self.pid.start(u["reference"], measured, command, without_prefix(p, "pid"))
+        begun = {f"pid.{q.name}": v for q, v in zip(self.pid.states(unit, unit), pid, strict=True)}
+        if self.feedforward is not None:
+            begun["feedforward.filter"] = u["reference"]
+        for part in self.compensators:
+            known = ControllerSnapshot(0.0, u["reference"], measured, command, self.pid.sample_time, {}, y)
+            own = zip(part.states(self.sensed_signal, unit), part.start(self.sensed_signal, known), strict=True)
+            begun |= {f"{part.section}.{q.name}": v for q, v in own}
+        return begun
+
+    def rest_states(
+        self, parameters: ParameterSet, y: Mapping[str, float], reference: float, command: float
+    ) -> list[float]:
+        """The states with which it goes on from a command and the plant's outputs at rest, or in steady motion."""
+        value: Mapping[str, Any] = self.values(parameters)
+        sensor = (
+            self.sensor.start(y, self.sensed_signal, without_prefix(value, "sensor")) if self.sensor else list[float]()
+        )
+        seen = sensor[0] if sensor else y[self.pid_signal.name]
+        value = self.schedule_gains(value, seen, {}, y)
+        wanted = float(self.inner_inputs({"reference": reference}, y[self.feedback.name], value)["reference"])
+        p = np.array([float(v) for v in value.values()])
+        v = float(self.uncompensated_command(p, wanted, seen, command, [y[n] for n in self.readings])[0])
+        return [*sensor, *map(float, self.start({"reference": wanted}, seen, y, v, value).values())]
+
+    def inner_inputs(self, u: Mapping[str, Any], position: Any, p: Mapping[str, Any]) -> dict[str, Any]:
+        """The inputs as PID and compensators see them: a cascade's reference is a speed, and `ERROR` a position's."""
+        if self.outer is None:
+            return dict(u)
+        own = without_prefix(p, self.outer.section)
+        speed = self.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, own)
+        return {**u, "reference": speed, ERROR: u["reference"] - position}
+
+    def schedule_gains(
+        self, p: Mapping[str, Any], measured: Any, seen: Mapping[str, Any], y: Mapping[str, Any]
+    ) -> Mapping[str, Any]:
+        """The loop's parameters with the gains of this instant; `seen` are the sensor's states after reading."""
+        if self.schedule is None:
+            return p
+        if self.schedule.position == self.pid_signal.name:
+            return self.schedule.set_gains(p, measured)
+        return self.schedule.set_gains(p, seen["count"] if "count" in seen else y[self.schedule.position])
 
     @property
     def command(self) -> Quantity:
@@ -382,137 +516,11 @@ class Controller:
             return None
         return self.dither.period(value["dither.frequency"], self.pid.sample_time)
 
-    def rates(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
-        """The law of a continuous controller: the rates of its states, the sensor's apart, and its command."""
-        seen = x["sensor.reading"] if self.sensor else y[self.pid_signal.name]
-        p = self.schedule_gains(p, seen, {}, y)
-        inner = self.inner_inputs(u, y[self.feedback.name], p)
-        moved, added = self._added_command(t, x, inner, seen, y, p)
-        arguments = without_prefix(x, "pid"), inner["reference"], seen, added, without_prefix(p, "pid")
-        rates, command = self.pid.rates(*arguments)
-        return with_prefix(rates, "pid") | moved, command
-
-    def sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
-        """The rates of the sensor's states between samples."""
-        if self.sensor is None:
-            return {}
-        own = without_prefix(x, "sensor"), y, self.sensed_signal, without_prefix(p, "sensor")
-        return with_prefix(self.sensor.rates(*own), "sensor")
-
-    def update(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> ControllerUpdate:
-        """What a sampled controller computes at a sample.
-
-        A sample is bad where any signal that the controller reads is no number, or beyond `LARGEST_SIGNAL`. At a bad
-        sample all states stay as they are, and with them the output; `PID.hold` counts it, and gives the safe output
-        once fault_samples have been bad in a row. The next good sample goes on from those states if there were fewer,
-        with what takes a difference or filters counting the time since the last good one; else it begins anew as at a
-        start, from the output that was sent last. Time, and a dither with it, goes on.
-
-        Parameters
-        ----------
-        t : casadi.SX
-            [s]
-        x, u, p : mapping of str to casadi.SX
-            The loop's states, inputs (the "reference", and its rates where a part uses them) and parameters.
-        y : mapping of str to casadi.SX
-            The plant's outputs: the measured one, or what an `Encoder` counts, and those that compensators read.
-        """
-        is_good = self._signals_are_good(x, u, y)
-        count = ca.if_else(is_good, 0, x[_COUNT] + 1)
-        good = count <= 0  # read where it is needed; the condition above is computed once
-        seen = self._good_signals(good, x, u, y)
-        found = self._sampled_law(t, *seen, p)
-        held = {**x, **with_prefix(self.pid.hold(without_prefix(x, "pid"), count, without_prefix(p, "pid")), "pid")}
-        after = _choose(good, found.states, held) | {_COUNT: count}
-        read = {f"{n}_read": v for own in seen[1:] for n, v in own.items()}
-        return ControllerUpdate(after, read | found.terms)
-
-    def start(
-        self, u: Mapping[str, Any], measured: Any, y: Mapping[str, Any], command: Any, p: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        """The first states, sensor apart, from what the actuator has got so far [output unit], by the loop's names.
-
-        Parameters
-        ----------
-        u : mapping of str to float or casadi.SX
-            The inputs as `inner_inputs` gives them.
-        measured : float or casadi.SX
-            As the PID sees it.
-        y : mapping of str to float or casadi.SX
-            The plant's outputs that compensators read.
-        command : float or casadi.SX
-            The PID's, which the compensators that act always add to.
-        p : mapping of str to float or casadi.SX
-            The loop's parameters, with the gains of this instant.
-        """
-        unit = Quantity("command", "1")
-        pid = self.pid.start(u["reference"], measured, command, without_prefix(p, "pid"))
-        begun = {f"pid.{q.name}": v for q, v in zip(self.pid.states(unit, unit), pid, strict=True)}
-        if self.feedforward is not None:
-            begun["feedforward.filter"] = u["reference"]
-        for part in self.compensators:
-            known = ControllerSnapshot(0.0, u["reference"], measured, command, self.pid.sample_time, {}, y)
-            own = zip(part.states(self.sensed_signal, unit), part.start(self.sensed_signal, known), strict=True)
-            begun |= {f"{part.section}.{q.name}": v for q, v in own}
-        return begun
-
-    def rest_states(
-        self, parameters: ParameterSet, y: Mapping[str, float], reference: float, command: float
-    ) -> list[float]:
-        """The states with which it goes on from a command and the plant's outputs at rest, or in steady motion."""
-        value: Mapping[str, Any] = self.values(parameters)
-        sensor = (
-            self.sensor.start(y, self.sensed_signal, without_prefix(value, "sensor")) if self.sensor else list[float]()
-        )
-        seen = sensor[0] if sensor else y[self.pid_signal.name]
-        value = self.schedule_gains(value, seen, {}, y)
-        wanted = float(self.inner_inputs({"reference": reference}, y[self.feedback.name], value)["reference"])
-        p = np.array([float(v) for v in value.values()])
-        v = float(self.uncompensated_command(p, wanted, seen, command, [y[n] for n in self.readings])[0])
-        return [*sensor, *map(float, self.start({"reference": wanted}, seen, y, v, value).values())]
-
-    def inner_inputs(self, u: Mapping[str, Any], position: Any, p: Mapping[str, Any]) -> dict[str, Any]:
-        """The inputs as PID and compensators see them: a cascade's reference is a speed, and `ERROR` a position's.
-
-        Parameters
-        ----------
-        u, p : mapping of str to float or casadi.SX
-            The loop's inputs and parameters.
-        position : float or casadi.SX
-            What the loop is judged by, as the controller sees it.
-        """
-        if self.outer is None:
-            return dict(u)
-        own = without_prefix(p, self.outer.section)
-        speed = self.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, own)
-        return {**u, "reference": speed, ERROR: u["reference"] - position}
-
-    def schedule_gains(
-        self, p: Mapping[str, Any], measured: Any, seen: Mapping[str, Any], y: Mapping[str, Any]
-    ) -> Mapping[str, Any]:
-        """The loop's parameters with the gains of this instant; as they are without a schedule.
-
-        Parameters
-        ----------
-        p : mapping of str to float or casadi.SX
-            The loop's parameters.
-        measured : float or casadi.SX
-            What the PID sees.
-        seen, y : mapping of str to float or casadi.SX
-            The sensor's states after reading, and the plant's outputs, one of which has the position.
-        """
-        if self.schedule is None:
-            return p
-        if self.schedule.position == self.pid_signal.name:
-            return self.schedule.set_gains(p, measured)
-        return self.schedule.set_gains(p, seen["count"] if "count" in seen else y[self.schedule.position])
-
     @cached_property
     def compensation(self) -> ca.Function:
-        """The compensators that act always, under constant signals and a reference at rest, of the PID's command.
+        """``(command, reference, measured, readings, p) -> [compensated, slope, feedback]`` of what acts always.
 
-        ``(command, reference, measured, readings, p) -> [compensated, slope, feedback]``: the command that they make
-        of the PID's, and its derivatives to the PID's command and to the measured signal.
+        Under constant signals and a reference at rest; the slopes are to the PID's command and to the measured signal.
         """
         v, r, y = (ca.SX.sym(n) for n in ("command", "reference", "measured"))
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
@@ -530,22 +538,9 @@ class Controller:
     def uncompensated_command(
         self, p: Array, reference: Any, measured: Any, command: ArrayLike, readings: ArrayLike = ()
     ) -> Array:
-        """The PID's command of which the compensators that act always make another one.
+        """The PID's command, shape (m,), of which the compensators that act always make another one, shape (m,).
 
-        Parameters
-        ----------
-        p : ndarray, shape (n_parameters,) or (n_parameters, m)
-            In the order of `Controller.parameters`.
-        reference, measured : float or array_like, shape (m,)
-            The signals at that instant.
-        command : float or array_like, shape (m,)
-            What the compensators make, which grows with the PID's command.
-        readings : array_like, shape (n_readings,) or (n_readings, m)
-            The outputs `Controller.readings`.
-
-        Returns
-        -------
-        ndarray, shape (m,)
+        Parameters p have shape (n_parameters,) or (n_parameters, m) in the controller's order, readings likewise.
         """
         wanted = np.atleast_1d(np.asarray(command, dtype=float))
         if not self.acting_always:
@@ -554,21 +549,10 @@ class Controller:
         return invert_increasing(lambda v: self._evaluate_compensation(p, reference, measured, v, shown)[0], wanted)
 
     def compensation_slopes(self, p: Array, measured: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
-        """Slopes of the compensators that act always, at a steady operating point without dither.
+        """Derivatives of the compensated command to the PID's command and to the measured signal, shape (m,) each.
 
-        Parameters
-        ----------
-        p : ndarray, shape (n_parameters,) or (n_parameters, m)
-            In the order of `Controller.parameters`.
-        measured : float or array_like, shape (m,)
-            The measured signal, which the reference equals there.
-        command : float or array_like, shape (m,)
-            What the actuator gets, the dither's offset included.
-
-        Returns
-        -------
-        slope, feedback : ndarray, shape (m,)
-            Derivatives of what they make to the PID's command and to the measured signal.
+        At a steady operating point without dither: the reference equals the measured signal, shape (m,), and the
+        command, shape (m,), is what the actuator gets, the dither's offset included.
         """
         order = list(self.parameters)
         offset = p[order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0
@@ -585,109 +569,6 @@ class Controller:
         rows.append(np.broadcast_to(shown[:, None] if shown.ndim == 1 else shown, (len(self.readings), len(v))))
         given = p if np.ndim(p) > 1 else np.repeat(np.reshape(p, (-1, 1)), len(v), axis=1)
         return [np.asarray(found, dtype=float).ravel() for found in self.compensation(*rows, given)]
-
-    def _added_command(
-        self, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
-    ) -> tuple[Signals, ca.SX]:
-        """The rates or next values of the parts' states, and what feedforward, compensators and dither add."""
-        moved, terms = self._added_terms(t, x, u, measured, y, p)
-        return moved, terms["dither"] + (terms["feedforward"] + terms["compensation"])
-
-    def _added_terms(
-        self, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
-    ) -> tuple[Signals, Signals]:
-        """The terms of `_added_command`, "feedforward", "compensation" and "dither", in place of their sum."""
-        moved, lead = self._feedforward_terms(x, u, p)
-        bent = ca.SX(0)
-        if self.compensators:
-            v = self.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
-            rates = {n: u[n] for n in (REFERENCE_SPEED, REFERENCE_ACCELERATION) if n in u}
-            error = u.get(ERROR, u["reference"] - measured)
-            h, elapsed = self.pid.sample_time, self._elapsed_time(x)
-            seen = ControllerSnapshot(t, u["reference"], measured, v + lead, h, rates, y, error, elapsed)
-            own, bent = compensate(self.compensators, seen, x, p)
-            moved = moved | own
-        return moved, {"feedforward": lead, "compensation": bent, "dither": self._dither_command(t, p)}
-
-    def _dither_command(self, t: ca.SX, p: Symbols) -> ca.SX:
-        """What the controller itself adds."""
-        if self.dither is None:
-            return ca.SX(0)
-        own = without_prefix(p, "dither")
-        sampled_apart = self.dither.analogue and self.pid.sample_time is not None
-        return own["offset"] if sampled_apart else own["offset"] + self.dither.wave(t, own)
-
-    def _feedforward_terms(self, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
-        """The feedforward's state, its rate or with a sampled PID its next value, and what it adds to the command."""
-        if self.feedforward is None:
-            return {}, ca.SX(0)
-        own = (without_prefix(x, "feedforward"), u["reference"], without_prefix(p, "feedforward"))
-        elapsed = self._elapsed_time(x)
-        moved, added = self.feedforward.rates(*own) if elapsed is None else self.feedforward.update(*own, elapsed)
-        return with_prefix(moved, "feedforward"), added
-
-    def _elapsed_time(self, x: Symbols) -> ca.SX | float | None:
-        """The time since the last good sample [s]; None of a continuous PID."""
-        return None if self.pid.sample_time is None else self.pid.elapsed_time(without_prefix(x, "pid"))
-
-    def _read_names(self, u: Symbols) -> tuple[set[str], set[str], set[str]]:
-        """Which states, inputs and outputs of the plant are signals that the controller reads."""
-        inputs = {"reference", REFERENCE_SPEED, REFERENCE_ACCELERATION} & set(u)
-        if isinstance(self.sensor, SensorLag):
-            return {"sensor.reading"}, inputs, set(self.readings)
-        return set(), inputs, {*self.readings, self.sensor.position if self.sensor else self.pid_signal.name}
-
-    def _signals_are_good(self, x: Symbols, u: Symbols, y: Symbols) -> ca.SX:
-        read = zip((x, u, y), self._read_names(u), strict=True)
-        return signals_are_good([v for of, own in read for n, v in of.items() if n in own])
-
-    def _good_signals(self, good: ca.SX, x: Symbols, u: Symbols, y: Symbols) -> tuple[Signals, Signals, Signals]:
-        """States, inputs and outputs with a number in place of a bad sample's signals: no operation sees what is none.
-
-        The number is any but 0, with which CasADi would put products of the signals into the choice.
-        """
-        states, inputs, outputs = self._read_names(u)
-
-        def read(of: Symbols, own: set[str]) -> Signals:
-            return {n: ca.if_else(good, v, 1) if n in own else v for n, v in of.items()}
-
-        return read(x, states), read(u, inputs), read(y, outputs)
-
-    def _sampled_law(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> ControllerUpdate:
-        """The states after a good sample."""
-        anew = x[_COUNT] >= p["pid.fault_samples"]
-        x, seen = self._read_sensor(anew, x, y, p)
-        measured = seen["reading"] if seen else y[self.pid_signal.name]
-        p = dict(self.schedule_gains(p, measured, seen, y))
-        position = measured if self.outer is None else seen["count"] if "count" in seen else y[self.feedback.name]
-        inner = self.inner_inputs(u, position, p)
-        begun = self.start(inner, measured, y, self.pid.sent(without_prefix(x, "pid")), p)
-        kept = ("pid.command", "pid.pending", _COUNT)  # what was sent stays; the count matters at bad samples alone
-        x = {**x, **_choose(anew, {n: v for n, v in begun.items() if n not in kept}, x)}
-        if self.pid.reset:
-            error = u["reference"] - position
-            moved = reset_integral(without_prefix(x, "pid"), error, without_prefix(p, "pid"))
-            x = {**x, **with_prefix(moved, "pid")}
-        moved, added = self._added_command(t, x, inner, measured, y, p)
-        arguments = without_prefix(x, "pid"), inner["reference"], measured
-        own = without_prefix(p, "pid")
-        read = {} if isinstance(self.sensor, SensorLag) else with_prefix(seen, "sensor")
-        after = read | with_prefix(self.pid.update(*arguments, added, own), "pid") | moved
-        terms = self.pid.terms(*arguments, own) | self._added_terms(t, x, inner, measured, y, p)[1]
-        gains = zip(Form.PARALLEL.gains, parallel_gains(self.pid.form, own), strict=True)
-        terms |= {f"{n}_parallel": value for n, value in gains}
-        sum_before_clip = self.pid.output(*arguments, own) + added
-        return ControllerUpdate(after, {"error": inner["reference"] - measured, **terms, "unlimited": sum_before_clip})
-
-    def _read_sensor(self, anew: ca.SX, x: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        """The loop's states, those of an encoder at rest where it begins anew; and the sensor's after the sample."""
-        if self.sensor is None:
-            return {**x}, {}
-        on, own = self.sensed_signal, without_prefix(p, "sensor")
-        if isinstance(self.sensor, Encoder):
-            x = {**x, **_choose(anew, with_prefix(self.sensor.rest(y, on, own), "sensor"), x)}
-        elapsed = self.pid.elapsed_time(without_prefix(x, "pid"))
-        return {**x}, self.sensor.update(without_prefix(x, "sensor"), y, on, own, elapsed)
 
 
 def signals_are_good(values: list[Any]) -> ca.SX:

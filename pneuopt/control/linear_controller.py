@@ -15,23 +15,11 @@ from pneuopt.quantities.parameters import ParameterSet
 
 
 def linear_gains(loop: ClosedLoop, p: Any, measured: ArrayLike = 0.0, command: ArrayLike = 0.0) -> Any:
-    """Kp, Ki, Kd, Tf of the controller's continuous equivalent, shape (4, m).
+    """Kp, Ki, Kd, Tf of the controller's continuous equivalent, shape (4, m), of loop parameters p (n_parameters, m).
 
     Backward Euler puts ``(1 - e^(-s h))/h``, nearly ``s/(1 + s h/2)``, for s: a sampled controller is the continuous
-    one with ``Kp + Ki h/2`` and ``Tf + h/2``. Compensators that act always multiply the gains by their slope, and what
-    they feed back of the measured signal is taken from Kp.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    p : array or casadi.SX, shape (n_parameters, m)
-        In the order of ``loop.parameters``; numbers where compensators act always.
-    measured, command : float or array_like, shape (m,)
-        The measured signal and the command at the operating point, which only such compensators feel.
-
-    Returns
-    -------
-    casadi.DM or casadi.SX, shape (4, m)
+    one with ``Kp + Ki h/2`` and ``Tf + h/2``. Compensators that act always multiply the gains by their slope at the
+    measured signal and command, shape (m,), and what they feed back of the measured signal is taken from Kp.
     """
     gains, half = loop.gains(p), 0.5 * (loop.pid.sample_time or 0.0)
     found = ca.vertcat(gains[0, :] + half * gains[1, :], gains[1:3, :], gains[3, :] + half)
@@ -70,20 +58,7 @@ def pade_delay_response(omega: ArrayLike, dead_time: float) -> NDArray[np.comple
 
 
 def controller_matrices(gains: Any, dead_time: float) -> tuple[Array, Array, Array, Array]:
-    """A, B, C and D of m PIDs from the control error to the command, with the loop's dead time in Padé form.
-
-    Parameters
-    ----------
-    gains : array_like, shape (4, m)
-        Kp, Ki, Kd, Tf > 0 of each, as `linear_gains` has them.
-    dead_time : float
-        [s]
-
-    Returns
-    -------
-    tuple of ndarray, shapes (m, k, k), (m, k, 1), (m, 1, k), (m, 1, 1)
-        With k = 2 states, integral and filter, or 4 with a dead time.
-    """
+    """A, B, C, D of m PIDs, gains (4, m), from the control error to the command, with a dead time [s] in Padé form."""
     Kp, Ki, Kd, Tf = np.reshape(gains, (4, -1, 1))
     zero, one, rate = np.zeros_like(Tf), np.ones_like(Tf), 1 / Tf
     A = np.stack([np.hstack([zero, zero]), np.hstack([zero, -rate])], axis=1)
@@ -101,22 +76,7 @@ def controller_matrices(gains: Any, dead_time: float) -> tuple[Array, Array, Arr
 def controller_response(
     loop: ClosedLoop, p: Array, omega: ArrayLike, measured: ArrayLike = 0.0, command: ArrayLike = 0.0
 ) -> NDArray[np.complex128]:
-    """Response from the measured output, through sensor and controller, to the command, its sign left out.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    p : ndarray, shape (m, n_parameters)
-        In the order of ``loop.parameters``.
-    omega : float or array_like, shape (m,)
-        [rad/s]
-    measured, command : float or array_like, shape (m,)
-        As for `linear_gains`.
-
-    Returns
-    -------
-    ndarray of complex, shape (m,)
-    """
+    """Response (m,) from the measured output to the command, its sign left out, at frequencies omega (m,) [rad/s]."""
     s = 1j * np.broadcast_to(np.asarray(omega, dtype=float), len(p))
     Kp, Ki, Kd, Tf = linear_gains(loop, p.T, measured, command).full()
     controller = Kp + Ki / s + Kd * s / (1 + Tf * s)

@@ -32,256 +32,6 @@ Matrices = tuple[Array, Array, Array, Array]
 """A, B, C, D of m systems with one input and one output, shapes (m, n, n), (m, n, 1), (m, 1, n), (m, 1, 1)."""
 
 
-class OpenLoops(NamedTuple):
-    """m loops cut at their commands.
-
-    Attributes
-    ----------
-    loop : tuple of ndarray
-        Under negative feedback, as `Matrices`; the plant's states come first.
-    noise : tuple of ndarray
-        The controllers from noise on what the PID sees, in a cascade on the position, to the command, without plant.
-    """
-
-    loop: Matrices
-    noise: Matrices
-
-
-@dataclass(frozen=True, eq=False)
-class ComposedLoops:
-    """Function that linearises many loops of one kind.
-
-    Under dither the plant is the mean over its ripple, as in `AveragedPlant`, with a controller that does not react to
-    the ripple.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    compiled : bool
-        Whether machine code is made of the plant's Jacobian, which pays for many plants.
-    """
-
-    loop: ClosedLoop
-    compiled: bool = False
-
-    def __call__(self, p: Array, x: Array, u: Array) -> OpenLoops:
-        """Linearise.
-
-        Parameters
-        ----------
-        p : ndarray, shape (m, n_parameters)
-            In the order of ``loop.parameters``.
-        x : ndarray, shape (m, n_plant_states)
-        u : ndarray, shape (m, n_plant_inputs)
-            The operating points, the command among the inputs.
-        """
-        plant, shown = self._plants(p, x, u)
-        law = self._laws(
-            self._frozen(p.T, shown.T).full().T,
-            shown,
-            u[:, names(self.loop.plant.inputs).index(self.loop.command.name)],
-        )
-        h, direct = self.loop.pid.sample_time, np.zeros((*plant[2].shape[:2], 1))
-        if h is None:
-            return OpenLoops(_join((*plant, direct), law.feedback), law.noise)
-        held = _bilinear((*_hold(*plant[:2], h), plant[2], direct), h)
-        joined = _join(held, _bilinear(law.feedback, h))
-        return OpenLoops(_delay(joined, h) if self.loop.pid.delay else joined, _bilinear(law.noise, h))
-
-    def _plants(self, p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array], Array]:
-        """A, B and C of the plants with a sensor's lag, in scaled states, and their outputs, shape (m, n_outputs)."""
-        loop, scale = self.loop, np.array([q.nominal for q in self.loop.plant.states])
-        A, B, _, _, _ = self._average(p, x, u)
-        A, B = A * scale / scale[:, None], (B / scale)[..., None]
-        own = p[:, [list(loop.parameters).index(n) for n in loop.plant.parameters]]
-        slopes, shown = self._outputs(x.T, u.T, own.T)
-        C = _split_columns(slopes.full(), len(x)) * scale
-        if isinstance(loop.sensor, SensorLag):
-            rate = 1 / np.reshape(loop.sensor_lag(p.T), (-1, 1, 1)) + np.zeros((len(x), 1, 1))
-            k, n = names(loop.plant.outputs).index(loop.pid_signal.name), A.shape[-1]
-            A = np.block([[A, np.zeros((len(x), n, 1))], [rate * C[:, k : k + 1], -rate]])
-            B = np.concatenate([B, np.zeros((len(x), 1, 1))], axis=1)
-            C = np.concatenate([C, np.zeros((*C.shape[:2], 1))], axis=2)
-            C[:, k] = np.eye(1, n + 1, n)
-        return (A, B, C), shown.full().T
-
-    @cached_property
-    def _frozen(self) -> ca.Function:
-        """``(p, y) -> p`` with the gains that a schedule has at the plant's outputs."""
-        loop = self.loop
-        y, p = ({n: ca.SX.sym(n) for n in own} for own in (names(loop.plant.outputs), loop.parameters))
-        frozen = loop.controller.schedule_gains(p, y[loop.pid_signal.name], {}, y)
-        return ca.Function("frozen", [stack(p), stack(y)], [stack(frozen)])
-
-    @cached_property
-    def _average(self) -> AveragedPlant:
-        return AveragedPlant(self.loop, self.compiled)
-
-    @cached_property
-    def _outputs(self) -> ca.Function:
-        """``(x, u, p) -> slopes to the states, outputs`` of the plant."""
-        x, u, p = (ca.SX.sym(s, self.loop.plant.ode.size1_in(i)) for i, s in enumerate("xup", 1))
-        y = self.loop.plant.ode(0, x, u, p)[1]
-        return ca.Function("outputs", [x, u, p], [ca.densify(ca.jacobian(y, x)), y])
-
-    def _laws(self, p: Array, shown: Array, command: Array) -> "_Laws":
-        """The controllers at outputs of shape (m, n_outputs) and commands of shape (m,)."""
-        loop, order = self.loop, list(self.loop.parameters)
-        bare = command - (p[:, order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0)
-        y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
-        seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])
-        v = loop.controller.uncompensated_command(loop.controller_part(p.T), seen, seen, bare, read)
-        return _Laws(*(_split_columns(M.full(), len(p)) for M in self._law(shown.T, v[None], p.T)))
-
-    @cached_property
-    def _law(self) -> ca.Function:
-        """``(y, v, p) -> A, B, C, D`` of the controller, from the plant's outputs and then the noise to the command.
-
-        v is the PID's command at the operating point.
-        """
-        law = _linear_law(self.loop.controller)
-        y, p = ({n: ca.SX.sym(n) for n in own} for own in (law.signals.outputs, self.loop.parameters))
-        v, noise, r = ca.SX.sym("v"), ca.SX.sym("noise"), ca.SX.sym("reference")
-        apart = (*_COMMANDS, "sensor.reading") if isinstance(law.sensor, SensorLag) else _COMMANDS
-        x: Signals = {n: ca.SX.sym(n) for n in names(law.states) if n not in apart}
-        moved, w = _controller(law, x, r, y, noise, p)
-        at = _resting_states(law, x, y, v, p)
-        z = ca.vertcat(stack(x), stack(y), noise)
-        J = ca.jacobian(ca.vertcat(stack({n: moved[n] for n in x}), w), z)
-        point = ca.vertcat(stack({n: at[n] for n in x}), 0, y[law.feedback.name])
-        J = ca.substitute(J, ca.vertcat(stack(x), noise, r), point)
-        n = len(x)
-        blocks = (J[:n, :n], J[:n, n:], J[n, :n], J[n, n:])
-        return ca.Function("law", [stack(y), v, stack(p)], [ca.densify(block) for block in blocks])
-
-
-# States that hold the command, as the hold and the delay have their own, and those that nothing moves in normal work.
-_COMMANDS = ("pid.command", "pid.pending", "pid.transfer", "pid.bad_samples")
-
-
-class _Laws(NamedTuple):
-    """Controllers from the plant's outputs and the noise to the command, shapes (m, rows, columns)."""
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-
-    @property
-    def feedback(self) -> Matrices:
-        """From the plant's outputs, the sign turned."""
-        return self.A, self.B[..., :-1], -self.C, -self.D[..., :-1]
-
-    @property
-    def noise(self) -> Matrices:
-        """From the noise alone."""
-        return self.A, self.B[..., -1:], self.C, self.D[..., -1:]
-
-
-def _split_columns(joined: Array, m: int) -> Array:
-    """Matrices of shape (m, rows, columns) from those that a Function of m points has joined side by side."""
-    return joined.reshape(len(joined), m, joined.shape[1] // m).transpose(1, 0, 2)
-
-
-def _linear_law(controller: Controller) -> Controller:
-    """A controller without what its linearisation leaves out: limits, dead band, resets, counts, dither, pulses."""
-    sensor = controller.sensor
-    sensor = replace(sensor, resolution=0.0) if isinstance(sensor, Encoder) else sensor
-    pid, acting = replace(controller.pid, limits=False, dead_band=False, reset=False), controller.acting_always
-    return replace(controller, pid=pid, sensor=sensor, dither=None, compensators=acting, schedule=None)
-
-
-def _controller(law: Controller, x: Signals, r: ca.SX, y: Signals, noise: ca.SX, p: Signals) -> tuple[Signals, ca.SX]:
-    """Rates or next values of a controller's states, and its command before the clip, under a reference at rest."""
-    own = without_prefix(x, "sensor")
-    noisy = law.feedback.name
-    y = {**y, noisy: y[noisy] + noise} if law.outer else y
-    seen = (
-        law.sensor.update(own, y, law.sensed_signal, without_prefix(p, "sensor"), law.pid.sample_time or 0.0)
-        if isinstance(law.sensor, Encoder)
-        else {}
-    )
-    measured = seen.get("reading", y[law.pid_signal.name]) + (0 if law.outer else noise)
-    bare, u = replace(law, sensor=None), dict.fromkeys(names(law.inputs), ca.SX(0))
-    u["reference"] = r
-    shown = {**y, law.pid_signal.name: measured}
-    if law.pid.sample_time is None:
-        return bare.rates(ca.SX(0), x, u, shown, p)
-    held = {n: ca.SX(0) for n in _COMMANDS}
-    found = bare.update(ca.SX(0), x | held, u, shown, p)
-    return with_prefix(seen, "sensor") | found.states, found.terms["unlimited"]
-
-
-def _resting_states(law: Controller, x: Signals, y: Signals, v: ca.SX, p: Signals) -> Signals:
-    """The states under constant signals, with the integral that makes the PID's command v."""
-    h, measured = law.pid.sample_time or 0.0, y[law.pid_signal.name]
-    at: Signals = {n: ca.SX(0) for n in x}
-    if isinstance(law.sensor, Encoder):
-        at["sensor.reading"], position = measured, y[law.sensor.position]
-        at["sensor.count"] = position - h * measured
-    seen = ControllerSnapshot(ca.SX(0), measured, measured, v, law.pid.sample_time, {}, y)
-    for part in law.compensators:
-        named = (f"{part.section}.{q.name}" for q in part.states(law.sensed_signal, law.command))
-        at |= dict(zip(named, map(ca.SX, part.start(law.sensed_signal, seen)), strict=True))
-    given: Mapping[str, ca.SX] = {**at, "pid.integral": ca.SX(0), **{n: ca.SX(0) for n in _COMMANDS}}
-    own, position = without_prefix(given, "pid"), y[law.feedback.name]
-    wanted = law.inner_inputs({"reference": position}, position, p)["reference"]
-    at["pid.integral"] = v - law.pid.output(own, wanted, measured, without_prefix(p, "pid"))
-    return at
-
-
-def _join(plant: Matrices, controller: Matrices) -> Matrices:
-    """The open loop from the command to what the controller makes of the outputs.
-
-    Joined in continuous form, the matrix keeps its zeros, and a double integral its two poles at zero.
-    """
-    (A, B, C, D), (Ac, Bc, Cc, Dc) = plant, controller
-    joined = np.block([[A, np.zeros((len(A), A.shape[-1], Ac.shape[-1]))], [Bc @ C, Ac]])
-    return joined, np.concatenate([B, Bc @ D], axis=1), np.concatenate([Dc @ C, Cc], axis=2), Dc @ D
-
-
-def _delay(system: Matrices, h: float) -> Matrices:
-    """Systems with a delay of a sample behind them: ``1/z = (1 - s h/2)/(1 + s h/2)``."""
-    one = np.ones((len(system[0]), 1, 1))
-    return _join(system, (-2 / h * one, 2 / np.sqrt(h) * one, 2 / np.sqrt(h) * one, -one))
-
-
-def _hold(A: Array, B: Array, h: float) -> tuple[Array, Array]:
-    """Matrices of plants from sample to sample on a held command."""
-    m, n = A.shape[:2]
-    both = np.concatenate([np.concatenate([A, B], axis=2), np.zeros((m, 1, n + 1))], axis=1)
-    sound = np.isfinite(both).all(axis=(1, 2))
-    moved = np.full_like(both, np.nan)
-    moved[sound] = _exponentials(both[sound] * h)
-    return moved[:, :n, :n], moved[:, :n, n:]
-
-
-def _exponentials(A: Array) -> Array:
-    """Exponentials of small matrices, shape (m, n, n): Taylor's series of A/2^k, squared k times.
-
-    C. Moler & C. Van Loan, Nineteen dubious ways to compute the exponential of a matrix, twenty-five years later, SIAM
-    Rev. 45 (2003) 3-49, methods 1 and 3. SciPy's own takes 20 ms a matrix where BLAS has threads that wait for a CPU.
-    """
-    largest = float(np.abs(A).sum(axis=-1).max(initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(max(largest, 1e-300) / LARGEST_TAYLOR_NORM))))
-    scaled, one = A / 2.0**squarings, np.eye(A.shape[-1])
-    found = np.broadcast_to(one, A.shape)
-    for k in range(TAYLOR_TERMS, 0, -1):
-        found = one + scaled @ found / k
-    for _ in range(squarings):
-        found = found @ found
-    return np.asarray(found)
-
-
-def _bilinear(system: Matrices, h: float) -> Matrices:
-    """Discrete systems in continuous form, ``z = (1 + s h/2)/(1 - s h/2)``, of any number of inputs and outputs."""
-    A, B, C, D = system
-    one = np.eye(A.shape[-1])
-    M = np.linalg.inv(A + one)
-    root = 2 / np.sqrt(h)
-    return 2 / h * M @ (A - one), root * M @ B, root * C @ M, D - C @ M @ B
-
-
 def linear_plant(
     loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
 ) -> Linearisation:
@@ -357,11 +107,7 @@ def open_loop(
 def noise_path(
     loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
 ) -> Linearisation:
-    """The controller of a loop with further feedback, from noise on what the PID sees to the command.
-
-    In a cascade the noise is the position's, which an `Encoder` differentiates, too.
-    Parameters as for `linear_plant`; frequencies as in `open_loop`.
-    """
+    """The controller of a loop with further feedback, from noise on what the PID or outer loop sees to the command."""
     return _composed_loops(loop, parameters, *operating_point(loop, parameters, x, u))[1]
 
 
@@ -381,6 +127,105 @@ def _composed_loops(
     return opened, Linearisation(A, B, C, D, states, ("noise",), (loop.command.name,))
 
 
+class OpenLoops(NamedTuple):
+    """m loops cut at their commands."""
+
+    loop: Matrices  # under negative feedback; the plant's states come first
+    # the controllers alone, from noise on what the PID sees, in a cascade on the position, to the command
+    noise: Matrices
+
+
+@dataclass(frozen=True, eq=False)
+class ComposedLoops:
+    """Function that linearises many loops of one kind; machine code of the plant's Jacobian pays for many plants.
+
+    Under dither the plant is the mean over its ripple, as in `AveragedPlant`, with a controller that does not react to
+    the ripple.
+    """
+
+    loop: ClosedLoop
+    compiled: bool = False
+
+    def __call__(self, p: Array, x: Array, u: Array) -> OpenLoops:
+        """Linearise m loops: parameters p, and the operating points' plant states x and inputs u, (m, ...) each."""
+        loop, order = self.loop, list(self.loop.parameters)
+        plant, shown = self._plants(p, x, u)
+        p = self._frozen(p.T, shown.T).full().T
+        offset = p[:, order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0
+        command = u[:, names(loop.plant.inputs).index(loop.command.name)] - offset
+        y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
+        seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])
+        v = loop.controller.uncompensated_command(loop.controller_part(p.T), seen, seen, command, read)
+        law = _Laws(*(_split_columns(M.full(), len(p)) for M in self._law(shown.T, v[None], p.T)))
+        h, direct = loop.pid.sample_time, np.zeros((*plant[2].shape[:2], 1))
+        if h is None:
+            return OpenLoops(_join((*plant, direct), law.feedback), law.noise)
+        held = _bilinear((*_hold(*plant[:2], h), plant[2], direct), h)
+        joined = _join(held, _bilinear(law.feedback, h))
+        if loop.pid.delay:  # a sample behind it, 1/z = (1 - s h/2)/(1 + s h/2)
+            one = np.ones((len(p), 1, 1))
+            joined = _join(joined, (-2 / h * one, 2 / np.sqrt(h) * one, 2 / np.sqrt(h) * one, -one))
+        return OpenLoops(joined, _bilinear(law.noise, h))
+
+    def _plants(self, p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        """A, B and C of the plants with a sensor's lag, in scaled states, and their outputs, shape (m, n_outputs)."""
+        loop, scale = self.loop, np.array([q.nominal for q in self.loop.plant.states])
+        A, B, _, _, _ = self._average(p, x, u)
+        A, B = A * scale / scale[:, None], (B / scale)[..., None]
+        own = p[:, [list(loop.parameters).index(n) for n in loop.plant.parameters]]
+        slopes, shown = self._outputs(x.T, u.T, own.T)
+        C = _split_columns(slopes.full(), len(x)) * scale
+        if isinstance(loop.sensor, SensorLag):
+            rate = 1 / np.reshape(loop.sensor_lag(p.T), (-1, 1, 1)) + np.zeros((len(x), 1, 1))
+            k, n = names(loop.plant.outputs).index(loop.pid_signal.name), A.shape[-1]
+            A = np.block([[A, np.zeros((len(x), n, 1))], [rate * C[:, k : k + 1], -rate]])
+            B = np.concatenate([B, np.zeros((len(x), 1, 1))], axis=1)
+            C = np.concatenate([C, np.zeros((*C.shape[:2], 1))], axis=2)
+            C[:, k] = np.eye(1, n + 1, n)
+        return (A, B, C), shown.full().T
+
+    @cached_property
+    def _frozen(self) -> ca.Function:
+        """``(p, y) -> p`` with the gains that a schedule has at the plant's outputs."""
+        loop = self.loop
+        y, p = ({n: ca.SX.sym(n) for n in own} for own in (names(loop.plant.outputs), loop.parameters))
+        frozen = loop.controller.schedule_gains(p, y[loop.pid_signal.name], {}, y)
+        return ca.Function("frozen", [stack(p), stack(y)], [stack(frozen)])
+
+    @cached_property
+    def _average(self) -> AveragedPlant:
+        return AveragedPlant(self.loop, self.compiled)
+
+    @cached_property
+    def _outputs(self) -> ca.Function:
+        """``(x, u, p) -> slopes to the states, outputs`` of the plant."""
+        x, u, p = (ca.SX.sym(s, self.loop.plant.ode.size1_in(i)) for i, s in enumerate("xup", 1))
+        y = self.loop.plant.ode(0, x, u, p)[1]
+        return ca.Function("outputs", [x, u, p], [ca.densify(ca.jacobian(y, x)), y])
+
+    @cached_property
+    def _law(self) -> ca.Function:
+        """``(y, v, p) -> A, B, C, D`` of the controller, from outputs and noise to the command; v is the PID's own."""
+        # without what a linearisation leaves out: limits, dead band, resets, counts, dither, pulses
+        whole, sensor = self.loop.controller, self.loop.sensor
+        sensor = replace(sensor, resolution=0.0) if isinstance(sensor, Encoder) else sensor
+        pid, acting = replace(whole.pid, limits=False, dead_band=False, reset=False), whole.acting_always
+        law = replace(whole, pid=pid, sensor=sensor, dither=None, compensators=acting, schedule=None)
+        y, p = ({n: ca.SX.sym(n) for n in own} for own in (law.signals.outputs, self.loop.parameters))
+        v, noise, r = ca.SX.sym("v"), ca.SX.sym("noise"), ca.SX.sym("reference")
+        apart = (*_COMMANDS, "sensor.reading") if isinstance(law.sensor, SensorLag) else _COMMANDS
+        x: Signals = {n: ca.SX.sym(n) for n in names(law.states) if n not in apart}
+        moved, w = _unlimited_law(law, x, r, y, noise, p)
+        at = _resting_states(law, x, y, v, p)
+        z = ca.vertcat(stack(x), stack(y), noise)
+        J = ca.jacobian(ca.vertcat(stack({n: moved[n] for n in x}), w), z)
+        point = ca.vertcat(stack({n: at[n] for n in x}), 0, y[law.feedback.name])
+        J = ca.substitute(J, ca.vertcat(stack(x), noise, r), point)
+        n = len(x)
+        blocks = (J[:n, :n], J[:n, n:], J[n, :n], J[n, n:])
+        return ca.Function("law", [stack(y), v, stack(p)], [ca.densify(block) for block in blocks])
+
+
 @lru_cache(maxsize=8)
 def _composed_function(loop: ClosedLoop) -> ComposedLoops:
     """The function of a loop, kept likewise."""
@@ -391,3 +236,115 @@ def _composed_function(loop: ClosedLoop) -> ComposedLoops:
 def _averaged_plant(loop: ClosedLoop) -> AveragedPlant:
     """The function of a loop, kept for the cases and operating points of one evaluation."""
     return AveragedPlant(loop)
+
+
+# States that hold the command, as the hold and the delay have their own, and those that nothing moves in normal work.
+_COMMANDS = ("pid.command", "pid.pending", "pid.transfer", "pid.bad_samples")
+
+
+class _Laws(NamedTuple):
+    """Controllers from the plant's outputs and the noise to the command, shapes (m, rows, columns)."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+    @property
+    def feedback(self) -> Matrices:
+        """From the plant's outputs, the sign turned."""
+        return self.A, self.B[..., :-1], -self.C, -self.D[..., :-1]
+
+    @property
+    def noise(self) -> Matrices:
+        """From the noise alone."""
+        return self.A, self.B[..., -1:], self.C, self.D[..., -1:]
+
+
+def _split_columns(joined: Array, m: int) -> Array:
+    """Matrices of shape (m, rows, columns) from those that a Function of m points has joined side by side."""
+    return joined.reshape(len(joined), m, joined.shape[1] // m).transpose(1, 0, 2)
+
+
+def _unlimited_law(
+    law: Controller, x: Signals, r: ca.SX, y: Signals, noise: ca.SX, p: Signals
+) -> tuple[Signals, ca.SX]:
+    """Rates or next values of a controller's states, and its command before the limits, under a reference at rest."""
+    own = without_prefix(x, "sensor")
+    noisy = law.feedback.name
+    y = {**y, noisy: y[noisy] + noise} if law.outer else y
+    seen = (
+        law.sensor.update(own, y, law.sensed_signal, without_prefix(p, "sensor"), law.pid.sample_time or 0.0)
+        if isinstance(law.sensor, Encoder)
+        else {}
+    )
+    measured = seen.get("reading", y[law.pid_signal.name]) + (0 if law.outer else noise)
+    bare, u = replace(law, sensor=None), dict.fromkeys(names(law.inputs), ca.SX(0))
+    u["reference"] = r
+    shown = {**y, law.pid_signal.name: measured}
+    if law.pid.sample_time is None:
+        return bare.rates(ca.SX(0), x, u, shown, p)
+    held = {n: ca.SX(0) for n in _COMMANDS}
+    found = bare.update(ca.SX(0), x | held, u, shown, p)
+    return with_prefix(seen, "sensor") | found.states, found.terms["unlimited"]
+
+
+def _resting_states(law: Controller, x: Signals, y: Signals, v: ca.SX, p: Signals) -> Signals:
+    """The states under constant signals, with the integral that makes the PID's command v."""
+    h, measured = law.pid.sample_time or 0.0, y[law.pid_signal.name]
+    at: Signals = {n: ca.SX(0) for n in x}
+    if isinstance(law.sensor, Encoder):
+        at["sensor.reading"], position = measured, y[law.sensor.position]
+        at["sensor.count"] = position - h * measured
+    seen = ControllerSnapshot(ca.SX(0), measured, measured, v, law.pid.sample_time, {}, y)
+    for part in law.compensators:
+        named = (f"{part.section}.{q.name}" for q in part.states(law.sensed_signal, law.command))
+        at |= dict(zip(named, map(ca.SX, part.start(law.sensed_signal, seen)), strict=True))
+    given: Mapping[str, ca.SX] = {**at, "pid.integral": ca.SX(0), **{n: ca.SX(0) for n in _COMMANDS}}
+    own, position = without_prefix(given, "pid"), y[law.feedback.name]
+    wanted = law.inner_inputs({"reference": position}, position, p)["reference"]
+    at["pid.integral"] = v - law.pid.output(own, wanted, measured, without_prefix(p, "pid"))
+    return at
+
+
+def _join(plant: Matrices, controller: Matrices) -> Matrices:
+    """The open loop from command to fed-back signal; in continuous form a double integral keeps its poles at zero."""
+    (A, B, C, D), (Ac, Bc, Cc, Dc) = plant, controller
+    joined = np.block([[A, np.zeros((len(A), A.shape[-1], Ac.shape[-1]))], [Bc @ C, Ac]])
+    return joined, np.concatenate([B, Bc @ D], axis=1), np.concatenate([Dc @ C, Cc], axis=2), Dc @ D
+
+
+def _hold(A: Array, B: Array, h: float) -> tuple[Array, Array]:
+    """Matrices of plants from sample to sample on a held command."""
+    m, n = A.shape[:2]
+    both = np.concatenate([np.concatenate([A, B], axis=2), np.zeros((m, 1, n + 1))], axis=1)
+    sound = np.isfinite(both).all(axis=(1, 2))
+    moved = np.full_like(both, np.nan)
+    moved[sound] = _exponentials(both[sound] * h)
+    return moved[:, :n, :n], moved[:, :n, n:]
+
+
+def _exponentials(A: Array) -> Array:
+    """Exponentials of small matrices, shape (m, n, n): Taylor's series of A/2^k, squared k times.
+
+    C. Moler & C. Van Loan, Nineteen dubious ways to compute the exponential of a matrix, twenty-five years later, SIAM
+    Rev. 45 (2003) 3-49, methods 1 and 3. SciPy's own takes 20 ms a matrix where BLAS has threads that wait for a CPU.
+    """
+    largest = float(np.abs(A).sum(axis=-1).max(initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(max(largest, 1e-300) / LARGEST_TAYLOR_NORM))))
+    scaled, one = A / 2.0**squarings, np.eye(A.shape[-1])
+    found = np.broadcast_to(one, A.shape)
+    for k in range(TAYLOR_TERMS, 0, -1):
+        found = one + scaled @ found / k
+    for _ in range(squarings):
+        found = found @ found
+    return np.asarray(found)
+
+
+def _bilinear(system: Matrices, h: float) -> Matrices:
+    """Discrete systems in continuous form, ``z = (1 + s h/2)/(1 - s h/2)``, of any number of inputs and outputs."""
+    A, B, C, D = system
+    one = np.eye(A.shape[-1])
+    M = np.linalg.inv(A + one)
+    root = 2 / np.sqrt(h)
+    return 2 / h * M @ (A - one), root * M @ B, root * C @ M, D - C @ M @ B

@@ -1,8 +1,8 @@
-"""`ClosedLoop`: a plant and its controller, as a `System` or a `DiscreteSystem` for the solvers; where it rests.
+"""`ClosedLoop`: a plant and its controller as one `System` or `DiscreteSystem` for the solvers, and where it rests.
 
-Where the parts meet: the reference r and the measured output y, or what a sensor shows of it, enter the PID,
-feedforward, compensators and dither are added to its command, the sum is clipped, and the result, the output "control",
-drives the actuated input.
+The plant's outputs go to the controller, whose command, the loop's output "control", drives the plant's actuated input.
+`ClosedLoop.system` wires the two in continuous time; with a sampled controller `ClosedLoop.hold_system` is the plant on
+a held command, and `ClosedLoop.update` what happens at a sample. What the controller computes stands in `Controller`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.pid import PID, ParallelForm, integrates
 from pneuopt.control.reference import Reference, disturbance_input
-from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag, Signals
+from pneuopt.control.sensor import Encoder, SensorLag, Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.runnable import PlantField
 from pneuopt.dynamics.system import (
@@ -145,11 +145,6 @@ class ClosedLoop:
         return self.controller.pid_signal
 
     @property
-    def sensed_signal(self) -> SensedSignal:
-        """What the sensor reads."""
-        return self.controller.sensed_signal
-
-    @property
     def readings(self) -> tuple[str, ...]:
         """The plant's outputs that the controller reads beside what its PID controls, in the plant's order."""
         return self.controller.readings
@@ -158,11 +153,6 @@ class ClosedLoop:
     def motion_inputs(self) -> tuple[Quantity, ...]:
         """Of "reference_speed" and "reference_acceleration" those that a compensator uses."""
         return self.controller.motion_inputs
-
-    @property
-    def tunable_sections(self) -> tuple[str, ...]:
-        """Prefixes of the parameters that a tuning may change: the controller's, not the sensor's or the plant's."""
-        return self.controller.tunable_sections
 
     @property
     def is_composed(self) -> bool:
@@ -202,13 +192,18 @@ class ClosedLoop:
         ModelError
             If the PID is sampled: use `discrete`, or `hold_system` and `update`.
         """
-        h = self.pid.sample_time
-        require(
-            h is None,
-            f"a loop sampled every {h} s is no ODE; use discrete(), or hold_system() between samples",
-            ModelError,
-        )
-        return define(self.states, self.inputs, self.outputs, self.parameters, self._continuous_rates)
+        h, of = self.pid.sample_time, self.controller
+        sampled = f"a loop sampled every {h} s is no ODE; use discrete(), or hold_system() between samples"
+        require(h is None, sampled, ModelError)
+
+        def rates(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+            no_command = ca.SX(0)  # what the controller measures does not depend on its command
+            measured = self.evaluate_plant(t, x, u, p, no_command)[1]
+            controller_rates, command = of.rates(t, x, u, measured, p)
+            plant_rates, y = self.evaluate_plant(t, x, u, p, command)
+            return plant_rates | controller_rates | of.sensor_rates(x, y, p), y | {"control": command}
+
+        return define(self.states, self.inputs, self.outputs, self.parameters, rates)
 
     def hold_system(self) -> System:
         """Between two samples of a sampled PID: the plant runs on the held command, the controller's states rest.
@@ -216,7 +211,19 @@ class ClosedLoop:
         An analogue dither is in here, as a function of time; a sampled one is part of the held command.
         """
         require(self.pid.sample_time is not None, "a continuous loop holds nothing; use system()", ModelError)
-        return define(self.states, self.inputs, self.outputs, self.parameters, self._held_rates)
+        at_rest = tuple(f"{section}." for section in self.controller.tunable_sections)
+
+        def rates(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+            command = x["pid.command"]
+            if self.dither and self.dither.analogue:
+                wave = self.dither.wave(t, without_prefix(p, "dither"))
+                command = self.pid.clip(command + wave, without_prefix(p, "pid"))
+            plant_rates, y = self.evaluate_plant(t, x, u, p, command)
+            controller_rates = {n: ca.SX(0) for n in x if n.startswith(at_rest)}
+            sensor_rates = self.controller.sensor_rates(x, y, p)
+            return plant_rates | controller_rates | sensor_rates, y | {"control": command}
+
+        return define(self.states, self.inputs, self.outputs, self.parameters, rates)
 
     @cached_property
     def update(self) -> ca.Function:
@@ -224,27 +231,9 @@ class ClosedLoop:
         require(self.pid.sample_time is not None, "a continuous loop has no update; use system()", ModelError)
         t, x, u = ca.SX.sym("t"), symbols(self.states), symbols(self.inputs)
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        y = self.evaluate_plant(t, x, u, p, ca.SX(0))[1]
-        after = stack({**x, **self.controller.update(t, x, u, y, p).states})
+        measured = self.evaluate_plant(t, x, u, p, ca.SX(0))[1]
+        after = stack({**x, **self.controller.update(t, x, u, measured, p).states})
         return ca.Function("update", [t, *map(stack, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
-
-    def _continuous_rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        """Rates and outputs of a loop with a continuous PID."""
-        shown = self.evaluate_plant(t, x, u, p, ca.SX(0))[1]
-        own, command = self.controller.rates(t, x, u, shown, p)
-        xdot, y = self.evaluate_plant(t, x, u, p, command)
-        return xdot | own | self.controller.sensor_rates(x, y, p), y | {"control": command}
-
-    def _held_rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        """Rates and outputs of a loop with a sampled PID while its command is held."""
-        command = x["pid.command"]
-        if self.dither and self.dither.analogue:
-            wave = self.dither.wave(t, without_prefix(p, "dither"))
-            command = self.pid.clip(command + wave, without_prefix(p, "pid"))
-        xdot, y = self.evaluate_plant(t, x, u, p, command)
-        held = tuple(f"{n}." for n in self.tunable_sections)
-        own = {n: ca.SX(0) for n in x if n.startswith(held)} | self.controller.sensor_rates(x, y, p)
-        return xdot | own, y | {"control": command}
 
     def evaluate_plant(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
         """Rates and outputs of the plant under a command."""
@@ -317,10 +306,6 @@ class ClosedLoop:
         """The sensor's time constant in the loop linearised [s]; p of shape (n_parameters,) or (n_parameters, m)."""
         return self.controller.sensor_lag(dict(zip(self.parameters, p, strict=True)))
 
-    def sensor_resolution(self, parameters: ParameterSet) -> float:
-        """What one count of the sensor changes its reading by [feedback's unit]; 0 of a sensor without counts."""
-        return self.controller.sensor_resolution(parameters)
-
     def dither_period(self, parameters: ParameterSet) -> float | None:
         """The time over which averages and ripple are taken [s] (`Dither.period`); None without dither."""
         return self.controller.dither_period(parameters)
@@ -384,15 +369,7 @@ def check_closed_loop(loop: object) -> None:
 
 
 def add_disturbances(loop: ClosedLoop, references: Iterable[Reference]) -> ClosedLoop:
-    """Give the plant an input for each disturbance of the references, named by `disturbance_input`.
-
-    A parameter becomes its value plus that input, an input of the plant likewise; so 0 is the plant as it was.
-
-    Raises
-    ------
-    UnknownNameError
-        If a disturbance is neither a parameter nor an input of the plant.
-    """
+    """Give the plant an input for each disturbance of the references; it adds to that parameter or input."""
     wanted = dict.fromkeys(n for reference in references for n in reference.disturbance)
     new = [n for n in wanted if disturbance_input(n) not in names(loop.plant.inputs)]
     known = [*names(loop.plant.inputs), *loop.plant.parameters]
@@ -426,13 +403,7 @@ def _add_plant_disturbances(plant: System, wanted: list[str]) -> System:
 
 
 def select_signal(kind: str, name: str | None, known: Sequence[Quantity], usual: str | None) -> Quantity:
-    """The signal of that name, by default the usual one or the only one.
-
-    Raises
-    ------
-    ModelError
-        If there are several; `UnknownNameError` if there is none of that name.
-    """
+    """The signal of that name, by default the usual one or the only one."""
     by_name = {q.name: q for q in known}
     if name is None:
         name = usual if usual in by_name else next(iter(by_name)) if len(by_name) == 1 else None
@@ -458,27 +429,11 @@ def check_algebraic_loop(plant: System, command: str, output: str) -> None:
 def find_rest(
     loop: ClosedLoop, parameters: ParameterSet, reference: float, start: Mapping[str, float]
 ) -> tuple[Array, float]:
-    """The plant's state and the command, at rest or in steady motion.
+    """The plant's state and the command, at rest or in steady motion; `start` is what else is known of the plant.
 
     A plant with a `rest_hook` gives them. Otherwise they are the equilibrium of plant and controller; a state that
     neither the rates nor the measured output depend on, such as the position of an axis under speed control, is left
     out and may keep moving.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    parameters : ParameterSet
-    reference : float
-        [unit of the measured signal]
-    start : mapping of str to float
-        What else is known of the plant.
-
-    Raises
-    ------
-    ConvergenceError
-        If there is no equilibrium.
-    InputError
-        If the plant refuses, or does not start from what `start` names.
     """
     plant, measured = loop.plant, loop.feedback.name
     require(measured not in start, f"start: {measured!r} is what the loop controls; give it as initial=")
@@ -504,16 +459,7 @@ def find_rest(
 
 
 def set_sliding_direction(loop: ClosedLoop, parameters: ParameterSet, reference: float) -> ParameterSet:
-    """Set the direction in which Karnopp's friction already slides where the plant moves at the start.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    parameters : ParameterSet
-        Every parameter of the loop.
-    reference : float
-        The speed so far [m/s, or rad/s].
-    """
+    """Set the direction in which Karnopp's friction already slides where the reference is a speed [m/s, rad/s]."""
     if loop.feedback.name != "speed" or FRICTION_DIRECTION not in loop.parameters:
         return parameters
     return parameters.with_values({FRICTION_DIRECTION: float(np.sign(reference))})

@@ -13,7 +13,6 @@ from scipy.interpolate import PchipInterpolator
 
 from pneuopt.control.reference import Reference, describe_circumstances, disturbance_columns, reference_samples
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
-from pneuopt.control.tolerances import LABEL_DECIMALS, MAX_LABELLED_STOPS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -32,150 +31,6 @@ class PlannedMotion(Protocol):
 
     def motion(self, t: Array) -> tuple[Array, Array, Array]:
         """Position, speed and acceleration at instants [s], each of their shape; constant before and after."""
-
-
-@dataclass(frozen=True)
-class SCurve:
-    """Seven segments of constant jerk, symmetric in time; those that a short move has no room for take no time.
-
-    Parameters
-    ----------
-    distance : float
-        [measured unit], positive.
-    peak_speed : float
-        [measured unit/s]
-    acceleration_time : float
-        From rest to the peak speed [s].
-    jerk_time : float
-        From no acceleration to the largest [s]; 0 makes it a trapezoid of speed.
-    """
-
-    distance: float
-    peak_speed: float
-    acceleration_time: float
-    jerk_time: float
-
-    @property
-    def cruise_time(self) -> float:
-        """At the peak speed [s]."""
-        return max(0.0, self.distance / self.peak_speed - self.acceleration_time)
-
-    @property
-    def duration(self) -> float:
-        """From rest to rest [s]."""
-        return 2 * self.acceleration_time + self.cruise_time
-
-    def motion(self, t: Array) -> tuple[Array, Array, Array]:
-        """See `PlannedMotion`; the second half is the first, mirrored, so that the end is met exactly."""
-        T = self.duration
-        late = t > T / 2
-        s, v, a = self._speeding_up(np.clip(np.where(late, T - t, t), 0.0, None))
-        moves = (t >= 0) & (t < T)
-        return (
-            np.where(late, self.distance - s, s),
-            np.where(moves, v, 0.0),
-            np.where(moves, np.where(late, -a, a), 0.0),
-        )
-
-    def _speeding_up(self, t: Array) -> tuple[Array, Array, Array]:
-        """Motion in the first half, segment by segment."""
-        Tj, Ta, v = self.jerk_time, self.acceleration_time, self.peak_speed
-        a = v / (Ta - Tj)
-        jerk = a / Tj if Tj else 0.0
-        left = Ta - t
-        when = [t < Tj, t < Ta - Tj, t < Ta]
-        return (
-            np.select(
-                when,
-                [jerk * t**3 / 6, a * (t * (t - Tj) / 2 + Tj**2 / 6), v * (t - Ta / 2) + jerk * left**3 / 6],
-                v * (t - Ta / 2),
-            ),
-            np.select(when, [jerk * t**2 / 2, a * (t - Tj / 2), v - jerk * left**2 / 2], v),
-            np.select(when, [jerk * t, np.full_like(t, a), jerk * left], 0.0),
-        )
-
-
-@dataclass(frozen=True)
-class MinimumJerk:
-    """The polynomial of fifth order from rest to rest, which has the least integral of the squared jerk.
-
-    T. Flash and N. Hogan, The coordination of arm movements, J. Neurosci. 5(7) (1985) 1688-1703.
-
-    Parameters
-    ----------
-    distance : float
-        [measured unit], positive.
-    duration : float
-        [s]
-    """
-
-    distance: float
-    duration: float
-
-    def motion(self, t: Array) -> tuple[Array, Array, Array]:
-        """See `PlannedMotion`."""
-        d, T = self.distance, self.duration
-        z = np.clip(t / T, 0.0, 1.0)
-        speed, acceleration = 30 * z**2 * (1 - z) ** 2, 60 * z * (1 - z) * (1 - 2 * z)
-        return d * z**3 * (10 - z * (15 - 6 * z)), d / T * speed, d / T**2 * acceleration
-
-
-def plan_s_curve(distance: float, speed: float, acceleration: float, jerk: float = inf) -> SCurve:
-    """The fastest move from rest to rest within limits of speed, acceleration and jerk.
-
-    Without a limit of jerk it is a trapezoid of speed. L. Biagiotti and C. Melchiorri, Trajectory Planning for
-    Automatic Machines and Robots (2008), sections 3.2 and 3.4.
-
-    Parameters
-    ----------
-    distance : float
-        [measured unit], positive, as the limits are.
-    speed, acceleration, jerk : float
-        Limits [measured unit/s, /s^2, /s^3].
-
-    Examples
-    --------
-    >>> plan_s_curve(0.2, speed=0.5, acceleration=5.0).duration, plan_s_curve(0.2, 0.5, 5.0, 100.0).duration
-    (0.5, 0.55)
-    """
-    ramp = acceleration / jerk  # [s], from no acceleration to the largest
-    if speed >= acceleration * ramp:
-        Tj, Ta = ramp, speed / acceleration + ramp
-    else:
-        Tj = sqrt(speed / jerk)
-        Ta = 2 * Tj
-    if speed * Ta <= distance:
-        return SCurve(distance, speed, Ta, Tj)
-    if distance >= 2 * acceleration * ramp**2:  # the largest acceleration is reached, the largest speed is not
-        half = ramp / 2
-        time = sqrt(half**2 + distance / acceleration) + half  # Ta, from peak Ta = distance, peak = a (Ta - Tj)
-        return SCurve(distance, distance / time, time, ramp)
-    Tj = cbrt(distance / (2 * jerk))
-    return SCurve(distance, distance / (2 * Tj), 2 * Tj, Tj)
-
-
-def plan_minimum_jerk(distance: float, speed: float, acceleration: float, jerk: float = inf) -> MinimumJerk:
-    """The shortest polynomial of fifth order within limits of speed, acceleration and jerk.
-
-    Its peaks are 15/8 d/T of speed, 10/sqrt(3) d/T^2 of acceleration and 60 d/T^3 of jerk (Flash and Hogan 1985).
-
-    Parameters
-    ----------
-    distance : float
-        [measured unit], positive, as the limits are.
-    speed, acceleration, jerk : float
-        Limits [measured unit/s, /s^2, /s^3].
-
-    Examples
-    --------
-    >>> round(plan_minimum_jerk(0.2, speed=0.5, acceleration=5.0).duration, 12)
-    0.75
-    """
-    times = 15 / 8 * distance / speed, sqrt(10 / sqrt(3) * distance / acceleration), cbrt(60 * distance / jerk)
-    return MinimumJerk(distance, max(times))
-
-
-Motion = Callable[[Array], tuple[Array, Array, Array]]
 
 
 class MoveProfile(Enum):
@@ -346,25 +201,6 @@ class Move:
         return replace(self, dwell=horizon - self.at - self.duration)
 
 
-def sample_motion(reference: Reference, motion: Motion, step: float, *, between: bool = True) -> Trajectory:
-    """The reference, its speed and its acceleration held on a grid, and its disturbances; as `Move.trajectory`.
-
-    Parameters
-    ----------
-    reference : Reference
-    motion : callable
-        Of instants [s] the reference, its speed and its acceleration.
-    step : float
-        Spacing of the grid [s].
-    between : bool
-        Whether the reference may begin to change between two samples.
-    """
-    k, first = reference_samples(reference, step, between=between)
-    t: Array = np.asarray(k * step, dtype=np.float64)
-    columns = dict(zip(("reference", REFERENCE_SPEED, REFERENCE_ACCELERATION), motion(t), strict=True))
-    return Trajectory(t, columns | disturbance_columns(reference, k >= first))
-
-
 @dataclass(frozen=True)
 class MoveSequence:
     """Moves of which each begins where and when the one before has ended, after its dwell.
@@ -468,12 +304,10 @@ class MoveSequence:
     @property
     def label(self) -> str:
         """How a table heads it."""
-        stops = [self.origin, *(move.final for move in self.chain)]
-        shown = [
-            f"{round(stop, LABEL_DECIMALS) + 0.0:g}"
-            for stop in (stops if len(stops) <= MAX_LABELLED_STOPS else stops[-2:])
-        ]
-        lead = f"move {len(self.moves)}, " if len(stops) > MAX_LABELLED_STOPS else ""
+        # sums of distances leave digits of a zero, which no label shows
+        stops = [f"{round(stop, 9) + 0.0:g}" for stop in (self.origin, *(move.final for move in self.chain))]
+        is_long = len(stops) > 4
+        lead, shown = (f"move {len(self.moves)}, ", stops[-2:]) if is_long else ("", stops)
         return ", ".join([lead + " to ".join(shown), *describe_circumstances(self)])
 
     def motion(self, t: Array) -> tuple[Array, Array, Array]:
@@ -495,11 +329,8 @@ class MoveSequence:
 
     def with_horizon(self, horizon: float) -> Self:
         """The same with another end of the experiment [s]."""
-        return type(self)([*self.moves[:-1], replace(self.moves[-1], dwell=self._dwell(horizon))])
-
-    def _dwell(self, horizon: float) -> float:
         last = self.chain[-1]
-        return horizon - last.at - last.duration
+        return type(self)([*self.moves[:-1], replace(self.moves[-1], dwell=horizon - last.at - last.duration)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -634,3 +465,120 @@ class MotionPath:
     def with_horizon(self, horizon: float) -> Self:
         """The same with another end of the experiment [s]."""
         return replace(self, dwell=horizon - float(self.t[-1]))
+
+
+def sample_motion(
+    reference: Reference, motion: Callable[[Array], tuple[Array, Array, Array]], step: float, *, between: bool = True
+) -> Trajectory:
+    """A reference and its rates on a grid of `step` [s], with disturbances; `between`: it may begin off the grid."""
+    k, first = reference_samples(reference, step, between=between)
+    t: Array = np.asarray(k * step, dtype=np.float64)
+    columns = dict(zip(("reference", REFERENCE_SPEED, REFERENCE_ACCELERATION), motion(t), strict=True))
+    return Trajectory(t, columns | disturbance_columns(reference, k >= first))
+
+
+@dataclass(frozen=True)
+class SCurve:
+    """Seven segments of constant jerk, symmetric in time; those that a short move has no room for take no time."""
+
+    distance: float  # [measured unit], positive
+    peak_speed: float  # [measured unit/s]
+    acceleration_time: float  # from rest to the peak speed [s]
+    jerk_time: float  # from no acceleration to the largest [s]; 0 makes it a trapezoid of speed
+
+    @property
+    def cruise_time(self) -> float:
+        """At the peak speed [s]."""
+        return max(0.0, self.distance / self.peak_speed - self.acceleration_time)
+
+    @property
+    def duration(self) -> float:
+        """From rest to rest [s]."""
+        return 2 * self.acceleration_time + self.cruise_time
+
+    def motion(self, t: Array) -> tuple[Array, Array, Array]:
+        """See `PlannedMotion`; the second half is the first, mirrored, so that the end is met exactly."""
+        T = self.duration
+        late = t > T / 2
+        s, v, a = self._speeding_up(np.clip(np.where(late, T - t, t), 0.0, None))
+        moves = (t >= 0) & (t < T)
+        return (
+            np.where(late, self.distance - s, s),
+            np.where(moves, v, 0.0),
+            np.where(moves, np.where(late, -a, a), 0.0),
+        )
+
+    def _speeding_up(self, t: Array) -> tuple[Array, Array, Array]:
+        """Motion in the first half, segment by segment."""
+        Tj, Ta, v = self.jerk_time, self.acceleration_time, self.peak_speed
+        a = v / (Ta - Tj)
+        jerk = a / Tj if Tj else 0.0
+        left = Ta - t
+        when = [t < Tj, t < Ta - Tj, t < Ta]
+        return (
+            np.select(
+                when,
+                [jerk * t**3 / 6, a * (t * (t - Tj) / 2 + Tj**2 / 6), v * (t - Ta / 2) + jerk * left**3 / 6],
+                v * (t - Ta / 2),
+            ),
+            np.select(when, [jerk * t**2 / 2, a * (t - Tj / 2), v - jerk * left**2 / 2], v),
+            np.select(when, [jerk * t, np.full_like(t, a), jerk * left], 0.0),
+        )
+
+
+@dataclass(frozen=True)
+class MinimumJerk:
+    """The polynomial of fifth order from rest to rest, which has the least integral of the squared jerk.
+
+    T. Flash and N. Hogan, The coordination of arm movements, J. Neurosci. 5(7) (1985) 1688-1703.
+    """
+
+    distance: float  # [measured unit], positive
+    duration: float  # [s]
+
+    def motion(self, t: Array) -> tuple[Array, Array, Array]:
+        """See `PlannedMotion`."""
+        d, T = self.distance, self.duration
+        z = np.clip(t / T, 0.0, 1.0)
+        speed, acceleration = 30 * z**2 * (1 - z) ** 2, 60 * z * (1 - z) * (1 - 2 * z)
+        return d * z**3 * (10 - z * (15 - 6 * z)), d / T * speed, d / T**2 * acceleration
+
+
+def plan_s_curve(distance: float, speed: float, acceleration: float, jerk: float = inf) -> SCurve:
+    """The fastest move from rest to rest within limits of speed, acceleration and jerk; without jerk's a trapezoid.
+
+    L. Biagiotti and C. Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), sections 3.2 and 3.4.
+
+    Examples
+    --------
+    >>> plan_s_curve(0.2, speed=0.5, acceleration=5.0).duration, plan_s_curve(0.2, 0.5, 5.0, 100.0).duration
+    (0.5, 0.55)
+    """
+    ramp = acceleration / jerk  # [s], from no acceleration to the largest
+    if speed >= acceleration * ramp:
+        Tj, Ta = ramp, speed / acceleration + ramp
+    else:
+        Tj = sqrt(speed / jerk)
+        Ta = 2 * Tj
+    if speed * Ta <= distance:
+        return SCurve(distance, speed, Ta, Tj)
+    if distance >= 2 * acceleration * ramp**2:  # the largest acceleration is reached, the largest speed is not
+        half = ramp / 2
+        time = sqrt(half**2 + distance / acceleration) + half  # Ta, from peak Ta = distance, peak = a (Ta - Tj)
+        return SCurve(distance, distance / time, time, ramp)
+    Tj = cbrt(distance / (2 * jerk))
+    return SCurve(distance, distance / (2 * Tj), 2 * Tj, Tj)
+
+
+def plan_minimum_jerk(distance: float, speed: float, acceleration: float, jerk: float = inf) -> MinimumJerk:
+    """The shortest polynomial of fifth order within limits of speed, acceleration and jerk.
+
+    Its peaks are 15/8 d/T of speed, 10/sqrt(3) d/T^2 of acceleration and 60 d/T^3 of jerk (Flash and Hogan 1985).
+
+    Examples
+    --------
+    >>> round(plan_minimum_jerk(0.2, speed=0.5, acceleration=5.0).duration, 12)
+    0.75
+    """
+    times = 15 / 8 * distance / speed, sqrt(10 / sqrt(3) * distance / acceleration), cbrt(60 * distance / jerk)
+    return MinimumJerk(distance, max(times))

@@ -209,15 +209,7 @@ def describe_circumstances(reference: Reference) -> list[str]:
 
 
 def reference_samples(reference: Reference, step: float, *, between: bool = False) -> tuple[NDArray[np.int_], int]:
-    """Numbers of the samples of a grid with spacing `step` [s], and of the first since the reference changes.
-
-    With `between` that instant may lie between two samples.
-
-    Raises
-    ------
-    InputError
-        If that instant lies between two samples, or the grid is coarser than the horizon.
-    """
+    """The samples of a grid of `step` [s], and the first since the reference changes, which may lie `between` two."""
     kind, at, horizon = type(reference).__name__, reference.at, reference.horizon
     require(0 < step < horizon, f"the grid's spacing {step:g} s must lie between 0 and {horizon:g} s")
     first = int(np.ceil(at / step - 1e-9)) if between else round(at / step)

@@ -4,36 +4,18 @@ from typing import Any
 
 import casadi as ca
 
-from pneuopt.control.tolerances import RESET_RATIO
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import difference_unit
 
 SIDE, EXCURSION = "side", "excursion"
+
+
 RESET_STATES = (SIDE, EXCURSION)
 
 
-def reset_parameters(unit: str) -> ParameterSet:
-    """The ratio [1], and the error within which no change of sign counts, of a signal of this unit."""
-    return ParameterSet(
-        {
-            "reset_ratio": Parameter(
-                RESET_RATIO, "1", lower=0.0, upper=1.0, meaning="part of the integral that is kept, its sign turned"
-            ),
-            "reset_band": Parameter(
-                0.0, difference_unit(unit), lower=0.0, meaning="error within which no change of its sign counts"
-            ),
-        }
-    )
-
-
-def reset_quantities(measured: Quantity) -> tuple[Quantity, ...]:
-    """The states: the side on which the error was last, and how far it has gone since it changed sides."""
-    return Quantity(SIDE, "1"), Quantity(EXCURSION, difference_unit(measured.unit), measured.nominal)
-
-
 def reset_integral(x: Symbols, error: Any, p: Symbols) -> dict[str, ca.SX]:
-    """The integral and the own states before the law of a sample is computed.
+    """The integral and the own states before the law of a sample, from the error of what the loop is judged by.
 
     With the error e, the side s_ on which it was (-1 or 1; 0 at the start) and the excursion m_, of the sample before::
 
@@ -50,13 +32,6 @@ def reset_integral(x: Symbols, error: Any, p: Symbols) -> dict[str, ca.SX]:
     systems with Stribeck friction, IEEE Trans. Control Syst. Technol. 30 (2022) 294-310: resets at zero crossings of
     the position error and of the speed, in continuous time. Their rules are here those of a sampled controller that
     sees the error alone: a stop is a sample at which the error no longer grows.
-
-    Parameters
-    ----------
-    x, p : mapping of str to casadi.SX
-        States "integral", "side", "excursion"; parameters "reset_ratio", "reset_band".
-    error : casadi.SX
-        Of the signal that the loop is judged by.
     """
     size, armed = ca.fabs(error), x[EXCURSION] > 0
     beyond = size > p["reset_band"]
@@ -67,3 +42,22 @@ def reset_integral(x: Symbols, error: Any, p: Symbols) -> dict[str, ca.SX]:
     excursion = ca.if_else(crosses, size, ca.if_else(armed, ca.if_else(stops, 0, size), 0))
     side = ca.if_else(ca.logic_or(crosses, begins), ca.if_else(error < 0, -1, 1), x[SIDE])
     return {"integral": integral, SIDE: side, EXCURSION: excursion}
+
+
+def reset_parameters(unit: str) -> ParameterSet:
+    """The ratio [1], and the error within which no change of sign counts, of a signal of this unit."""
+    return ParameterSet(
+        {
+            "reset_ratio": Parameter(
+                1.0, "1", lower=0.0, upper=1.0, meaning="part of the integral that is kept, its sign turned"
+            ),
+            "reset_band": Parameter(
+                0.0, difference_unit(unit), lower=0.0, meaning="error within which no change of its sign counts"
+            ),
+        }
+    )
+
+
+def reset_quantities(measured: Quantity) -> tuple[Quantity, ...]:
+    """The states: the side on which the error was last, and how far it has gone since it changed sides."""
+    return Quantity(SIDE, "1"), Quantity(EXCURSION, difference_unit(measured.unit), measured.nominal)

@@ -7,7 +7,7 @@ from typing import Any
 
 import casadi as ca
 
-from pneuopt.control.tolerances import MIN_SENSOR_LAG
+from pneuopt.control.tolerances import SHORTEST_TIME
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -21,27 +21,13 @@ REFERENCE_SPEED, REFERENCE_ACCELERATION = "reference_speed", "reference_accelera
 
 @dataclass(frozen=True)
 class SensedSignal:
-    """The signal that a sensor reads, and the controller's sample time.
+    """The signal that a sensor reads, and the controller's sample time."""
 
-    Parameters
-    ----------
-    measured : Quantity
-        The plant's output that the controller wants.
-    outputs : mapping of str to Quantity
-        All of the plant's.
-    sample_time : float, optional
-        The controller's [s].
-    order : int, optional
-        Of the measured signal as a derivative of the axis's position: 0 itself, 1 its speed; None of any other.
-    cascade : bool
-        Whether the controller that wants a speed is the inner one of a cascade, whose reference is a position.
-    """
-
-    measured: Quantity
-    outputs: Mapping[str, Quantity]
-    sample_time: float | None
-    order: int | None = 1
-    cascade: bool = False
+    measured: Quantity  # the plant's output that the controller wants
+    outputs: Mapping[str, Quantity]  # all of the plant's
+    sample_time: float | None  # [s], None of a continuous controller
+    order: int | None = 1  # as a derivative of the axis's position: 0 itself, 1 its speed; None of any other
+    cascade: bool = False  # whether it is the speed of a cascade's inner controller, whose reference is a position
 
     @property
     def speed_unit(self) -> str:
@@ -82,8 +68,8 @@ class SensorLag:
 
     def __post_init__(self) -> None:
         require(
-            MIN_SENSOR_LAG <= self.lag < inf,
-            f"SensorLag: lag must be at least {MIN_SENSOR_LAG:g} s, got {self.lag:g} s; "
+            SHORTEST_TIME <= self.lag < inf,
+            f"SensorLag: lag must be at least {SHORTEST_TIME:g} s, got {self.lag:g} s; "
             "without a lag leave the sensor out",
         )
 
@@ -95,7 +81,7 @@ class SensorLag:
         return ParameterSet(
             {
                 "lag": Parameter(
-                    self.lag, "s", lower=MIN_SENSOR_LAG, meaning="lag with which the controller sees the signal"
+                    self.lag, "s", lower=SHORTEST_TIME, meaning="lag with which the controller sees the signal"
                 )
             }
         )

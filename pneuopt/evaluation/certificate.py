@@ -615,7 +615,7 @@ def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Refer
     band : float or Tolerance
         Half width, a fraction of the step or in the measured unit.
     """
-    count, size, unit = loop.sensor_resolution(parameters), abs(reference.nominal_size), loop.feedback.unit
+    count, size, unit = loop.controller.sensor_resolution(parameters), abs(reference.nominal_size), loop.feedback.unit
     half = band_share(band, reference) * size
     if count / 2 <= half * (1 + COUNT_TOLERANCE):
         return None

@@ -274,7 +274,7 @@ def metric_units(loop: ClosedLoop) -> dict[str, str]:
 
 def relevant_units(loop: ClosedLoop) -> dict[str, str]:
     """As `metric_units`, less those of a dither or a position that the loop has not; the step's size has the key ""."""
-    left_out = {n for n, metric in METRICS.items() if metric.positions and loop.sensed_signal.order != 0}
+    left_out = {n for n, metric in METRICS.items() if metric.positions and loop.controller.sensed_signal.order != 0}
     left_out |= set() if loop.dither is not None else set(DITHER_METRICS)
     units = {n: unit for n, unit in metric_units(loop).items() if n not in left_out}
     return {"": loop.feedback.unit, **units}

@@ -78,7 +78,9 @@ def loop_inputs(loop: ClosedLoop, reference: Reference, step: float) -> Trajecto
     """Inputs of the loop under a reference; those that the reference has no column for are zero."""
     run = reference.trajectory(step)
     columns, none = dict(run.values), np.zeros(len(run))
-    if loop.sensed_signal.order == 1 and REFERENCE_SPEED in columns:  # the reference is a speed, and this is its rate
+    if (
+        loop.controller.sensed_signal.order == 1 and REFERENCE_SPEED in columns
+    ):  # the reference is a speed, and this is its rate
         columns[REFERENCE_ACCELERATION] = columns[REFERENCE_SPEED]
     return Trajectory(run.t, {q.name: columns.get(q.name, none) for q in loop.inputs})
 

@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pneuopt.control.compensators import MotionFeedforward
+from pneuopt.control.compensators import Compensator, MotionFeedforward
 from pneuopt.control.controller import Controller
 from pneuopt.control.dither import Waveform
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
@@ -19,9 +19,8 @@ from pneuopt.control.pid import AntiWindup, Form, ParallelForm
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.control.sensor import REFERENCE_SPEED, Encoder, SensorLag
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.export.makers import BLOCK_FORMS, Block, BlockDesign, BlockForm, Setting, number, standard_times, wire
+from pneuopt.export.makers import MAKER_BLOCKS, Block, BlockNumbers, MakerBlock, Setting, number, standard_times, wire
 from pneuopt.export.program import check_sampled
-from pneuopt.export.tolerances import RANGE_MARGIN, SHEET_WIDTH
 from pneuopt.export.writer import check_name, comment_text
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -88,21 +87,27 @@ def export_settings(
     if measured_span is not None:
         message = f"measured_span must be positive and finite, got {measured_span:g} {loop.feedback.unit}"
         require(0 < measured_span < math.inf, message)
-    form, steps = BLOCK_FORMS[block], as_references(references)
+    maker_block, steps = MAKER_BLOCKS[block], as_references(references)
     acting = acting_controller(loop.controller, parameters)
-    around = find_surroundings(acting, parameters, form, steps, centre, measured_span)
+    around = find_surroundings(acting, parameters, maker_block, steps, centre, measured_span)
     d = around.inner
-    settings = form.settings(d)  # first of all: it refuses what the block cannot have
+    settings = maker_block.settings(d)  # first of all: it refuses what the block cannot have
     compared = compare_with_block(loop, parameters, block, steps)
-    lines = [_verdict(loop, parameters, block), *_scale_lines(d), f"{form.title}: the gains of {name}"]
+    lines, unit = [_verdict(loop, parameters, block)], d.command_unit
+    if unit in MECHANICAL_UNITS:
+        scale = f"not volts: behind the block apply your amplifier's scale, volts per {unit}."
+        lines += [f"THE OUTPUT IS {MECHANICAL_UNITS[unit].upper()}, {scale}"]
+        lines += [f"No scale is stated in the files; every limit and value of the output below is in {unit}."]
+    lines += [f"{maker_block.title}: the gains of {name}"]
     lines += [*map(comment_text, origin), "", "What stands around it, in the order of the signals", ""]
     lines += _wrap(around.lines)
     if around.outer:
-        lines += ["", f"Settings of the outer block ({around.outer.measured})", "", *_rows(form.settings(around.outer))]
+        lines += ["", f"Settings of the outer block ({around.outer.measured})", ""]
+        lines += _rows(maker_block.settings(around.outer))
     lines += ["", f"Settings{f' of the inner block ({d.measured})' if around.outer else ''}", "", *_rows(settings)]
-    lines += ["", "What the output is", "", *_wrap([*form.states(d), *_rest_words(d, form)])]
-    lines += ["", "Check before you enable it", "", *_wrap(_checks(d, around.outer or d, form))]
-    lines += ["", f"Formula: {form.formula}", "Sources:", *(f"- {source}" for source in form.sources)]
+    lines += ["", "What the output is", "", *_wrap(_output_words(d, maker_block))]
+    lines += ["", "Check before you enable it", "", *_wrap(_checks(d, around.outer or d, maker_block))]
+    lines += ["", f"Formula: {maker_block.formula}", "Sources:", *(f"- {source}" for source in maker_block.sources)]
     lines += ["", *compared] if compared else []
     return {f"{name}_{block.value}.txt": "\n".join(lines) + "\n"}
 
@@ -115,12 +120,12 @@ def describe_refusal(
     centre: float = 0.0,
 ) -> str:
     """Why a block cannot hold a design, as `export_settings` refuses it; empty where it can."""
-    form, steps = BLOCK_FORMS[block], as_references(references)
+    maker_block, steps = MAKER_BLOCKS[block], as_references(references)
     try:
         acting = acting_controller(controller, parameters)
-        around = find_surroundings(acting, parameters, form, steps, centre, None)
+        around = find_surroundings(acting, parameters, maker_block, steps, centre, None)
         for design in filter(None, (around.inner, around.outer)):
-            form.settings(design)
+            maker_block.settings(design)
     except InputError as reason:
         return str(reason)
     return ""
@@ -129,22 +134,14 @@ def describe_refusal(
 def run_as_block(
     loop: ClosedLoop, parameters: ParameterSet, block: Block
 ) -> tuple[ClosedLoop, ParameterSet, list[str]]:
-    """A loop whose controller is another maker's block with the same gains.
-
-    Returns
-    -------
-    loop : ClosedLoop
-    parameters : ParameterSet
-    differences : list of str
-        In what that differs from the design; empty where the block runs it as it is.
-    """
-    form, found = BLOCK_FORMS[block], list[str]()
+    """A loop whose controller is a maker's block with the same gains, its parameters, and in what it differs."""
+    maker_block, found = MAKER_BLOCKS[block], list[str]()
     acting = acting_controller(loop.controller, parameters)
     integrates = loop.parallel_form(parameters).Ki != 0
-    clamps = form.clamps and loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
+    clamps = maker_block.clamps and loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
     kind = AntiWindup.CLAMPING if clamps else loop.pid.anti_windup
     found += ["its integral is clamped at a limit, the design's unwinds by back-calculation"] * (clamps and integrates)
-    behind = integrates and form.added is None and design_of(acting, parameters, 0.0).is_added_to
+    behind = integrates and maker_block.added is None and block_numbers(acting, parameters, 0.0).is_added_to
     found += [f"{BLIND_LIMITS} (simulated as if they saw it)"] if behind and loop.pid.limits else []
     found += ["it has no dead band of the integral"] if acting.pid.dead_band else []
     found += ["it has no reset of the integral"] if loop.pid.reset else []
@@ -152,7 +149,7 @@ def run_as_block(
     parts = {n: getattr(acting, n) for n in ("dither", "feedforward", "compensators", "schedule")}
     own = replace(loop, pid=pid, **parts)
     gains = loop.parallel_form(parameters)
-    values = {f"pid.{n}": v for n, v in vars(gains).items()} | _block_gains(loop, parameters, form, found)
+    values = {f"pid.{n}": v for n, v in vars(gains).items()} | _block_gains(loop, parameters, maker_block, found)
     shared = parameters.select(n for n in parameters if n in own.parameters and n not in values)
     return own, own.parameters.with_values({n: p.value for n, p in shared.items()} | values), found
 
@@ -173,39 +170,32 @@ def compare_with_block(
     lines += [f"  {'reference':<24}{'metric':<18}{'as tuned':>12}{'as the block':>14}"]
     for step in steps:
         for metric, of in COMPARED_METRICS.items():
-            before, after = (_shown(float(frame[step.label][metric])) for frame in (tuned, run))
+            figures = (float(frame[step.label][metric]) for frame in (tuned, run))
+            before, after = (f"{figure:.4g}" if math.isfinite(figure) else "never" for figure in figures)
             lines += [f"  {f'{step.label} {unit}':<24}{f'{metric} [{of}]':<22}{before:>8}{after:>14}"]
-    return [*lines, "", "To tune for the block, state what it has under [pid] of tuning.toml:", *_advice(own, values)]
+    lines += ["", "To tune for the block, state what it has under [pid] of tuning.toml:"]
+    lines += [f'  anti_windup = "{own.pid.anti_windup.value}"'] if own.pid.limits else []
+    lines += [f"  {n} = {values.value(f'pid.{n}'):g}" for n in ("b", "c")]
+    return [*lines, *(['  Tf = "0 s"'] if values.value("pid.Tf") == 0 else [])]
 
 
 def _verdict(loop: ClosedLoop, parameters: ParameterSet, block: Block) -> str:
     """How near the block is to the design, in a line."""
-    form, found = BLOCK_FORMS[block], run_as_block(loop, parameters, block)[2]
+    maker_block, found = MAKER_BLOCKS[block], run_as_block(loop, parameters, block)[2]
     if found:
         points = "one point; it stands" if len(found) == 1 else f"{len(found)} points; they stand"
         return f"The block differs from the design in {points} at the end of this sheet, with its figures."
     back = loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
     late = block is Block.SIMULINK and back and loop.parallel_form(parameters).Ki != 0
     but = ", but for one sample: at a limit its back-calculation acts a sample later" if late else ""
-    inferred = "; its formula is INFERRED: compare a step first" if form.is_inferred else ""
+    inferred = "; its formula is INFERRED: compare a step first" if maker_block.is_inferred else ""
     return f"The block runs the design as it was tuned{but}{inferred}."
 
 
-def _scale_lines(d: BlockDesign) -> list[str]:
-    """That an output is in no output module's unit."""
-    words = MECHANICAL_UNITS.get(d.command_unit)
-    if words is None:
-        return []
-    return [
-        f"THE OUTPUT IS {words.upper()}, not volts: behind the block apply your amplifier's scale, volts per "
-        f"{d.command_unit}.",
-        f"No scale is stated in the files; every limit and value of the output below is in {d.command_unit}.",
-    ]
-
-
-def _rest_words(d: BlockDesign, form: BlockForm) -> Iterator[str]:
-    """What the design itself makes of its rest."""
-    b = form.weights(d)[0]
+def _output_words(d: BlockNumbers, maker_block: MakerBlock) -> Iterator[str]:
+    """What the output is at rest and while the block does not control, by the maker's states and the design's own."""
+    b = maker_block.weights(d)[0]
+    yield from maker_block.states(d)
     if d.is_added_to:
         yield "The sum of its surroundings is added to that."
     if b != 1 and d.gains.Kp and not d.integrates:
@@ -213,8 +203,8 @@ def _rest_words(d: BlockDesign, form: BlockForm) -> Iterator[str]:
         yield f"That is so at the setpoint 0; elsewhere the rest is off the centre by {off}: no integral is there."
 
 
-def _wrap(lines: Iterable[str]) -> list[str]:
-    fill = textwrap.TextWrapper(SHEET_WIDTH, "  ", "     ", break_on_hyphens=False)
+def _wrap(lines: Iterable[str], width: int = 116) -> list[str]:
+    fill = textwrap.TextWrapper(width, "  ", "     ", break_on_hyphens=False)
     return [part for line in lines for part in fill.wrap(line)]
 
 
@@ -223,11 +213,11 @@ def _rows(settings: list[Setting]) -> list[str]:
     return [f"  {s.name:<{widths[0]}}  {s.value:<{widths[1]}}  {s.formula}".rstrip() for s in settings]
 
 
-def _checks(d: BlockDesign, first: BlockDesign, form: BlockForm) -> Iterator[str]:
+def _checks(d: BlockNumbers, first: BlockNumbers, maker_block: MakerBlock) -> Iterator[str]:
     """What an engineer tries before the loop is closed."""
     rest = wire(d.centre, d)
     rises = "rise" if (d.gains.Kp or d.gains.Ki or d.gains.Kd) >= 0 else "fall"
-    yield f"1. Centre: in manual ({form.manual}) and at error 0, {rest} stands on the wire and nothing moves."
+    yield f"1. Centre: in manual ({maker_block.manual}) and at error 0, {rest} stands on the wire and nothing moves."
     yield f"2. Sign: in manual, a little more than {rest} makes the {d.measured} {rises}; else turn a sign, not a gain."
     ends = [wire(v, d) if math.isfinite(v) else "no limit" for v in (d.low, d.high)]
     yield f"3. Limits: the least and the largest output on the wire are {ends[0]} and {ends[1]}."
@@ -236,65 +226,42 @@ def _checks(d: BlockDesign, first: BlockDesign, form: BlockForm) -> Iterator[str
     yield f"5. Watchdog: pull the sensor, stop the controller: each time {rest} stands on the wire afterwards."
 
 
-def _block_gains(loop: ClosedLoop, parameters: ParameterSet, form: BlockForm, found: list[str]) -> dict[str, float]:
+def _block_gains(
+    loop: ClosedLoop, parameters: ParameterSet, maker_block: MakerBlock, found: list[str]
+) -> dict[str, float]:
     """Weights, filter and times as a block has them; what that changes is added to `found`."""
-    design = design_of(acting_controller(loop.controller, parameters), parameters, 0.0)
+    design = block_numbers(acting_controller(loop.controller, parameters), parameters, 0.0)
     gains, values = design.gains, dict[str, float]()
     matters = {"b": gains.Kp != 0, "c": gains.Kd != 0}
-    for weight, wanted, own in zip("bc", (design.b, design.c), form.weights(design), strict=True):
+    for weight, wanted, own in zip("bc", (design.b, design.c), maker_block.weights(design), strict=True):
         differs = own != wanted and matters[weight]
         found += [f"its set-point weight {weight} is {own:g}, the design's {wanted:g}"] if differs else []
         values[f"pid.{weight}"] = own
-    if not form.has_filter and gains.Kd != 0 and gains.Tf != 0:
+    if not maker_block.has_filter and gains.Kd != 0 and gains.Tf != 0:
         found += [f"its derivative has no filter, the design's has one of {gains.Tf:g} s"]
         values["pid.Tf"] = 0.0
-    if form.time_grain:
-        rounded = _round_times(design, form)
+    if maker_block.time_grain:
+        grain = maker_block.time_grain
+        times = (*standard_times(design, maker_block.title.partition(" (")[0]), gains.Tf)
+        Ti, Td, Tf = (grain * round(t / grain) if math.isfinite(t) else t for t in times)
+        rounded = {"Ki": gains.Kp / Ti if Ti else 0.0, "Kd": gains.Kp * Td}
+        rounded |= {"Tf": Tf} if design.differentiates else {}
         off = {n: v for n, v in rounded.items() if not math.isclose(v, getattr(gains, n), rel_tol=1e-9)}
         found += [f"its times are whole milliseconds: {', '.join(off)} change"] if off else []
         h = design.sample_time
-        whole = math.isclose(h, form.time_grain * max(1, round(h / form.time_grain)), rel_tol=1e-9)
+        whole = math.isclose(h, grain * max(1, round(h / grain)), rel_tol=1e-9)
         found += [] if whole else [f"its cycle is in whole milliseconds: {h:g} s cannot be set; what follows keeps it"]
         values |= {f"pid.{n}": v for n, v in off.items()}
     return values
 
 
-def _round_times(design: BlockDesign, form: BlockForm) -> dict[str, float]:
-    """Ki, Kd and, of a derivative, Tf of times that are rounded."""
-    gains, grain = design.gains, form.time_grain
-    times = (*standard_times(design, form.title.partition(" (")[0]), gains.Tf)
-    Ti, Td, Tf = (grain * round(t / grain) if math.isfinite(t) else t for t in times)
-    found = {"Ki": gains.Kp / Ti if Ti else 0.0, "Kd": gains.Kp * Td}
-    return found | ({"Tf": Tf} if design.differentiates else {})
-
-
-def _shown(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "never"
-
-
-def _advice(own: ClosedLoop, values: ParameterSet) -> list[str]:
-    kind = f'  anti_windup = "{own.pid.anti_windup.value}"'
-    weights = [f"  {n} = {values.value(f'pid.{n}'):g}" for n in ("b", "c")]
-    return [*([kind] if own.pid.limits else []), *weights, *(['  Tf = "0 s"'] if values.value("pid.Tf") == 0 else [])]
-
-
 @dataclass(frozen=True)
 class Surroundings:
-    """What stands around a block.
+    """What stands around a block, or around the two of a cascade."""
 
-    Attributes
-    ----------
-    lines : tuple of str
-        From the sensor to the wire.
-    inner : BlockDesign
-        The block itself.
-    outer : BlockDesign or None
-        A cascade's outer block, whose output is the setpoint of the inner one.
-    """
-
-    lines: tuple[str, ...]
-    inner: BlockDesign
-    outer: BlockDesign | None
+    lines: tuple[str, ...]  # from the sensor to the wire
+    inner: BlockNumbers
+    outer: BlockNumbers | None  # whose output is the setpoint of the inner one
 
 
 def acting_controller(controller: Controller, parameters: ParameterSet) -> Controller:
@@ -308,12 +275,17 @@ def acting_controller(controller: Controller, parameters: ParameterSet) -> Contr
         if n != "schedule.nominal_load"
     )
     oscillates = dither is not None and (value["dither.amplitude"] != 0 or value["dither.offset"] != 0)
+
+    def acts(part: Compensator) -> bool:
+        sizes = ("speed", "acceleration") if isinstance(part, MotionFeedforward) else (part.size,)
+        return any(value[f"{part.section}.{n}"] != 0 for n in sizes)
+
     return replace(
         controller,
         pid=replace(controller.pid, dead_band=controller.pid.dead_band and value["pid.dead_band"] > 0),
         dither=dither if oscillates else None,
         feedforward=lead if lead is not None and value["feedforward.gain"] != 0 else None,
-        compensators=tuple(c for c in controller.compensators if _acts(c, value)),
+        compensators=tuple(filter(acts, controller.compensators)),
         schedule=schedule if scheduled else None,
     )
 
@@ -321,53 +293,37 @@ def acting_controller(controller: Controller, parameters: ParameterSet) -> Contr
 def find_surroundings(
     controller: Controller,
     parameters: ParameterSet,
-    form: BlockForm,
+    maker_block: MakerBlock,
     references: Sequence[Reference],
     centre: float,
     measured_span: float | None,
 ) -> Surroundings:
-    """What stands around a block, as lines, and the numbers of the block or of the two of a cascade.
-
-    Parameters
-    ----------
-    controller : Controller
-        Of `acting_controller`.
-    parameters : ParameterSet
-    form : BlockForm
-    references : sequence of Reference
-        Whose values the range of the process value holds.
-    centre : float
-        Of the valve [the command's unit].
-    measured_span : float, optional
-        Of the process value [its unit]; by default of the references and their travel again beyond either end.
-
-    Raises
-    ------
-    InputError
-        If a part of the design has no counterpart among the maker's standard blocks.
-    """
+    """What stands around a block, and the numbers of it or of a cascade's two; refuses what no block holds."""
     value = controller.values(parameters)
     low, high = _process_range(references, measured_span, controller.feedback.unit)
-    outer = _outer_design(controller, value, references, (low, high))
+    outer = _outer_numbers(controller, value, references, (low, high))
     if outer is not None:
         low, high = outer.low, outer.high
-    inner = replace(design_of(controller, parameters, centre), pv_low=low, pv_high=high)
+    inner = replace(block_numbers(controller, parameters, centre), pv_low=low, pv_high=high)
     given = references[0].origin
     inner = replace(inner, start=given) if outer is None else replace(inner, reach="what the outer block gives at most")
-    _check_parts(controller, value, form)
+    missing = "; ".join(_missing_parts(controller, value))
+    title = maker_block.title.partition(" (")[0].partition(",")[0]
+    told = f"{title} cannot hold this design: {missing}. No standard block of {maker_block.maker} stands for that"
+    require(not missing, f"{told}; use --to st, which writes the whole controller")
     rest_is_inside = inner.low <= inner.centre <= inner.high
     told = f"the valve's centre, {write_value(centre, inner.command_unit)}, lies beyond the limits of the output"
-    require(rest_is_inside, f"{told}: no setting of {form.maker} rests there; mend the limits under [pid]")
-    lines = list(_lines(controller, value, form, inner, outer, references))
+    require(rest_is_inside, f"{told}: no setting of {maker_block.maker} rests there; mend the limits under [pid]")
+    lines = list(_lines(controller, value, maker_block, inner, outer, references))
     return Surroundings(tuple(f"{k}. {line}" for k, line in enumerate(lines, 1)), inner, outer)
 
 
-def design_of(controller: Controller, parameters: ParameterSet, centre: float) -> BlockDesign:
+def block_numbers(controller: Controller, parameters: ParameterSet, centre: float) -> BlockNumbers:
     """The numbers of a controller's PID."""
     value = controller.values(parameters)
     motion = any(isinstance(c, MotionFeedforward) for c in controller.compensators)
     sampled_dither = controller.dither is not None and (not controller.dither.analogue or value["dither.offset"] != 0)
-    return BlockDesign(
+    return BlockNumbers(
         controller.parallel_form(parameters),
         value["pid.b"],
         value["pid.c"],
@@ -383,18 +339,13 @@ def design_of(controller: Controller, parameters: ParameterSet, centre: float) -
     )
 
 
-def _acts(part: object, value: Mapping[str, float]) -> bool:
-    section, size = getattr(part, "section"), getattr(part, "size")  # noqa: B009 - of the protocol of compensators
-    sizes = ("speed", "acceleration") if isinstance(part, MotionFeedforward) else (size,)
-    return any(value[f"{section}.{n}"] != 0 for n in sizes)
-
-
 def _process_range(references: Sequence[Reference], span: float | None, unit: str) -> tuple[float, float]:
     """The least and the largest process value."""
-    low = min(min(r.origin, r.initial, r.final, *_values_of(r)) for r in references)
-    high = max(max(r.origin, r.initial, r.final, *_values_of(r)) for r in references)
-    if span is None:
-        travel = (high - low or max(abs(high), *(abs(r.nominal_size) for r in references)) or 1.0) * RANGE_MARGIN
+    on_the_way = [float(v) for r in references for v in r.trajectory(r.horizon / 1000)["reference"]]
+    values = [*(v for r in references for v in (r.origin, r.initial, r.final)), *on_the_way]
+    low, high = min(values), max(values)
+    if span is None:  # as far again beyond either end
+        travel = high - low or max(abs(high), *(abs(r.nominal_size) for r in references)) or 1.0
         return low - travel, high + travel
     told = f"the process value's span of {write_value(span, difference_unit(unit))} does not hold the references, from"
     ends = f"{write_value(low, unit)} to {write_value(high, unit)}"
@@ -405,37 +356,20 @@ def _process_range(references: Sequence[Reference], span: float | None, unit: st
     return (low + high - span) / 2, (low + high + span) / 2
 
 
-def _values_of(reference: Reference) -> list[float]:
-    step = reference.horizon / 1000
-    return [float(v) for v in reference.trajectory(step)["reference"]]
-
-
-def _top_speed(references: Sequence[Reference]) -> float:
-    """The largest speed that a reference states of itself; 0 of steps."""
-    found = [r.trajectory(r.horizon / 1000) for r in references]
-    return max((float(abs(t[REFERENCE_SPEED]).max()) for t in found if REFERENCE_SPEED in t), default=0.0)
-
-
-def _outer_design(
+def _outer_numbers(
     controller: Controller, value: Mapping[str, float], references: Sequence[Reference], span: tuple[float, float]
-) -> BlockDesign | None:
+) -> BlockNumbers | None:
     """The outer block of a cascade: proportional; it reaches its limits only with its process value out of range."""
     if controller.outer is None:
         return None
     Kp, weight = (value[f"{controller.outer.section}.{n}"] for n in ("Kp", "weight"))
-    top = Kp * (span[1] - span[0]) + weight * _top_speed(references)
+    motions = [r.trajectory(r.horizon / 1000) for r in references]  # a step has no speed
+    speeds = (float(abs(t[REFERENCE_SPEED]).max()) for t in motions if REFERENCE_SPEED in t)
+    top = Kp * (span[1] - span[0]) + weight * max(speeds, default=0.0)
     gains, h = ParallelForm(Kp), controller.pid.sample_time or 0.0
     on, speed = controller.feedback, controller.pid_signal.unit
-    found = BlockDesign(gains, 1.0, 1.0, math.nan, -top, top, 0.0, h, on.name, on.unit, speed, *span)
+    found = BlockNumbers(gains, 1.0, 1.0, math.nan, -top, top, 0.0, h, on.name, on.unit, speed, *span)
     return replace(found, goes="to the inner block", zero="no speed")
-
-
-def _check_parts(controller: Controller, value: Mapping[str, float], form: BlockForm) -> None:
-    missing = list(_missing_parts(controller, value))
-    block = form.title.partition(" (")[0].partition(",")[0]
-    told = f"{block} cannot hold this design: {'; '.join(missing)}. No standard block of {form.maker} stands for that"
-    remedy = "use --to st, which writes the whole controller"
-    require(not missing, f"{told}; {remedy}")
 
 
 def _missing_parts(controller: Controller, value: Mapping[str, float]) -> Iterator[str]:
@@ -466,9 +400,9 @@ def _named_value(name: str, controller: Controller, value: Mapping[str, float]) 
 def _lines(
     controller: Controller,
     value: Mapping[str, float],
-    form: BlockForm,
-    inner: BlockDesign,
-    outer: BlockDesign | None,
+    maker_block: MakerBlock,
+    inner: BlockNumbers,
+    outer: BlockNumbers | None,
     references: Sequence[Reference],
 ) -> Iterator[str]:
     """From the setpoint and the sensor to the wire."""
@@ -477,7 +411,12 @@ def _lines(
     unit = first.measured_unit
     typed = f"{write_value(example, unit)} is the number {number(example)}"
     yield f"Setpoint: the {first.measured} in {unit}; {typed}."
-    seen = _sensor_words(controller, value)
+    seen = "; the design counts on no filter of it"
+    if isinstance(controller.sensor, SensorLag):
+        seen = f"; the design counts on a sensor with a lag of {write_value(value['sensor.lag'], 's')}: add no filter"
+    elif isinstance(controller.sensor, Encoder) and controller.sensor.resolution:
+        counted = controller.sensed_signal.outputs[controller.sensor.position].unit
+        seen = f"; counted in steps of {write_value(value['sensor.resolution'], counted)}"
     yield f"Process value: the {first.measured}, in {unit}, too{'' if outer else seen}."
     if outer is not None:
         weight = value["position_loop.weight"]
@@ -486,49 +425,37 @@ def _lines(
         yield f"Outer block: P of the {outer.measured}; its output{rate} is the setpoint of the inner block, a {speed}."
         yield f"Process value of the inner block: the {speed}, measured{seen}."
         yield "Order: enable the inner block first; hold the outer one in manual while the inner one is."
-    yield f"{'Inner block' if outer else 'Block'}: {form.title}; {_block_words(inner)}."
-    yield from _added_lines(controller, value, form, inner)
-    yield f"Limits: {_limit_words(inner, form)}."
+    terms = "".join(n for n, gain in zip("PID", (inner.gains.Kp, inner.gains.Ki, inner.gains.Kd), strict=True) if gain)
+    yield f"{'Inner block' if outer else 'Block'}: {maker_block.title}; settings below, {terms or 'no gain'}."
+    yield from _added_lines(controller, value, maker_block, inner)
+    yield f"Limits: {_limit_words(inner, maker_block)}."
     zero = write_value(inner.centre, inner.command_unit)
     yield f"Centre: {zero} on the wire is the command 0, at which the valve is closed or the drive without force."
-    yield from _hardware_lines(controller, value)
-
-
-def _sensor_words(controller: Controller, value: Mapping[str, float]) -> str:
-    if isinstance(controller.sensor, SensorLag):
-        return f"; the design counts on a sensor with a lag of {write_value(value['sensor.lag'], 's')}: add no filter"
-    if isinstance(controller.sensor, Encoder) and controller.sensor.resolution:
-        unit = controller.sensed_signal.outputs[controller.sensor.position].unit
-        return f"; counted in steps of {write_value(value['sensor.resolution'], unit)}"
-    return "; the design counts on no filter of it"
-
-
-def _block_words(d: BlockDesign) -> str:
-    terms = (("P", d.gains.Kp), ("I", d.gains.Ki), ("D", d.gains.Kd))
-    return "settings below, " + ("".join(n for n, gain in terms if gain) or "no gain")
+    if controller.pid.delay:
+        yield "Delay: the design counts on one sample from reading to acting: write the output at the next sample."
+    if controller.dither is not None and controller.dither.analogue and value["dither.amplitude"]:
+        size = write_value(value["dither.amplitude"], controller.command.unit)
+        wave, frequency = controller.dither.waveform.value, number(value["dither.frequency"])
+        yield f"Generator behind the output: a {wave} of {size} peak at {frequency} Hz; hardware."
 
 
 def _added_lines(
-    controller: Controller, value: Mapping[str, float], form: BlockForm, inner: BlockDesign
+    controller: Controller, value: Mapping[str, float], maker_block: MakerBlock, inner: BlockNumbers
 ) -> Iterator[str]:
-    terms = [*_motion_terms(controller, value), *_dither_terms(controller, value, inner.sample_time)]
+    is_speed = REFERENCE_SPEED not in (q.name for q in controller.inputs)  # a loop of the speed: the setpoint is one
+    speed = "setpoint" if is_speed else "speed of the setpoint"
+    motion = {"speed": speed, "acceleration": "acceleration of the setpoint"}
+    gains = {f"{MotionFeedforward.section}.{n}": factor for n, factor in motion.items()}
+    terms = [
+        f"{write_value(value[gain], controller.parameters[gain].unit, 9)} x {factor}"
+        for gain, factor in gains.items()
+        if value.get(gain)
+    ]
+    terms += _dither_terms(controller, value, inner.sample_time)
     if terms:
-        where = form.added(inner) if form.added else "a sum behind the block, before the limits"
+        where = maker_block.added(inner) if maker_block.added else "a sum behind the block, before the limits"
         yield f"Sum: {' + '.join(terms)}; in your program once a sample, 0 while the block is not in automatic."
         yield f"Where it goes: {where}."
-
-
-def _motion_terms(controller: Controller, value: Mapping[str, float]) -> Iterator[str]:
-    is_speed = REFERENCE_SPEED not in (q.name for q in controller.inputs)  # a loop of the speed: the setpoint is one
-    factors = {
-        "speed": "setpoint" if is_speed else "speed of the setpoint",
-        "acceleration": "acceleration of the setpoint",
-    }
-    for part in controller.compensators:
-        for name, factor in factors.items() if isinstance(part, MotionFeedforward) else ():
-            gain = f"{part.section}.{name}"
-            if value[gain]:
-                yield f"{write_value(value[gain], controller.parameters[gain].unit, 9)} x {factor}"
 
 
 def _dither_terms(controller: Controller, value: Mapping[str, float], sample_time: float) -> Iterator[str]:
@@ -543,20 +470,11 @@ def _dither_terms(controller: Controller, value: Mapping[str, float], sample_tim
         yield f"{write_value(value['dither.amplitude'], unit, 9)} x {wave}, k the number of the sample"
 
 
-def _limit_words(d: BlockDesign, form: BlockForm) -> str:
+def _limit_words(d: BlockNumbers, maker_block: MakerBlock) -> str:
     if not (math.isfinite(d.low) or math.isfinite(d.high)):
         return "the design has none; the output stage has its own"
     ends = [write_value(v, d.command_unit) if math.isfinite(v) else "none" for v in (d.low, d.high)]
-    if not d.is_added_to or form.added is not None:
+    if not d.is_added_to or maker_block.added is not None:
         return f"{ends[0]} to {ends[1]} on the wire, in the block"
     own = "; the block has the same, for its integral" if d.integrates else ""
     return f"{ends[0]} to {ends[1]} on the wire, behind that sum, in your program{own}"
-
-
-def _hardware_lines(controller: Controller, value: Mapping[str, float]) -> Iterator[str]:
-    if controller.pid.delay:
-        yield "Delay: the design counts on one sample from reading to acting: write the output at the next sample."
-    if controller.dither is not None and controller.dither.analogue and value["dither.amplitude"]:
-        size = write_value(value["dither.amplitude"], controller.command.unit)
-        wave, frequency = controller.dither.waveform.value, number(value["dither.frequency"])
-        yield f"Generator behind the output: a {wave} of {size} peak at {frequency} Hz; hardware."

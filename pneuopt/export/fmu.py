@@ -12,7 +12,6 @@ from pathlib import Path
 import casadi as ca
 
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
-from pneuopt.export.tolerances import ZIP_DATE
 from pneuopt.export.writer import check_name
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
@@ -57,7 +56,11 @@ def export_fmu(system: System, parameters: ParameterSet, x: Array | None = None,
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
         files = builder.export_fmu({"no_warning": True, "with_serialization": False})
         texts = {str(Path(place)): Path(local).read_text("utf-8") for local, place in files.items()}
-    return _pack(_repair(texts))
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as target:
+        for place, text in _repair(texts).items():  # of one date, so that a model makes the same bytes each time
+            target.writestr(zipfile.ZipInfo(place, (1980, 1, 1, 0, 0, 0)), text)
+    return archive.getvalue()
 
 
 def _build(system: System, parameters: ParameterSet, start: Array, name: str) -> ca.DaeBuilder:
@@ -95,12 +98,3 @@ def _repair(texts: Mapping[str, str]) -> dict[str, str]:
     plain = {place: text.replace(old, "") for place, text in {**texts, _DESCRIPTION: description}.items()}
     token = hashlib.sha256("".join(plain.values()).encode()).hexdigest()[:32]
     return {n: text.replace(old, token) for n, text in {**texts, _DESCRIPTION: description}.items()}
-
-
-def _pack(texts: Mapping[str, str]) -> bytes:
-    """A zip archive that depends on its texts alone."""
-    archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as target:
-        for place, text in texts.items():
-            target.writestr(zipfile.ZipInfo(place, ZIP_DATE), text)
-    return archive.getvalue()

@@ -5,6 +5,7 @@ holds for the others. Case does not tell two names apart: structured text knows 
 back on a longer name of the same meaning, "integral" on "pid_integral", and on a number at its end only after that.
 """
 
+import itertools
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
@@ -202,7 +203,12 @@ class Identifiers:
 
     def claim(self, *wishes: str) -> str:
         """The first of some wishes, worded as an identifier, that is free; else the last with a number after it."""
-        worded = [_identifier(wish) for wish in wishes]
+        worded = []
+        for wish in wishes:  # ASCII letters, digits and single underscores between them, a letter first
+            plain = unicodedata.normalize("NFKD", wish).encode("ascii", "ignore").decode()
+            joined = "_".join(re.findall("[A-Za-z0-9]+", plain))
+            joined = f"x_{joined}" if joined[:1].isdigit() else joined
+            worded.append(joined[:MAX_IDENTIFIER].rstrip("_"))
         for name in filter(None, worded):
             if self._is_free(name):
                 self.take(name)
@@ -211,24 +217,13 @@ class Identifiers:
 
     def claim_next(self, kind: str, first: int = 1) -> str:
         """The first free name of a kind and a number."""
-        number = first
-        while not self._is_free(name := _with_number(kind, number)):
-            number += 1
+        for number in itertools.count(first):
+            end = f"_{number}" if kind.endswith("_") else str(number)
+            name = f"{kind.rstrip('_')[: MAX_IDENTIFIER - len(end)].rstrip('_')}{end}"
+            if self._is_free(name):
+                break
         self.take(name)
         return name
 
     def _is_free(self, name: str) -> bool:
         return name.casefold() not in self._taken and reserved_as(name) is None
-
-
-def _identifier(text: str) -> str:
-    """ASCII letters, digits and single underscores between them, a letter first; "" where nothing is left of it."""
-    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
-    joined = "_".join(re.findall("[A-Za-z0-9]+", plain))
-    joined = f"x_{joined}" if joined[:1].isdigit() else joined
-    return joined[:MAX_IDENTIFIER].rstrip("_")
-
-
-def _with_number(kind: str, number: int) -> str:
-    end = f"_{number}" if kind.endswith("_") else str(number)
-    return f"{kind.rstrip('_')[: MAX_IDENTIFIER - len(end)].rstrip('_')}{end}"

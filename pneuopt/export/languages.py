@@ -6,8 +6,9 @@ structured text, a Python class; and JavaScript, in which a page runs the whole 
 
 import json
 import math
+import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from importlib import resources
@@ -20,20 +21,11 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.dynamics.system import FRICTION_DIRECTION
 from pneuopt.export.identifiers import RESERVED_FILES, Identifiers, reserved_as
 from pneuopt.export.program import CENTRE, ControllerProgram, Variable, controller_program
-from pneuopt.export.tolerances import (
-    DROPOUT,
-    GAP,
-    LARGEST_LITERAL,
-    LONGEST_GAP,
-    RISE,
-    RUN_SAMPLES,
-    RUN_TOLERANCE,
-    SELECT,
-    SMALLEST_LITERAL,
-)
+from pneuopt.export.tolerances import LARGEST_LITERAL, RUN_SAMPLES, RUN_TOLERANCE, SELECT, SMALLEST_LITERAL
 from pneuopt.export.writer import (
     ARITHMETIC,
     COMPARED,
+    Assignment,
     Binding,
     Header,
     Names,
@@ -53,16 +45,79 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
 
+class Language(Enum):
+    """In what a controller is written."""
+
+    C = "c"
+    STRUCTURED_TEXT = "st"
+    PYTHON = "python"
+
+
+def export_controller(
+    loop: ClosedLoop | Controller,
+    parameters: ParameterSet,
+    language: Language,
+    *,
+    name: str = "controller",
+    centre: float = 0.0,
+    origin: Sequence[str] = (),
+) -> dict[str, str]:
+    """Write the sampled controller of a loop in another language.
+
+    Parameters
+    ----------
+    loop : ClosedLoop or Controller
+        With a sample time. Of a loop, its controller alone is written.
+    parameters : ParameterSet
+        A missing one has the loop's default.
+    language : Language
+        C99 with a test, one function block of IEC 61131-3 structured text, or a Python class without dependencies.
+    name : str
+        Of the structure, block or class, and of the files.
+    centre : float
+        On the wire to the valve while the command is zero [the command's unit].
+    origin : sequence of str
+        What the files shall say of where the gains come from; any text.
+
+    Returns
+    -------
+    dict of str to str
+        Texts by the names of the files.
+
+    Raises
+    ------
+    InputError
+        If the name is no identifier, is reserved in a language, or is that of a number in the block; if the parameters
+        cannot run; `ModelError` if the controller is continuous.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.linear import FirstOrder
+    >>> loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, limits=False))
+    >>> list(export_controller(loop, loop.parameters, Language.C))
+    ['controller.h', 'controller.c', 'controller_test.c']
+    """
+    if isinstance(loop, Controller):
+        controller = loop
+    else:
+        check_closed_loop(loop)
+        loop.check(parameters)
+        controller = loop.controller
+    program = controller_program(controller, parameters, centre)
+    header = make_header(name, controller, parameters, centre, origin)
+    within = {n.casefold() for n in program.names}
+    taken = [n for n in header.own_names if n.casefold() in within]
+    reserved = "a file that compilers or Windows have" if header.name.casefold() in RESERVED_FILES else None
+    what = reserved_as(name) or reserved or (f"{taken[0]}, a number of the block" if taken else None)
+    free = Identifiers([*program.names, *RESERVED_FILES]).claim(f"{name}_control", f"{name}_block")
+    require(what is None, f"--name {name}: is {what}; take another, as --name {free}")
+    return _WRITERS[language](program, header)
+
+
 @dataclass(frozen=True)
 class ReferenceRun:
-    """A run of a controller.
-
-    Attributes
-    ----------
-    inputs : ndarray, shape (n_samples, n_inputs)
-    outputs : ndarray, shape (n_samples,)
-        The first output, with the parameters of the program.
-    """
+    """A run of a controller: inputs, shape (n_samples, n_inputs), and its first output, shape (n_samples,)."""
 
     inputs: Array
     outputs: Array
@@ -71,32 +126,26 @@ class ReferenceRun:
 def make_reference_run(program: ControllerProgram) -> ReferenceRun:
     """A step of the reference, half of which drives the output to its limits, with a measured signal that swings in.
 
-    What else the controller gets, rates of the reference and further readings, are waves. One sample of the measured
-    signal is no number, and then so many in a row that the controller begins anew.
+    Rates of the reference and further readings are waves. One sample of the measured signal is no number, and then so
+    many in a row that the controller begins anew.
     """
     k = np.arange(RUN_SAMPLES)
-    size = _step_size(program)
+    value = {n: v.value for n, v in program.originals.items()}
+    gain, upper = abs(value.get("pid.Kp", value.get("pid.K", 1.0))), value.get("pid.upper", np.inf)
+    has_limit = np.isfinite(upper) and upper > 0 and gain > 0
+    size = float(1.5 * upper / gain) if has_limit else 1.0  # beyond its limits for a while
     reference = np.where((k >= 5) & (k < 150), size, -0.3 * size)
-    measured = size * (1 - np.exp(-np.maximum(k - 5, 0) / RISE)) + 0.02 * size * np.sin(0.9 * k)
+    # a faster rise hides the integral, a slower one the approach
+    measured = size * (1 - np.exp(-np.maximum(k - 5, 0) / 25.0)) + 0.02 * size * np.sin(0.9 * k)
     others = [size * np.sin(0.1 * (n + 1) * k) for n in range(len(program.inputs) - 2)]
-    count = {v.name: v.value for v in program.parameters}["fault_samples"]
-    measured[DROPOUT] = measured[GAP : GAP + int(min(count, LONGEST_GAP)) + 1] = np.nan
+    gap = int(min(value["pid.fault_samples"], 30)) + 1
+    measured[60] = measured[100 : 100 + gap] = np.nan
     inputs = np.column_stack([reference, measured, *others])
     return ReferenceRun(inputs, run_program(program, inputs)[:, 0])
 
 
 def run_program(program: ControllerProgram, inputs: Array) -> Array:
-    """The outputs of a program as CasADi computes them, started with the first sample.
-
-    Parameters
-    ----------
-    program : ControllerProgram
-    inputs : ndarray, shape (n_samples, n_inputs)
-
-    Returns
-    -------
-    ndarray, shape (n_samples, n_outputs)
-    """
+    """What CasADi computes of inputs (n_samples, n_inputs), started with the first: outputs (n_samples, n_outputs)."""
     p, count, found = program.values, len(program.outputs), []
     centre = program.originals[CENTRE].value if CENTRE in program.originals else 0.0
     x = program.start([*inputs[0], centre], p)
@@ -105,13 +154,6 @@ def run_program(program: ControllerProgram, inputs: Array) -> Array:
         found.append(results[:count])
         x = results[count:]
     return np.array(found)
-
-
-def _step_size(program: ControllerProgram) -> float:
-    """A step that drives the output beyond its limits for a while; 1 where it has none."""
-    value = {n: v.value for n, v in program.originals.items()}
-    gain, upper = abs(value.get("pid.Kp", value.get("pid.K", 1.0))), value.get("pid.upper", np.inf)
-    return float(1.5 * upper / gain) if np.isfinite(upper) and upper > 0 and gain > 0 else 1.0
 
 
 C99 = Syntax(
@@ -132,6 +174,8 @@ C99 = Syntax(
     truth=OperationSyntax("({0} ? 1.0 : 0.0)", needs=(Binding.COMPARISON,)),
     condition=OperationSyntax("{0} != 0.0", Binding.COMPARISON, (Binding.SUM,)),
 )
+
+
 _HELPERS = {
     ca.OP_FMIN: "static double least(double a, double b)\n{\n    return a < b ? a : b;\n}\n",
     ca.OP_FMAX: "static double largest(double a, double b)\n{\n    return a > b ? a : b;\n}\n",
@@ -180,12 +224,8 @@ def _header(program: ControllerProgram, header: Header, body: ProgramText) -> st
     lines += [f"}} {name};", "", f"extern const {name}_parameters {name}_tuned;", ""]
     lines += ["/* Take over parameters, at first or while it runs. */", f"{prepare};", ""]
     lines += [f"/* Begin, or go on without a bump; {last.name} {comment_text(f'[{last.unit}]: {last.meaning}')}. */"]
-    lines += [
-        f"{start};",
-        "",
-        "/*",
-        f" * Compute a sample; returns {out.name} {comment_text(f'[{out.unit}]: {out.meaning}')}.",
-    ]
+    lines += [f"{start};", "", "/*"]
+    lines += [f" * Compute a sample; returns {out.name} {comment_text(f'[{out.unit}]: {out.meaning}')}."]
     lines += [*signals, " */", f"{step};", "", "#endif"]
     return "\n".join(lines) + "\n"
 
@@ -201,28 +241,25 @@ def _source(program: ControllerProgram, header: Header, body: ProgramText) -> st
     values = [f"    {C99.literal(v.value)}, /* {v.name} [{comment_text(v.unit)}] */" for v in program.parameters]
     lines += [f"const {name}_parameters {name}_tuned = {{", *values, "};", "", prepare, "{", "    c->p = *p;"]
     lines += [f"    c->{a.name} = {a.text};" for a in body.coefficients]
-    unread = [v.name for v in program.start_inputs if not _reads((*body.start_locals, *body.start), v.name)]
+
+    def unread_names(variables: Iterable[Variable], *assignments: Assignment) -> list[str]:
+        text = " ".join(a.text for a in assignments)  # in which a name stands as a whole word, or not at all
+        return [v.name for v in variables if not re.search(rf"(?<![\w>.]){v.name}\b", text)]
+
+    unread = unread_names(program.start_inputs, *body.start_locals, *body.start)
     lines += ["}", "", start, "{", *(f"    (void)({n});" for n in unread)]
     lines += [f"    const double {a.name} = {a.text};" for a in body.start_locals]
     lines += [f"    c->{a.name} = {a.text};" for a in body.start]
-    unused = [v.name for v in program.inputs if not _reads(body.locals, v.name)]
-    lines += ["}", "", step, "{", *(f"    (void)({n});" for n in unused)]
+    lines += ["}", "", step, "{", *(f"    (void)({n});" for n in unread_names(program.inputs, *body.locals))]
     lines += [*(f"    const double {a.name} = {a.text};" for a in body.locals), ""]
     lines += [f"    c->{n} = {text};" for n, text in {**body.outputs, **body.states}.items()]
     return "\n".join([*lines, f"    return c->{program.outputs[0].name};", "}"]) + "\n"
 
 
-def _reads(assignments: tuple[tuple[str, str], ...], name: str) -> bool:
-    """Whether a name stands in one of the expressions, as a whole word."""
-    import re
-
-    return any(re.search(rf"(?<![\w>.]){name}\b", text) for _, text in assignments)
-
-
 def _test(program: ControllerProgram, header: Header, run: ReferenceRun) -> str:
     name, columns = header.name, len(program.inputs) + 1
     rows = [
-        "    {" + ", ".join(_number(v) for v in (*given, out)) + "},"
+        "    {" + ", ".join("NAN" if math.isnan(v) else C99.literal(v) for v in (*given, out)) + "},"
         for given, out in zip(run.inputs, run.outputs, strict=True)
     ]
     read = ", ".join(f"run[k][{i}]" for i in range(columns - 1))
@@ -244,12 +281,9 @@ def _test(program: ControllerProgram, header: Header, run: ReferenceRun) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _number(value: float) -> str:
-    """A number of the test's run, or none."""
-    return "NAN" if math.isnan(value) else C99.literal(value)
-
-
 _WHOLE = "LINT_TO_LREAL(LREAL_TO_LINT({0}))"
+
+
 _TANH = "(1.0 - 2.0 / (EXP(2.0 * MAX(-20.0, MIN(20.0, {0}))) + 1.0))"  # beyond 20 it is 1 in 16 digits
 
 
@@ -372,21 +406,16 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     signature = ", ".join(f"{v.name}: float" for v in program.inputs)
     begin = ", ".join(f"{v.name}: float" for v in program.start_inputs[:-1])
     period = PYTHON.literal(program.sample_time)
-    lines = ['"""', *header.lines, '"""', "", "import math", "", f"SAMPLE_TIME = {period}  # s", ""]
-    lines += [
-        "",
-        f"class {name}:",
-        '    """The controller: start it, then call step once a sample.',
-        "",
-        "    Parameters",
-    ]
-    lines += ["    ----------"]
+    lines = ['"""', *header.lines, '"""', "", "import math", "", f"SAMPLE_TIME = {period}  # s", "", ""]
+    lines += [f"class {name}:", '    """The controller: start it, then call step once a sample.', ""]
+    lines += ["    Parameters", "    ----------"]
     for v in program.parameters:
-        lines += textwrap.wrap(comment_text(_told(v)), 110, initial_indent="    ", subsequent_indent="        ")
+        lines += textwrap.wrap(comment_text(_description(v)), 110, initial_indent="    ", subsequent_indent="        ")
     lines += ['    """', "", "    def __init__(", "        self,", "        *,"]
     lines += [f"        {v.name}: float = {PYTHON.literal(v.value)}," for v in program.parameters]
     lines += ["    ) -> None:", *(f"        self.{v.name} = {v.name}" for v in program.parameters)]
-    lines += [_first_value(v) for v in (*program.states, *program.outputs)]
+    for v in (*program.states, *program.outputs):
+        lines += [f"        self.{v.name} = {'False' if v.is_flag else '0.0'}  # {comment_text(_description(v))}"]
     zeros = ", ".join("0.0" for _ in program.start_inputs[:-1])
     lines += ["        self.prepare()", f"        self.start({zeros})", ""]
     lines += ["    def prepare(self) -> None:", '        """Take over parameters that were changed."""']
@@ -399,21 +428,14 @@ def write_python(program: ControllerProgram, header: Header) -> dict[str, str]:
     lines += [f"        {a.name} = {a.text}" for a in body.start_locals]
     lines += [f"        self.{a.name} = {a.text}" for a in body.start]
     out = program.outputs[0]
-    lines += [
-        "",
-        f"    def step(self, {signature}) -> float:",
-        f'        """Compute a sample: {out.meaning} [{comment_text(out.unit)}]."""',
-    ]
+    lines += ["", f"    def step(self, {signature}) -> float:"]
+    lines += [f'        """Compute a sample: {out.meaning} [{comment_text(out.unit)}]."""']
     lines += [f"        {a.name} = {a.text}" for a in body.locals]
     lines += [f"        self.{n} = {text}" for n, text in {**body.outputs, **body.states}.items()]
     return {f"{header.name}.py": "\n".join([*lines, f"        return self.{out.name}"]) + "\n"}
 
 
-def _first_value(v: Variable) -> str:
-    return f"        self.{v.name} = {'False' if v.is_flag else '0.0'}  # {comment_text(_told(v))}"
-
-
-def _told(v: Variable) -> str:
+def _description(v: Variable) -> str:
     return f"{v.name} [{v.unit}]: {v.meaning}" if v.meaning else f"{v.name} [{v.unit}]"
 
 
@@ -452,19 +474,7 @@ def write_loop_javascript(loop: ClosedLoop) -> str:
     at ``points + 1`` equal instants; null where the loop is too stiff or leaves what its model describes. Parameters,
     states and outputs are those of the loop, in its order, which ``LOOP`` names. The reference is ``{at, initial,
     final, inputs}``, the last one optional: what other inputs are from that instant on, ``[[place, value], ...]``.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    NotImplementedError
-        If the loop has an operation that JavaScript has no word for, or a friction that sticks (`Karnopp`).
+    A loop with an operation that JavaScript has no word for, or a friction that sticks, raises `NotImplementedError`.
     """
     if FRICTION_DIRECTION in loop.parameters:
         raise NotImplementedError("a friction that sticks is simulated from event to event, which the page does not do")
@@ -509,83 +519,8 @@ def _method(name: str, signature: str, function: ca.Function, results: Sequence[
     return coefficients, [*lines, "    },"]
 
 
-class Language(Enum):
-    """In what a controller is written."""
-
-    C = "c"
-    STRUCTURED_TEXT = "st"
-    PYTHON = "python"
-
-
 _WRITERS: Mapping[Language, Callable[[ControllerProgram, Header], dict[str, str]]] = {
     Language.C: lambda program, header: write_c99(program, header, make_reference_run(program)),
     Language.STRUCTURED_TEXT: write_structured_text,
     Language.PYTHON: write_python,
 }
-
-
-def export_controller(
-    loop: ClosedLoop | Controller,
-    parameters: ParameterSet,
-    language: Language,
-    *,
-    name: str = "controller",
-    centre: float = 0.0,
-    origin: Sequence[str] = (),
-) -> dict[str, str]:
-    """Write the sampled controller of a loop in another language.
-
-    Parameters
-    ----------
-    loop : ClosedLoop or Controller
-        With a sample time. Of a loop, its controller alone is written.
-    parameters : ParameterSet
-        A missing one has the loop's default.
-    language : Language
-        C99 with a test, one function block of IEC 61131-3 structured text, or a Python class without dependencies.
-    name : str
-        Of the structure, block or class, and of the files.
-    centre : float
-        On the wire to the valve while the command is zero [the command's unit].
-    origin : sequence of str
-        What the files shall say of where the gains come from; any text.
-
-    Returns
-    -------
-    dict of str to str
-        Texts by the names of the files.
-
-    Raises
-    ------
-    InputError
-        If the name is no identifier, is reserved in a language, or is that of a number in the block; if the parameters
-        cannot run; `ModelError` if the controller is continuous.
-
-    Examples
-    --------
-    >>> from pneuopt.control.pid import PID
-    >>> from pneuopt.models.linear import FirstOrder
-    >>> loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, limits=False))
-    >>> list(export_controller(loop, loop.parameters, Language.C))
-    ['controller.h', 'controller.c', 'controller_test.c']
-    """
-    if isinstance(loop, Controller):
-        controller = loop
-    else:
-        check_closed_loop(loop)
-        loop.check(parameters)
-        controller = loop.controller
-    program = controller_program(controller, parameters, centre)
-    header = make_header(name, controller, parameters, centre, origin)
-    _check_block_name(header, program)
-    return _WRITERS[language](program, header)
-
-
-def _check_block_name(header: Header, program: ControllerProgram) -> None:
-    """Refuse a name that a language, the file system or a number of the block has."""
-    within = {n.casefold() for n in program.names}
-    taken = [n for n in header.own_names if n.casefold() in within]
-    reserved = "a file that compilers or Windows have" if header.name.casefold() in RESERVED_FILES else None
-    what = reserved_as(header.name) or reserved or (f"{taken[0]}, a number of the block" if taken else None)
-    free = Identifiers([*program.names, *RESERVED_FILES]).claim(f"{header.name}_control", f"{header.name}_block")
-    require(what is None, f"--name {header.name}: is {what}; take another, as --name {free}")

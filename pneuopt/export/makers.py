@@ -1,7 +1,7 @@
 """The PID blocks of common controllers: what is typed in, by which formula and source, what is refused.
 
-`BlockForm` says what is known of a maker's block, `BlockDesign` has the numbers of a controller that it takes. To add a
-maker, write its `BlockForm`, and a row in `BLOCK_FORMS`.
+`MakerBlock` says what is known of a maker's block, `BlockNumbers` has the numbers of a controller that it takes. To add
+a maker, write its `MakerBlock`, and a row in `MAKER_BLOCKS`.
 """
 
 import math
@@ -11,63 +11,49 @@ from enum import Enum
 from typing import NamedTuple
 
 from pneuopt.control.pid import ParallelForm
-from pneuopt.export.tolerances import MINUTE, OPEN_END, OPEN_LIMIT, PLAIN_WEIGHT, TIME_GRAIN, USUAL_UPDATE
+from pneuopt.export.tolerances import OPEN_LIMIT, TIME_GRAIN, USUAL_UPDATE
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.units import difference_unit, write_value
 
 BEHIND_OFFSET = "Behind the block: offset"
+
+
 BEHIND_FACTOR = "Behind the block: factor"
 """Settings of what the user's own program does with a block's output: ``wire = offset + factor output``."""
 
 
-@dataclass(frozen=True)
-class BlockDesign:
-    """The numbers of a tuned controller that a block takes, in SI units.
+class Block(Enum):
+    """Whose PID block takes the gains."""
 
-    Parameters
-    ----------
-    gains : ParallelForm
-    b, c : float
-    Tt : float
-        Of back-calculation [s]; nan where the design has another anti-windup or none.
-    low, high : float
-        Ends of the output on the wire [the command's unit]; infinite for none.
-    centre : float
-        On the wire while the command is zero.
-    sample_time : float
-    measured, measured_unit, command_unit : str
-    pv_low, pv_high : float
-        The range of the process value that the block counts on [the measured unit].
-    start : float
-        The process value where the references begin [the measured unit].
-    is_added_to : bool
-        Whether a feedforward or a dither is added to what the block computes, before the limits.
-    goes : str
-        Where the output goes.
-    zero : str
-        What the command zero is.
-    reach : str
-        What the range of the process value holds.
-    """
+    SIEMENS = "siemens"
+    ROCKWELL = "rockwell"
+    BECKHOFF = "beckhoff"
+    CODESYS = "codesys"
+    SIMULINK = "simulink"
+
+
+@dataclass(frozen=True)
+class BlockNumbers:
+    """The numbers of a tuned controller that a block takes, in SI units."""
 
     gains: ParallelForm
     b: float
     c: float
-    Tt: float
-    low: float
-    high: float
-    centre: float
-    sample_time: float
+    Tt: float  # [s] of back-calculation; nan where the design has another anti-windup or none
+    low: float  # end of the output on the wire [the command's unit]; infinite for none
+    high: float  # the other end
+    centre: float  # on the wire while the command is zero
+    sample_time: float  # [s]
     measured: str
     measured_unit: str
     command_unit: str
-    pv_low: float = -0.5
+    pv_low: float = -0.5  # range of the process value that the block counts on [the measured unit]
     pv_high: float = 0.5
-    start: float = 0.0
-    is_added_to: bool = False
-    goes: str = "on the wire"
-    zero: str = "the centre"
-    reach: str = "the references and as far again"
+    start: float = 0.0  # process value where the references begin
+    is_added_to: bool = False  # whether a feedforward or a dither is added before the limits
+    goes: str = "on the wire"  # where the output goes
+    zero: str = "the centre"  # what the command zero is
+    reach: str = "the references and as far again"  # what the range of the process value holds
 
     @property
     def span(self) -> float:
@@ -119,43 +105,22 @@ class Setting(NamedTuple):
 
 
 @dataclass(frozen=True)
-class BlockForm:
-    """What is known of a block.
-
-    Attributes
-    ----------
-    title, formula : str
-    sources : tuple of str
-    settings : callable
-        From a `BlockDesign`; raises `InputError` for gains that the block cannot have.
-    states : callable
-        What the output is at rest, at a fault and while the block is stopped, from a `BlockDesign`.
-    manual : str
-        How it is held in manual at the centre.
-    added : callable, optional
-        Where a signal in the command's unit is added before the limits, from a `BlockDesign`; None: the block has no
-        such input.
-    weights : callable
-        The set-point weights b and c that the block has in place of a design's own.
-    has_filter : bool
-        Whether its derivative has a filter of first order that can be set.
-    clamps : bool
-        Whether its integral is clamped at a limit, or may be taken to be.
-    time_grain : float
-        What its times are rounded to [s]; 0 for nothing.
-    """
+class MakerBlock:
+    """What is known of a maker's PID block."""
 
     title: str
     formula: str
     sources: tuple[str, ...]
-    settings: Callable[[BlockDesign], list[Setting]]
-    states: Callable[[BlockDesign], list[str]]
-    manual: str
-    added: Callable[[BlockDesign], str] | None = None
-    weights: Callable[[BlockDesign], tuple[float, float]] = lambda d: (d.b, d.c)
-    has_filter: bool = True
-    clamps: bool = True
-    time_grain: float = 0.0
+    settings: Callable[[BlockNumbers], list[Setting]]  # refuses gains that the block cannot have
+    states: Callable[[BlockNumbers], list[str]]  # what the output is at rest, at a fault and while stopped
+    manual: str  # how it is held in manual at the centre
+    # where a signal in the command's unit is added before the limits; None: there is no such input
+    added: Callable[[BlockNumbers], str] | None = None
+    # set-point weights b, c that it has in their place
+    weights: Callable[[BlockNumbers], tuple[float, float]] = lambda d: (d.b, d.c)
+    has_filter: bool = True  # whether its derivative has a filter of first order that can be set
+    clamps: bool = True  # whether its integral is clamped at a limit, or may be taken to be
+    time_grain: float = 0.0  # what its times are rounded to [s]; 0 for nothing
 
     @property
     def maker(self) -> str:
@@ -180,29 +145,23 @@ def flag(value: bool) -> str:
 
 def nearest_weight(value: float) -> float:
     """Of the weights 0 and 1 the nearer one."""
-    return 0.0 if value < PLAIN_WEIGHT else 1.0
+    return 0.0 if value < 0.5 else 1.0
 
 
-def wire(value: float, design: BlockDesign) -> str:
+def wire(value: float, design: BlockNumbers) -> str:
     """An output in its unit."""
     return write_value(value, design.command_unit)
 
 
-def check_limits(design: BlockDesign, block: str) -> None:
+def check_limits(design: BlockNumbers, block: str) -> None:
     """Refuse a design without limits where the block counts its output in percent of them."""
     told = f"{block} counts its output in percent of the command's range, and this design has no limits"
     remedy = "state limits under [pid] of tuning.toml and tune again, or use --to st"
     require(math.isfinite(design.span), f"{told}; {remedy}")
 
 
-def standard_times(design: BlockDesign, block: str) -> tuple[float, float]:
-    """Ti, infinite for no integral, and Td [s] of a block whose gain multiplies all its terms.
-
-    Raises
-    ------
-    InputError
-        If Kp = 0 while another gain is not.
-    """
+def standard_times(design: BlockNumbers, block: str) -> tuple[float, float]:
+    """Ti, infinite for no integral, and Td [s] of a block whose gain multiplies all its terms; refuses Kp = 0 there."""
     Kp, Ki, Kd = design.gains.Kp, design.gains.Ki, design.gains.Kd
     told = f"{block} multiplies its integral and its derivative by its gain"
     given = f"this design has Kp = 0, Ki = {Ki:g}, Kd = {Kd:g}"
@@ -210,7 +169,7 @@ def standard_times(design: BlockDesign, block: str) -> tuple[float, float]:
     return Kp / Ki if Ki else math.inf, Kd / Kp if Kp else 0.0
 
 
-def direction(design: BlockDesign, block: str) -> float:
+def direction(design: BlockNumbers, block: str) -> float:
     """1, or -1 of a design whose gains are negative; refuses gains of both signs."""
     Kp, Ki, Kd = design.gains.Kp, design.gains.Ki, design.gains.Kd
     signs = {math.copysign(1.0, g) for g in (Kp, Ki, Kd) if g}
@@ -222,7 +181,7 @@ def direction(design: BlockDesign, block: str) -> float:
 PID_COMPACT = "Siemens PID_Compact"
 
 
-def _siemens_settings(d: BlockDesign) -> list[Setting]:
+def _siemens_settings(d: BlockNumbers) -> list[Setting]:
     check_limits(d, PID_COMPACT)
     Ti, Td = standard_times(d, PID_COMPACT)
     sign, percent = direction(d, PID_COMPACT), 100.0 / d.span
@@ -262,7 +221,7 @@ def _siemens_settings(d: BlockDesign) -> list[Setting]:
     ]
 
 
-def _siemens_states(d: BlockDesign) -> list[str]:
+def _siemens_states(d: BlockNumbers) -> list[str]:
     rest = wire(d.centre, d)
     return [
         f"At error 0 from rest: Output = 0 %, {rest} on the wire.",
@@ -273,7 +232,7 @@ def _siemens_states(d: BlockDesign) -> list[str]:
     ]
 
 
-def _counts(d: BlockDesign) -> str:
+def _counts(d: BlockNumbers) -> str:
     """The same in counts of an analogue output of 10 V, which has 27648 of them."""
     if d.command_unit != "V":
         return "; not Output_PER, which has no offset"
@@ -282,17 +241,11 @@ def _counts(d: BlockDesign) -> str:
     return f"; at a 10 V output {counts} counts, not Output_PER"
 
 
-def _siemens_weights(d: BlockDesign) -> tuple[float, float]:
+def _siemens_weights(d: BlockNumbers) -> tuple[float, float]:
     return min(max(d.b, 0.0), 1.0), min(max(d.c, 0.0), 1.0)
 
 
-def _siemens_sum_input(d: BlockDesign) -> str:
-    return (
-        f"Disturbance = {number(100.0 / d.span)} %/({d.command_unit}) x sum (INFERRED: it is added before the limits)"
-    )
-
-
-SIEMENS_FORM = BlockForm(
+SIEMENS_BLOCK = MakerBlock(
     "Siemens PID_Compact (S7-1200, S7-1500), V2",
     "y = Gain ((b w - x) + 1/(Ti s) (w - x) + Td s/(a Td s + 1) (c w - x)) + Disturbance, w setpoint, x Input, y in %",
     (
@@ -306,7 +259,9 @@ SIEMENS_FORM = BlockForm(
     _siemens_settings,
     _siemens_states,
     "Mode = 4 with ManualValue = 0.0",
-    _siemens_sum_input,
+    lambda d: (
+        f"Disturbance = {number(100.0 / d.span)} %/({d.command_unit}) x sum (INFERRED: it is added before the limits)"
+    ),
     _siemens_weights,
 )
 """PID_Compact as of V2: 0 % of its output is made the centre, as it gives 0 % whenever it does not control."""
@@ -315,32 +270,32 @@ SIEMENS_FORM = BlockForm(
 LOGIX_PID = "Rockwell PID"
 
 
-def _can_be_enhanced(d: BlockDesign) -> bool:
+def _can_be_enhanced(d: BlockNumbers) -> bool:
     """Whether PIDE runs the design: its velocity form rests at the centre by its integral only."""
     return d.integrates and not d.is_added_to
 
 
-def _can_be_plain(d: BlockDesign) -> bool:
+def _can_be_plain(d: BlockNumbers) -> bool:
     """Whether PID runs it as well as PIDE: its proportional term sees the error."""
     return nearest_weight(d.b) == 1 or not _can_be_enhanced(d)
 
 
-def _rockwell_weights(d: BlockDesign) -> tuple[float, float]:
+def _rockwell_weights(d: BlockNumbers) -> tuple[float, float]:
     return (1.0 if _can_be_plain(d) else 0.0), nearest_weight(d.c)
 
 
-def _rockwell_settings(d: BlockDesign) -> list[Setting]:
+def _rockwell_settings(d: BlockNumbers) -> list[Setting]:
     check_limits(d, LOGIX_PID)
     plain = _plain_settings(d) if _can_be_plain(d) else []
     return plain + (_enhanced_settings(d) if _can_be_enhanced(d) else [])
 
 
-def _scaled_gains(d: BlockDesign) -> tuple[float, float, float]:
+def _scaled_gains(d: BlockNumbers) -> tuple[float, float, float]:
     scale = direction(d, LOGIX_PID) * d.pv_span / d.span
     return d.gains.Kp * scale, d.gains.Ki * scale, d.gains.Kd * scale
 
 
-def _plain_settings(d: BlockDesign) -> list[Setting]:
+def _plain_settings(d: BlockNumbers) -> list[Setting]:
     Kp, Ki, Kd = _scaled_gains(d)
     inverse = direction(d, LOGIX_PID) < 0
     S, R = write_value(d.pv_span, difference_unit(d.measured_unit)), wire(d.span, d)
@@ -372,7 +327,7 @@ def _plain_settings(d: BlockDesign) -> list[Setting]:
     return [Setting(f"PID .{name}", value, formula) for name, value, formula in rows]
 
 
-def _enhanced_settings(d: BlockDesign) -> list[Setting]:
+def _enhanced_settings(d: BlockNumbers) -> list[Setting]:
     Kp, Ki, Kd = _scaled_gains(d)
     inverse = direction(d, LOGIX_PID) < 0
     unit, on = d.measured_unit, d.command_unit
@@ -384,8 +339,8 @@ def _enhanced_settings(d: BlockDesign) -> list[Setting]:
             number(Kp),
             f"Kp S/R, S the span of PV, here {write_value(d.pv_span, difference_unit(unit))}, R that of CV",
         ),
-        ("IGain", number(Ki * MINUTE), "[1/min] 60 Ki S/R"),
-        ("DGain", number(Kd / MINUTE), "[min] Kd/60 S/R; 0 is no derivative"),
+        ("IGain", number(Ki * 60.0), "[1/min] 60 Ki S/R"),
+        ("DGain", number(Kd / 60.0), "[min] Kd/60 S/R; 0 is no derivative"),
         ("PVEProportional", str(b < 1).lower(), "b = 0: of PV; b = 1: of the error"),
         ("PVEDerivative", str(c < 1).lower(), "c = 0: of PV; c = 1: of the error"),
         ("DSmoothing", "false", "its time is not published"),
@@ -409,7 +364,7 @@ def _enhanced_settings(d: BlockDesign) -> list[Setting]:
     return [Setting(f"PIDE {name}", value, formula) for name, value, formula in rows]
 
 
-def _rockwell_states(d: BlockDesign) -> list[str]:
+def _rockwell_states(d: BlockNumbers) -> list[str]:
     rest = f"{number(d.rest)} %, {wire(d.centre, d)} on the wire"
     lines = []
     if _can_be_plain(d):
@@ -432,11 +387,7 @@ def _rockwell_states(d: BlockDesign) -> list[str]:
     ]
 
 
-def _rockwell_sum_input(d: BlockDesign) -> str:
-    return f"BIAS = {number(d.rest)} + {number(100.0 / d.span)} %/({d.command_unit}) x sum, every scan"
-
-
-ROCKWELL_FORM = BlockForm(
+ROCKWELL_BLOCK = MakerBlock(
     "Rockwell PID and PIDE (Logix 5000)",
     "independent CV = KP E + KI int E dt + KD dE/dt + BIAS, E and CV in % of their spans; PIDE adds the changes of it",
     (
@@ -451,7 +402,7 @@ ROCKWELL_FORM = BlockForm(
     _rockwell_settings,
     _rockwell_states,
     "PID: SWM = 1; PIDE: ProgManualReq = true",
-    _rockwell_sum_input,
+    lambda d: f"BIAS = {number(d.rest)} + {number(100.0 / d.span)} %/({d.command_unit}) x sum, every scan",
     _rockwell_weights,
     has_filter=False,
 )
@@ -461,12 +412,12 @@ ROCKWELL_FORM = BlockForm(
 UTIL_PID = "CODESYS Util.PID_FIXCYCLE"
 
 
-def _codesys_settings(d: BlockDesign) -> list[Setting]:
+def _codesys_settings(d: BlockNumbers) -> list[Setting]:
     Ti, Td = standard_times(d, UTIL_PID)
     direction(d, UTIL_PID)  # typed in with their sign, which must be one
     name, unit = ("PID_FIXCYCLE" if d.integrates else "PD"), d.command_unit
     is_open = math.isinf(d.low) and math.isinf(d.high)
-    low, high = (0.0, 0.0) if is_open else (max(d.low, -OPEN_END), min(d.high, OPEN_END))
+    low, high = (0.0, 0.0) if is_open else (max(d.low, -OPEN_LIMIT), min(d.high, OPEN_LIMIT))
     limits = "both 0: no limit" if is_open else d.goes
     integral = [("TN", number(Ti), "Kp/Ki [s]")] if d.integrates else []
     clock = [("CYCLE", number(d.sample_time), "sample time [s], the period of the task")]
@@ -485,13 +436,14 @@ def _codesys_settings(d: BlockDesign) -> list[Setting]:
     return [Setting(f"{name}.{field}", value, formula) for field, value, formula in rows]
 
 
-def _codesys_states(d: BlockDesign) -> list[str]:
+def _codesys_states(d: BlockNumbers) -> list[str]:
     rest = wire(d.centre, d)
     block = "Util.PID_FIXCYCLE" if d.integrates else "Util.PD, as there is no integral: TN = 0 has no meaning in PID"
     task = f"it must be called by a task of {number(d.sample_time)} s"
+    is_rough = d.differentiates and not d.integrates
     return [
         f"The block is {block}; {task}.",
-        *(["PD measures the time itself, in whole ms: its derivative is rough."] if _is_rough(d) else []),
+        *(["PD measures the time itself, in whole ms: its derivative is rough."] if is_rough else []),
         f"At error 0 from rest: Y = Y_OFFSET, {rest}. In manual Y_MANUAL, at RESET Y_OFFSET: the same.",
         "At a fault of the sensor: it goes on with the last value. Set MANUAL by your input's diagnosis"
         + (", and by OVERFLOW." if d.integrates else "."),
@@ -499,15 +451,7 @@ def _codesys_states(d: BlockDesign) -> list[str]:
     ]
 
 
-def _is_rough(d: BlockDesign) -> bool:
-    return d.differentiates and not d.integrates
-
-
-def _codesys_sum_input(d: BlockDesign) -> str:
-    return f"Y_OFFSET = {number(d.centre)} {d.command_unit} + sum, every cycle"
-
-
-CODESYS_FORM = BlockForm(
+CODESYS_BLOCK = MakerBlock(
     "CODESYS Util.PID_FIXCYCLE, Util.PD without an integral",
     "Y = KP (e + 1/TN int e dt + TV de/dt) + Y_OFFSET; PD: Y = KP (e + TV de/dt) + Y_OFFSET",
     (
@@ -521,7 +465,7 @@ CODESYS_FORM = BlockForm(
     _codesys_settings,
     _codesys_states,
     "MANUAL := TRUE",
-    _codesys_sum_input,
+    lambda d: f"Y_OFFSET = {number(d.centre)} {d.command_unit} + sum, every cycle",
     weights=lambda _: (1.0, 1.0),
     has_filter=False,
 )
@@ -536,7 +480,7 @@ def _time(seconds: float) -> str:
     return f"T#{round(seconds / TIME_GRAIN)}ms" if math.isfinite(seconds) else "T#0ms"
 
 
-def _beckhoff_settings(d: BlockDesign) -> list[Setting]:
+def _beckhoff_settings(d: BlockNumbers) -> list[Setting]:
     Ti, Td = standard_times(d, FB_CTRL_PID)
     direction(d, FB_CTRL_PID)  # typed in with their sign, which must be one
     shown = write_value(Ti, "s") if math.isfinite(Ti) else ""
@@ -565,7 +509,7 @@ def _beckhoff_settings(d: BlockDesign) -> list[Setting]:
     ]
 
 
-def _beckhoff_states(d: BlockDesign) -> list[str]:
+def _beckhoff_states(d: BlockNumbers) -> list[str]:
     rest = wire(d.centre, d)
     return [
         f"At error 0 from rest: fOut = 0, {rest} on the wire.",
@@ -576,7 +520,7 @@ def _beckhoff_states(d: BlockDesign) -> list[str]:
     ]
 
 
-BECKHOFF_FORM = BlockForm(
+BECKHOFF_BLOCK = MakerBlock(
     "Beckhoff FB_CTRL_PID (TF4100 Controller Toolbox)",
     "G(s) = fKp (1 + 1/(tTn s) + tTv s/(1 + tTd s))",
     (
@@ -595,25 +539,24 @@ BECKHOFF_FORM = BlockForm(
 """FB_CTRL_PID of the Controller Toolbox: its output is 0 whenever it does not control."""
 
 
-def _simulink_settings(d: BlockDesign) -> list[Setting]:
+def _simulink_settings(d: BlockNumbers) -> list[Setting]:
     Tf, (low, high) = d.gains.Tf, d.limits
     kind = {(True, True): "PID", (True, False): "PI"}.get((d.integrates, d.differentiates), "PD")
     begin = f"where it starts at rest, here y0 = {number(d.start)} {d.measured_unit}"
-    derivative = [
-        Setting("D", number(d.gains.Kd), "Kd"),
-        Setting("c", number(d.c), "c"),
-        *(
-            _filter_settings(d, begin)
-            if Tf
-            else [
-                Setting(
-                    "Use filtered derivative",
-                    "off",
-                    "Tf = 0: no filter; its first sample is a kick where c r - y is not 0",
-                )
-            ]
-        ),
-    ]
+    method = Setting("Integrator method", "Backward Euler", "as the design is sampled")
+    first = number(d.gains.Kp * (1 - d.b) * d.start), f"P (1 - b) y0, {begin}"
+    integral = [method, Setting("Integrator initial condition", *first)] if d.integrates else []
+    unfiltered = "Tf = 0: no filter; its first sample is a kick where c r - y is not 0"
+    lag = [Setting("Use filtered derivative", "off", unfiltered)]
+    if Tf:
+        lag = [
+            Setting("Use filtered derivative", "on", "as the design"),
+            Setting("N", number(1 / Tf), "1/Tf, a pole [rad/s], not ISA's ratio"),
+            Setting("Filter method", "Backward Euler", "as the design is sampled"),
+            Setting("Filter initial condition", number(d.gains.Kd * (d.c - 1) * d.start), f"D (c - 1) y0, {begin}"),
+        ]
+    bias = f"{d.command_unit}: a Bias block behind the output and its limits" if d.centre else f"{d.command_unit}"
+    derivative = [Setting("D", number(d.gains.Kd), "Kd"), Setting("c", number(d.c), "c"), *lag]
     return [
         Setting("Controller", kind, "PD with D = 0 is P alone: the block has no P" if kind == "PD" else "its terms"),
         Setting("Form", "Parallel", ""),
@@ -623,34 +566,14 @@ def _simulink_settings(d: BlockDesign) -> list[Setting]:
         *([Setting("I", number(d.gains.Ki), "Ki")] if d.integrates else []),
         Setting("b", number(d.b), "b"),
         *(derivative if kind != "PI" else []),
-        *(_integral_settings(d, begin) if d.integrates else []),
+        *integral,
         *_limit_settings(low, high, d),
-        Setting(
-            BEHIND_OFFSET,
-            number(d.centre),
-            f"{d.command_unit}: a Bias block behind the output and its limits" if d.centre else f"{d.command_unit}",
-        ),
+        Setting(BEHIND_OFFSET, number(d.centre), bias),
         Setting(BEHIND_FACTOR, "1", f"{d.command_unit} {d.goes} for 1 {d.command_unit} of the output"),
     ]
 
 
-def _filter_settings(d: BlockDesign, begin: str) -> list[Setting]:
-    return [
-        Setting("Use filtered derivative", "on", "as the design"),
-        Setting("N", number(1 / d.gains.Tf), "1/Tf, a pole [rad/s], not ISA's ratio"),
-        Setting("Filter method", "Backward Euler", "as the design is sampled"),
-        Setting("Filter initial condition", number(d.gains.Kd * (d.c - 1) * d.start), f"D (c - 1) y0, {begin}"),
-    ]
-
-
-def _integral_settings(d: BlockDesign, begin: str) -> list[Setting]:
-    return [
-        Setting("Integrator method", "Backward Euler", "as the design is sampled"),
-        Setting("Integrator initial condition", number(d.gains.Kp * (1 - d.b) * d.start), f"P (1 - b) y0, {begin}"),
-    ]
-
-
-def _limit_settings(low: float, high: float, d: BlockDesign) -> list[Setting]:
+def _limit_settings(low: float, high: float, d: BlockNumbers) -> list[Setting]:
     back = math.isfinite(d.Tt)
     inside = math.isfinite(low) or math.isfinite(high)
     if d.is_open or not inside:
@@ -667,7 +590,7 @@ def _limit_settings(low: float, high: float, d: BlockDesign) -> list[Setting]:
     ]
 
 
-def _simulink_states(d: BlockDesign) -> list[str]:
+def _simulink_states(d: BlockNumbers) -> list[str]:
     rest = wire(d.centre, d)
     return [
         f"At error 0 from rest: the output is 0, {rest} on the wire behind the Bias block.",
@@ -677,7 +600,7 @@ def _simulink_states(d: BlockDesign) -> list[str]:
     ]
 
 
-SIMULINK_FORM = BlockForm(
+SIMULINK_BLOCK = MakerBlock(
     "Simulink Discrete PID Controller (2DOF), form Parallel",
     "u = P (b r - y) + I Ts z/(z - 1) (r - y) + D N/(1 + N Ts z/(z - 1)) (c r - y)",
     (
@@ -692,21 +615,11 @@ SIMULINK_FORM = BlockForm(
 """The block with two degrees of freedom: its output is 0 at rest, and a Bias block behind it adds the centre."""
 
 
-class Block(Enum):
-    """Whose PID block takes the gains."""
-
-    SIEMENS = "siemens"
-    ROCKWELL = "rockwell"
-    BECKHOFF = "beckhoff"
-    CODESYS = "codesys"
-    SIMULINK = "simulink"
-
-
-BLOCK_FORMS: Mapping[Block, BlockForm] = {
-    Block.SIEMENS: SIEMENS_FORM,
-    Block.ROCKWELL: ROCKWELL_FORM,
-    Block.BECKHOFF: BECKHOFF_FORM,
-    Block.CODESYS: CODESYS_FORM,
-    Block.SIMULINK: SIMULINK_FORM,
+MAKER_BLOCKS: Mapping[Block, MakerBlock] = {
+    Block.SIEMENS: SIEMENS_BLOCK,
+    Block.ROCKWELL: ROCKWELL_BLOCK,
+    Block.BECKHOFF: BECKHOFF_BLOCK,
+    Block.CODESYS: CODESYS_BLOCK,
+    Block.SIMULINK: SIMULINK_BLOCK,
 }
 """What is known of each block."""

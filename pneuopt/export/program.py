@@ -54,25 +54,14 @@ _NOT_READ = ("measured_read", "output_read")
 
 @dataclass(frozen=True)
 class Variable:
-    """A number of a program.
+    """A number of a program."""
 
-    Parameters
-    ----------
-    name, unit, meaning : str
-    value : float
-        Of a parameter; of another 0.
-    origin : str
-        What the loop calls it ("pid.Kp"), where it has it; `name` is an identifier in every language.
-    is_flag : bool
-        Whether it is on or off, 1 or 0.
-    """
-
-    name: str
+    name: str  # an identifier in every language
     unit: str
     meaning: str
-    value: float = 0.0
-    origin: str = ""
-    is_flag: bool = False
+    value: float = 0.0  # of a parameter
+    origin: str = ""  # what the loop calls it, "pid.Kp"
+    is_flag: bool = False  # whether it is on or off, 1 or 0
 
 
 FAULT_FLAG = Variable(FAULT, "1", "whether this sample had a signal that is no number", is_flag=True)
@@ -80,32 +69,18 @@ FAULT_FLAG = Variable(FAULT, "1", "whether this sample had a signal that is no n
 
 @dataclass(frozen=True)
 class ControllerProgram:
-    """What a sampled controller computes, apart from any plant and any language.
+    """What a sampled controller computes, apart from any plant and any language."""
 
-    Attributes
-    ----------
-    sample_time : float
-        [s]
-    parameters, inputs, states, outputs : tuple of Variable
-        The first output is what the actuator gets, the last one the flag of a fault.
-    start_inputs : tuple of Variable
-    start : casadi.Function
-        ``(start_inputs, parameters) -> states``: at rest, or from another controller's output without a bump.
-    step : casadi.Function
-        ``(inputs, states, parameters) -> (outputs and next states, terms)``.
-    terms : tuple of str
-        Names of intermediate values.
-    """
-
-    sample_time: float
+    sample_time: float  # [s]
     parameters: tuple[Variable, ...]
     inputs: tuple[Variable, ...]
     states: tuple[Variable, ...]
-    outputs: tuple[Variable, ...]
+    outputs: tuple[Variable, ...]  # the first is what the actuator gets, the last the flag of a fault
     start_inputs: tuple[Variable, ...]
+    # (start_inputs, parameters) -> states: at rest, or from another controller's output without a bump
     start: ca.Function
-    step: ca.Function
-    terms: tuple[str, ...]
+    step: ca.Function  # (inputs, states, parameters) -> (outputs and next states, terms)
+    terms: tuple[str, ...]  # names of values on the way
 
     @property
     def values(self) -> list[float]:
@@ -130,27 +105,14 @@ class ControllerProgram:
 
 
 def controller_program(controller: Controller, parameters: ParameterSet, centre: float = 0.0) -> ControllerProgram:
-    """The program of a controller.
+    """The program of a sampled controller; `centre` is on the wire while the command is zero [the command's unit].
 
-    Parameters
-    ----------
-    controller : Controller
-        With a sample time. What is behind it, an analogue dither say, and before it, a sensor's lag or steps, is
-        hardware and not in the program; what an `Encoder` computes of a position is.
-    parameters : ParameterSet
-    centre : float
-        On the wire to the valve while the command is zero [the command's unit]; 0 for nothing.
-
-    Raises
-    ------
-    ModelError
-        If the controller is continuous.
-    InputError
-        If the parameters cannot run.
+    What is behind it, an analogue dither say, and before it, a sensor's lag or steps, is hardware and not in the
+    program; what an `Encoder` computes of a position is.
     """
     check_sampled(controller)
     controller.check(parameters)
-    return _assemble(_law(controller), controller, parameters, centre)
+    return _assemble(_symbolic_law(controller), controller, parameters, centre)
 
 
 def check_sampled(controller: Controller) -> None:
@@ -172,29 +134,19 @@ class _WrappedDither(Dither):
 
 
 @dataclass(frozen=True)
-class _Law:
-    """The controller symbolically.
+class _SymbolicLaw:
+    """The controller symbolically, by the loop's names."""
 
-    Attributes
-    ----------
-    inputs, states, parameters : dict of str to casadi.SX
-        By the loop's names, and "sample", "centre", "measured", "output" and "reading NAME".
-    measured : Quantity
-        What the controller's input shows.
-    after, start, terms : dict of str to casadi.SX
-        Next states, first ones, and intermediate values.
-    """
-
-    inputs: Signals
+    inputs: Signals  # "measured", "output" and "reading NAME", too
     states: Signals
     parameters: Signals
-    measured: Quantity
+    measured: Quantity  # what the controller's input shows
     after: Signals
     start: Signals
     terms: Signals
 
 
-def _law(controller: Controller) -> _Law:
+def _symbolic_law(controller: Controller) -> _SymbolicLaw:
     """What is computed at a sample, and at the start."""
     sensor, dither = controller.sensor, controller.dither
     counts = isinstance(sensor, Encoder) and sensor.differentiates(controller.sensed_signal)
@@ -214,7 +166,7 @@ def _law(controller: Controller) -> _Law:
     renamed = {"reference_read": "setpoint_read", f"{measured.name}_read": "measured_read"}
     renamed |= {n: f"{n}_term" for n in ADDED_TERMS}
     terms = {renamed.get(n, n): v for n, v in found.terms.items() if n not in _NOT_READ}
-    return _Law(u, x, p, measured, after, _start(computed, u, measured.name, readings, p), terms)
+    return _SymbolicLaw(u, x, p, measured, after, _start(computed, u, measured.name, readings, p), terms)
 
 
 def _reading(name: str) -> str:
@@ -242,7 +194,7 @@ def _start(computed: Controller, u: Signals, measured: str, readings: Iterable[s
     return {**begun, f"pid.{BAD_SAMPLES}": ca.if_else(good, 0, own["fault_samples"]), SAMPLE: ca.SX(0)}
 
 
-def _assemble(law: _Law, controller: Controller, parameters: ParameterSet, centre: float) -> ControllerProgram:
+def _assemble(law: _SymbolicLaw, controller: Controller, parameters: ParameterSet, centre: float) -> ControllerProgram:
     """The program of a law, with the states and parameters that it needs and no others."""
     outputs = _outputs(law, controller, centre)
     states = _needed_states(ca.vertcat(*(v for v, _ in outputs.values())), law.states, law.after)
@@ -276,7 +228,7 @@ def _assemble(law: _Law, controller: Controller, parameters: ParameterSet, centr
     )
 
 
-class _Names(NamedTuple):
+class _ClaimedNames(NamedTuple):
     """What is called how, by the loop's names."""
 
     parameters: Mapping[str, str]
@@ -287,15 +239,12 @@ class _Names(NamedTuple):
 
 def _claim_names(
     controller: Controller, outputs: Iterable[str], given: Iterable[str], states: Iterable[str], terms: Iterable[str]
-) -> _Names:
-    """The shortest name of each that is free.
-
-    The signals of the block come first, so that they are called alike in every program, then the parameters.
-    """
+) -> _ClaimedNames:
+    """The shortest name of each that is free: the block's signals first, so that they are called alike everywhere."""
     taken = Identifiers([*FIXED_NAMES, *outputs, *(_rate_name(q.name) for q in controller.motion_inputs)])
     parameters = {n: taken.claim(_short_name(n), n) for n in sorted(given, key=lambda n: n != CENTRE)}
     taken.take(*C_NAMES)
-    return _Names(
+    return _ClaimedNames(
         parameters,
         {n: taken.claim(_short_name(n), n) for n in states},
         {n: taken.claim(n, f"{n}_reading") for n in controller.readings},
@@ -319,7 +268,7 @@ def _more_inputs(controller: Controller, names: Mapping[str, str]) -> tuple[Vari
     return (*rates, *(Variable(names[n], units[n], f"{told}, as its sensor shows it") for n, told in read))
 
 
-def _outputs(law: _Law, controller: Controller, centre: float) -> dict[str, tuple[ca.SX, str]]:
+def _outputs(law: _SymbolicLaw, controller: Controller, centre: float) -> dict[str, tuple[ca.SX, str]]:
     """What the controller gives: the value, and what it is."""
     delayed, wire = bool(controller.pid.delay), law.parameters[CENTRE] if centre else ca.SX(0)
     command = law.after["pid.pending" if delayed else "pid.command"]

@@ -22,7 +22,7 @@ from pneuopt.control.tolerances import LARGEST_SIGNAL
 from pneuopt.dynamics.compiled.c_writer import DIVISIONS, Instruction, read_instructions
 from pneuopt.export.identifiers import Identifiers
 from pneuopt.export.program import C_NAMES, ControllerProgram
-from pneuopt.export.tolerances import MAX_BLOCK_NAME, MAX_COMMENT, MAX_INLINE, SELECT
+from pneuopt.export.tolerances import MAX_COMMENT, MAX_IDENTIFIER, MAX_INLINE, SELECT
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import provenance
@@ -88,24 +88,12 @@ ARITHMETIC: Mapping[int, OperationSyntax] = {
 
 @dataclass(frozen=True)
 class Syntax:
-    """What a language calls the operations.
+    """What a language calls the operations."""
 
-    Attributes
-    ----------
-    forms : mapping of int to OperationSyntax
-        By CasADi's operation, and `SELECT`.
-    infinity : str
-        A number larger than all others.
-    truth : OperationSyntax
-        1 where a condition holds, else 0.
-    condition : OperationSyntax
-        Whether a number is not 0.
-    """
-
-    forms: Mapping[int, OperationSyntax]
-    infinity: str
-    truth: OperationSyntax
-    condition: OperationSyntax
+    forms: Mapping[int, OperationSyntax]  # by CasADi's operation, and `SELECT`
+    infinity: str  # a number larger than all others
+    truth: OperationSyntax  # 1 where a condition holds, else 0
+    condition: OperationSyntax  # whether a number is not 0
 
     def literal(self, value: float) -> str:
         """A number that reads back as the same double."""
@@ -123,70 +111,28 @@ class Assignment(NamedTuple):
 
 @dataclass
 class Written:
-    """What `write_expressions` gives.
+    """A Function in a language."""
 
-    Attributes
-    ----------
-    coefficients : list of Assignment
-        What depends on the parameters alone.
-    statements : list of Assignment
-        What is computed at every sample before the results.
-    results : dict of str to str
-        The expression of each result.
-    operations : set of int
-        The operations in them.
-    """
-
-    coefficients: list[Assignment] = field(default_factory=list)
-    statements: list[Assignment] = field(default_factory=list)
-    results: dict[str, str] = field(default_factory=dict)
-    operations: set[int] = field(default_factory=set)
+    coefficients: list[Assignment] = field(default_factory=list)  # what depends on the parameters alone
+    statements: list[Assignment] = field(default_factory=list)  # what is computed at every sample before the results
+    results: dict[str, str] = field(default_factory=dict)  # the expression of each result
+    operations: set[int] = field(default_factory=set)  # CasADi's, in them
 
 
 class Names(NamedTuple):
-    """What the numbers of a Function are called.
+    """What the numbers of a Function are called."""
 
-    Attributes
-    ----------
-    inputs : sequence of sequence of str
-        The entries of each argument.
-    results : sequence of str
-        The entries of the first output.
-    labels : sequence of str
-        Those of the second, which only gives names to values on the way; a Function may have but one output.
-    parameters : frozenset of str
-        Which inputs are known before the sample.
-    constants : mapping of float to str
-        Names of constants.
-    coefficient : str
-        How a value that depends on the parameters alone is reached, {} being its name.
-    taken : frozenset of str
-        Names besides that no value on the way may have.
-    """
-
-    inputs: Sequence[Sequence[str]]
-    results: Sequence[str]
-    labels: Sequence[str] = ()
-    parameters: frozenset[str] = frozenset()
+    inputs: Sequence[Sequence[str]]  # the entries of each argument
+    results: Sequence[str]  # the entries of the first output
+    labels: Sequence[str] = ()  # of the second output, which may be absent: it only gives names to values on the way
+    parameters: frozenset[str] = frozenset()  # which inputs are known before the sample
     constants: Mapping[float, str] = {}
-    coefficient: str = "{}"
-    taken: frozenset[str] = frozenset()
+    coefficient: str = "{}"  # how a value that depends on the parameters alone is reached
+    taken: frozenset[str] = frozenset()  # no value on the way may have these
 
 
 def write_expressions(function: ca.Function, names: Names, syntax: Syntax) -> Written:
-    """Write a Function in a language.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        SX, with dense results.
-    names : Names
-    syntax : Syntax
-
-    Raises
-    ------
-    NotImplementedError
-        For an operation of CasADi that the language has no word for.
+    """Write an SX Function with dense results in a language that has a word for each of its operations.
 
     Examples
     --------
@@ -359,12 +305,7 @@ def _before_jumps(instructions: list[Instruction]) -> set[int]:
 
 @dataclass(frozen=True)
 class Places:
-    """How a language reaches the numbers of a block; {} stands for the name.
-
-    Attributes
-    ----------
-    parameter, state, coefficient : str
-    """
+    """How a language reaches the numbers of a block; {} stands for the name."""
 
     parameter: str = "{}"
     state: str = "{}"
@@ -373,29 +314,15 @@ class Places:
 
 @dataclass(frozen=True)
 class ProgramText:
-    """A program in one language.
+    """A program in one language."""
 
-    Attributes
-    ----------
-    coefficients : tuple of Assignment
-        What is computed when parameters are set.
-    start : tuple of Assignment
-        The first states, each once, after `start_locals`.
-    start_locals, locals : tuple of Assignment
-        Values on the way.
-    outputs, states : mapping of str to str
-        What each becomes, in terms of the locals; no state is read here that has been written. A flag's is a condition.
-    operations : frozenset of int
-        CasADi's operations in all of them.
-    """
-
-    coefficients: tuple[Assignment, ...]
+    coefficients: tuple[Assignment, ...]  # what is computed when parameters are set
     start_locals: tuple[Assignment, ...]
-    start: tuple[Assignment, ...]
+    start: tuple[Assignment, ...]  # the first states, each once, after `start_locals`
     locals: tuple[Assignment, ...]
-    outputs: Mapping[str, str]
-    states: Mapping[str, str]
-    operations: frozenset[int]
+    outputs: Mapping[str, str]  # what each becomes, by the locals; a flag's is a condition
+    states: Mapping[str, str]  # no state is read here that has been written
+    operations: frozenset[int]  # CasADi's, in all of them
 
 
 def write_program_text(
@@ -447,17 +374,9 @@ _COMMENT_MARKS = re.compile(r"\*/|/\*|\(\*|\*\)|//|\"\"\"|'''|\?\?|\\|<!|--|\$")
 
 @dataclass(frozen=True)
 class Header:
-    """The lines on top of a file.
+    """The lines on top of a file, plain text, which no comment of C, structured text or Python ends in."""
 
-    Attributes
-    ----------
-    name : str
-        Of the block, structure or class.
-    lines : tuple of str
-        Plain text, which no comment of C, structured text or Python ends in.
-    """
-
-    name: str
+    name: str  # of the block, structure or class
     lines: tuple[str, ...] = field(default=())
 
     @property
@@ -486,30 +405,14 @@ def check_name(name: str) -> None:
     proper = re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) is not None
     told = "letters, digits and single underscores between them, a letter first"
     require(
-        proper and len(name) <= MAX_BLOCK_NAME, f"--name {name!r}: a block's name has {told}, {MAX_BLOCK_NAME} at most"
+        proper and len(name) <= MAX_IDENTIFIER, f"--name {name!r}: a block's name has {told}, {MAX_IDENTIFIER} at most"
     )
 
 
 def make_header(
     name: str, controller: Controller, parameters: ParameterSet, centre: float, origin: Sequence[str]
 ) -> Header:
-    """The header of a controller: where it comes from, its sample time, its gains in every form, what to mind.
-
-    Parameters
-    ----------
-    name : str
-    controller : Controller
-    parameters : ParameterSet
-    centre : float
-        Of the valve [the command's unit].
-    origin : sequence of str
-        Sentences on where the gains come from; they may hold any text.
-
-    Raises
-    ------
-    InputError
-        If the name is no identifier.
-    """
+    """Where a controller comes from (`origin`, any text), its sample time, its gains in every form, what to mind."""
     check_name(name)
     h, signal = controller.pid.sample_time or 0.0, controller.feedback
     lines = [

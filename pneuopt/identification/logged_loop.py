@@ -127,7 +127,7 @@ class LoggedLoop:
         held |= {
             f"{c.section}.{q.name}"
             for c in self.loop.compensators
-            for q in c.states(self.loop.sensed_signal, self.loop.command)
+            for q in c.states(self.loop.controller.sensed_signal, self.loop.command)
         }
         acting = {"pid.Kd": "pid.derivative", "pid.Td": "pid.derivative", "feedforward.gain": "feedforward.filter"}
         for gain, state in acting.items():

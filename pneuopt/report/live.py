@@ -196,7 +196,7 @@ def live_script(
         "rule": {"edge": 1 + EDGE_ROUNDING, "tail": TAIL_SHARE, "periods": MIN_SETTLED_PERIODS},
         "measured": [q.name for q in loop.outputs].index(loop.feedback.name),
         "labels": [f"{q.name} [{q.unit}]" for q in (loop.feedback, loop.outputs[-1])],
-        "controller": list(loop.tunable_sections),
+        "controller": list(loop.controller.tunable_sections),
     }
     rest, page = (resources.files(__package__).joinpath(n).read_text("utf-8") for n in ("live_rest.js", "live.js"))
     return f"{code}\nconst DATA = {to_script(data)};\n{rest}{page}"
@@ -247,7 +247,7 @@ def _sliders(finders: Sequence[RestFinder]) -> tuple[list[dict[str, Any]], list[
 def _slider(finders: Sequence[RestFinder], parameters: ParameterSet, name: str) -> dict[str, Any] | None:
     """Of a parameter that may move; None where its ends cannot run."""
     loop = finders[0].loop
-    sections = (*PLANT_SECTIONS, *loop.tunable_sections)
+    sections = (*PLANT_SECTIONS, *loop.controller.tunable_sections)
     if name in NOT_MOVED or name.partition(".")[0] not in sections:
         return None
     p = parameters[name]

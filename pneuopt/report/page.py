@@ -28,7 +28,7 @@ from pneuopt.evaluation.evaluate import respond
 from pneuopt.evaluation.margins import worst_open_loop
 from pneuopt.evaluation.metric import Band
 from pneuopt.export.blocks import describe_refusal
-from pneuopt.export.makers import BLOCK_FORMS, Block
+from pneuopt.export.makers import MAKER_BLOCKS, Block
 from pneuopt.logs.experiment import Experiment
 from pneuopt.plotting import (
     Response,
@@ -245,7 +245,7 @@ EXPORTS = {
     "st": "a PLC (IEC 61131-3 structured text)",
     "c": "a microcontroller (C99, with a test)",
     "python": "a Python program",
-    **{block.value: f"the PID block of {BLOCK_FORMS[block].maker}" for block in Block},
+    **{block.value: f"the PID block of {MAKER_BLOCKS[block].maker}" for block in Block},
     "fmu": "a simulation tool (the plant as FMU)",
 }
 """The forms of `pneuopt export`, and who takes them."""
@@ -303,7 +303,7 @@ def report_exports(
     refused = [block for block in Block if describe_refusal(controller, parameters, block, references, centre)]
     taken = {form: what for form, what in EXPORTS.items() if form not in {block.value for block in refused}}
     rows = tuple((what, f"pneuopt export {fit} {tuned} --to {form}") for form, what in taken.items())
-    makers = ", ".join(BLOCK_FORMS[block].maker for block in refused)
+    makers = ", ".join(MAKER_BLOCKS[block].maker for block in refused)
     told = f"The PID block of these makers cannot hold this design: {makers}. The structured text holds it whole."
     return Report((Table(text_columns("what it takes", "command"), rows), *([Line(told)] if refused else [])))
 

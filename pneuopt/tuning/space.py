@@ -176,7 +176,7 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     divisors = {"dither.frequency", *(f"pid.{n}" for n in loop.pid.positive_parameters)}
     for n in free:
         require(
-            n.partition(".")[0] in loop.tunable_sections,
+            n.partition(".")[0] in loop.controller.tunable_sections,
             f"{n} is free, but tune changes the controller and the dither only; use parameters.fixed({n!r})",
         )
         message = f"{n} is free, but it says what a machine does in a fault; use parameters.fixed({n!r})"

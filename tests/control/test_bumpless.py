@@ -12,7 +12,6 @@ from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.trajectories import Trajectory
 
 OLD = {"pid.Kp": 200.0, "pid.Ki": 3000.0, "pid.Kd": 1.0, "pid.Tf": 0.01, "pid.b": 0.7, "pid.c": 1.0}
@@ -70,9 +69,3 @@ def test_a_form_takes_over_in_its_own_gains() -> None:
     k = [q.name for q in loop.states].index("pid.integral")
     assert moved[k] - x[k] == pytest.approx(300.0 * 0.1)
     np.testing.assert_array_equal(np.delete(moved, k), np.delete(x, k))
-
-
-def test_a_state_of_another_loop_is_refused() -> None:
-    loop = LOOPS["sampled"]
-    with pytest.raises(InputError, match=r"x has shape \(3,\), the loop has 8 states"):
-        bumpless_transfer(loop, np.zeros(3), loop.parameters, loop.parameters)

@@ -14,8 +14,8 @@ from pneuopt.quantities.trajectories import Trajectory
 
 
 @pytest.mark.parametrize("frequency", [500.0, 600.0])
-def test_a_sampled_sine_at_or_above_nyquist_is_refused_with_numbers(frequency: float) -> None:
-    with pytest.raises(InputError, match=rf"{frequency:g} Hz .* every 1 ms.* 500 Hz.*analogue = true"):
+def test_a_sampled_sine_at_or_above_nyquist_is_refused(frequency: float) -> None:
+    with pytest.raises(InputError, match=r"dither\.frequency"):
         Dither(frequency).parameters("V", 1e-3)
 
 
@@ -42,7 +42,7 @@ def test_averaging_over_the_period_removes_the_sampled_sine(frequency: float, pe
 
 @pytest.mark.parametrize("frequency", [0.0, -1.0, float("inf")])
 def test_frequency_must_be_positive(frequency: float) -> None:
-    with pytest.raises(InputError, match="frequency must be positive"):
+    with pytest.raises(InputError, match="frequency"):
         Dither(frequency)
 
 
@@ -97,8 +97,3 @@ def test_joined_periods_are_as_few_as_average_the_sampled_wave_away() -> None:
         mean = (np.interp(at + period / 2, t, whole) - np.interp(at - period / 2, t, whole)) / period
         assert np.abs(mean).max() < 3e-3, frequency
     assert Dither().period(13.37, h) == pytest.approx(1 / 13.37)
-
-
-def test_a_waveform_is_one_of_the_two() -> None:
-    with pytest.raises(InputError, match=r"waveform is one of Waveform.SINE, Waveform.TRIANGLE, got 'triangle'"):
-        Dither(waveform="triangle")  # type: ignore[arg-type]

@@ -1,29 +1,18 @@
 """Slopes of compensators in margins, and what does not fit a loop."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from pneuopt.control.compensators import COMPENSATORS, Compensator, Direction, FrictionFeedforward
+from pneuopt.control.compensators import COMPENSATORS, Direction, FrictionFeedforward
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.margins import margins, sensitivity_terms
-from pneuopt.models import catalog
-from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Stribeck
-from pneuopt.quantities.errors import InputError, ModelError
+from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.two_phase import is_linear
-
-H = 2e-3  # [s] of the sampled loops
-
-
-def part(section: str) -> Compensator:
-    return COMPENSATORS[section]()
 
 
 def closed_poles(loop: ClosedLoop, p: ParameterSet, reference: float) -> np.ndarray:
@@ -59,46 +48,3 @@ def test_margins_count_slopes_at_the_operating_point(
     assert not is_linear(loop)
     with pytest.raises(ModelError, match="FrictionFeedforward, DeadZoneInverse: its slope"):
         sensitivity_terms(loop, [1.0], p)
-
-
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda plant: ClosedLoop(plant, PID(), compensators=(part("knocker"),)), "give the PID a sample_time"),
-        (lambda plant: ClosedLoop(plant, PID(H), compensators=(part("knocker"),) * 2), "has Knocker twice"),
-        (
-            lambda plant: ClosedLoop(plant, PID(H), compensators=part("knocker")),  # type: ignore[arg-type]
-            "compensators is a tuple of parts",
-        ),
-        (
-            lambda plant: ClosedLoop(plant, PID(H), compensators=(COMPENSATORS["knocker"],)),  # type: ignore[arg-type]
-            "is a tuple of parts",
-        ),
-        (
-            lambda _: ClosedLoop(
-                ForceDrive(Stribeck()).system(),
-                PID(),
-                measured="position",
-                compensators=(FrictionFeedforward(Direction.MEASURED),),
-            ),
-            "take Direction.REFERENCE",
-        ),
-        (
-            lambda _: ClosedLoop(
-                catalog.t32()[0].system(), PID(), measured="pressure_a", compensators=(part("motion_feedforward"),)
-            ),
-            "neither a position nor a speed",
-        ),
-        (
-            lambda plant: ClosedLoop(plant, PID(), compensators=(part("pressure_feedback"),)),
-            "PressureFeedback reads pressure_a, pressure_b, which the plant does not have: the plant's outputs are",
-        ),
-        (
-            lambda _: FrictionFeedforward("measured"),  # type: ignore[arg-type]
-            "direction is one of Direction.REFERENCE, Direction.MEASURED",
-        ),
-    ],
-)
-def test_what_does_not_fit_is_refused(second_order: System, make: Callable[[System], object], said: str) -> None:
-    with pytest.raises((ModelError, InputError), match=said):
-        make(second_order)

@@ -1,13 +1,9 @@
-import math
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.control.reference import Reference, Step, as_references
-from pneuopt.quantities.errors import InputError
+from pneuopt.control.reference import Reference, Step
 
 
 @given(size=st.floats(-5, 5).filter(lambda s: abs(s) > 1e-6), first=st.integers(0, 90), initial=st.floats(-5, 5))
@@ -31,36 +27,8 @@ def test_labels_tell_steps_apart() -> None:
     assert steps[0] != steps[2]
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"size": 0.0}, "size must not be zero"),
-        ({"size": math.nan}, "size must be a finite number"),
-        ({"size": 1.0, "at": -0.1}, "at must not be negative"),
-        ({"size": 1.0, "at": 2.0}, "horizon 1 s must lie after the step at 2 s"),
-        ({"size": 1.0, "horizon": math.inf}, "horizon must be a finite"),
-        ({"size": 1.0, "start": {"position": math.nan}}, r"start\['position'\] must be a finite number"),
-    ],
-)
-def test_impossible_steps_are_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        Step(**fields)
-
-
-def test_a_step_between_samples_is_refused_with_the_nearest() -> None:
-    with pytest.raises(InputError, match=r"between two samples of 0\.01 s; use 0\.1 s"):
-        Step(1.0, at=0.1049).trajectory(0.01)
-    with pytest.raises(InputError, match="spacing 2 s"):
-        Step(1.0).trajectory(2.0)
-
-
 def test_a_step_is_a_reference() -> None:
     step = Step(0.2, at=0.1, initial=0.1)
     assert isinstance(step, Reference)
     assert step.with_horizon(2.0) == Step(0.2, at=0.1, initial=0.1, horizon=2.0)
     assert step.values(np.array([0.0, 0.1, 5.0])).tolist() == [0.1, step.final, step.final]
-
-
-def test_what_is_no_reference_is_refused() -> None:
-    with pytest.raises(InputError, match="references takes a Step or a Move"):
-        as_references([Step(0.1), 0.1])  # type: ignore[list-item]

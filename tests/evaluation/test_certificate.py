@@ -394,7 +394,7 @@ def test_a_dither_may_show_what_lies_between_counts() -> None:
 def test_a_count_of_a_speed_is_that_of_its_filter() -> None:
     """A count of 1 mm is 1/6 m/s behind a filter of 5 ms at 1 ms."""
     loop, step = counted("speed"), Step(1.0, horizon=0.2)
-    assert loop.sensor_resolution(loop.parameters) == pytest.approx(1 / 6, rel=1e-12)
+    assert loop.controller.sensor_resolution(loop.parameters) == pytest.approx(1 / 6, rel=1e-12)
     told = describe_counts(loop, loop.parameters, step, 0.02)
     assert told == (
         "the settling band of +-20 mm/s is narrower than half the 0.167 m/s by which one count changes the reading; "

@@ -21,8 +21,6 @@ from pneuopt.export.languages import Language, export_controller
 from pneuopt.models import catalog
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
-from pneuopt.models.karnopp import Karnopp
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -38,16 +36,6 @@ def test_it_is_valid_and_the_same_each_time(tmp_path: Path) -> None:
     found = {v.name: v for v in fmpy.read_model_description(str(tmp_path / "plant.fmu")).modelVariables}
     assert float(found["load.mass"].start) == rig.value("load.mass")
     assert {"valve_voltage", "speed", "out.speed", "pressure_a"} <= set(found)
-
-
-def test_a_bad_name_and_a_bad_state_are_refused() -> None:
-    system = ForceDrive(Stribeck()).system()
-    with pytest.raises(InputError, match="a block's name"):
-        export_fmu(system, system.parameters, name="a b")
-    with pytest.raises(InputError, match="friction that sticks"):
-        export_fmu(ForceDrive(Karnopp(Stribeck())).system(), system.parameters)
-    with pytest.raises(InputError, match="x has 3 entries, the plant 2 states"):
-        export_fmu(system, system.parameters, np.zeros(3))
 
 
 def plant_model(

