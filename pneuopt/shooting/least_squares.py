@@ -93,18 +93,7 @@ class BudgetSpentError(KeyboardInterrupt):
 
 
 class CpuBudget:
-    """CPU time that may be spent, from now on.
-
-    Parameters
-    ----------
-    seconds : float
-        Of this process, all its threads together [s]; infinite: no budget.
-
-    Raises
-    ------
-    InputError
-        If it is not positive.
-    """
+    """CPU seconds of this process, all its threads together, that may be spent from now on; infinite: no budget."""
 
     def __init__(self, seconds: float) -> None:
         require(seconds > 0, f"cpu_seconds must be positive, got {seconds:g}; leave it out for a search to its end")
@@ -135,31 +124,15 @@ class CpuBudget:
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """The equations and the run at the end of a search, from which the residuals are diagnosed.
-
-    Attributes
-    ----------
-    equations : NormalEquations
-    run : RolloutResult
-        With states, by the finest steps.
-    nodes : ndarray, shape (m, n_states)
-    values : ndarray
-        All the problem's parameter values.
-    keep : ndarray of bool, shape (k,)
-        The free parameters that have a covariance.
-    gap_deviations : ndarray, shape (n_states,)
-        Standard deviations of the gaps, in nominal sizes.
-    substeps : int
-        Integration steps a sample of the sensitivities.
-    """
+    """The equations and the run at the end of a search, from which the residuals are diagnosed."""
 
     equations: NormalEquations
-    run: RolloutResult
-    nodes: Array
-    values: Array
-    keep: Mask
-    gap_deviations: Array
-    substeps: int
+    run: RolloutResult  # with states, by the finest steps
+    nodes: Array  # (m, n_states)
+    values: Array  # all the problem's parameter values
+    keep: Mask  # (k,): the free parameters that have a covariance
+    gap_deviations: Array  # (n_states,): standard deviations of the gaps, in nominal sizes
+    substeps: int  # integration steps a sample of the sensitivities
 
 
 class SearchEnd(Enum):
@@ -181,60 +154,32 @@ class SearchEnd(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The result of a least squares: states over time, parameters, and how well the data determine them.
+    """The result of a least squares: states over time, parameters, and how well the data determine them."""
 
-    Attributes
-    ----------
-    trajectories : tuple of Trajectory
-        States and outputs, one a phase.
-    parameters : ParameterSet
-        The problem's parameters with the free ones solved for.
-    status : Status
-        As it is reported; a caller may say more of it.
-    end : SearchEnd
-        Why the search ended.
-    stats : mapping of str to float
-        Iterations, seconds, final cost, largest gap, ...
-    covariance : ndarray, shape (k, k), or None
-        Of the free parameters in their own units, at unit noise scale; None where the data do not determine them.
-    chi_square : float
-        Sum of squared data residuals, in noise standard deviations.
-    count : int
-        Number of data residuals.
-    at_bound : ndarray of bool, shape (k,)
-        Which parameters are at a bound, without those fixed by equal bounds.
-    jumps : ndarray, shape (m, n_states), or None
-        The gap behind each linked segment, in nominal sizes, if the gaps stand for noise of the states.
-    unidentifiable : tuple of str
-        The parameters that the data do not determine here; a caller holds them, and fits again.
-    unsettled : tuple of str
-        The parameter along which the search was still moving when it gave up; empty where it ended otherwise.
-    prior_covariance : ndarray, shape (k, k), or None
-        The covariance due to a weak prior of fixed parameters (`NormalEquations.prior_covariance`); None where nothing
-        is fixed.
-    variance_inflation : float
-        Factor on the estimates' variance by weighted squares (robust losses).
-    optimum : Optimum or None
-        None where there is no covariance.
-    stage_costs : tuple of (float, float)
-        The gap and the cost at the end of the stages from the third, and of the search.
-    """
-
-    trajectories: tuple[Trajectory, ...]
-    parameters: ParameterSet
-    status: Status
-    end: SearchEnd
-    stats: Mapping[str, float]
+    trajectories: tuple[Trajectory, ...]  # states and outputs, one a phase
+    parameters: ParameterSet  # the problem's parameters with the free ones solved for
+    status: Status  # as it is reported; a caller may say more of it
+    end: SearchEnd  # why the search ended
+    stats: Mapping[str, float]  # iterations, seconds, final cost, largest gap,
+    # (k, k), or None: of the free parameters in their own units, at unit noise scale; None where the data do not
+    # determine them
     covariance: Array | None
-    chi_square: float
-    count: int
-    at_bound: Mask
+    chi_square: float  # sum of squared data residuals, in noise standard deviations
+    count: int  # number of data residuals
+    at_bound: Mask  # (k,): which parameters are at a bound, without those fixed by equal bounds
+    # (m, n_states), or None: the gap behind each linked segment, in nominal sizes, if the gaps stand for noise of the
+    # states
     jumps: Array | None = None
+    # the parameters that the data do not determine here; a caller holds them, and fits again
     unidentifiable: tuple[str, ...] = ()
+    # the parameter along which the search was still moving when it gave up; empty where it ended otherwise
     unsettled: tuple[str, ...] = ()
+    # (k, k), or None: the covariance due to a weak prior of fixed parameters (`NormalEquations.prior_covariance`);
+    # None where nothing is fixed
     prior_covariance: Array | None = None
-    variance_inflation: float = 1.0
-    optimum: Optimum | None = None
+    variance_inflation: float = 1.0  # factor on the estimates' variance by weighted squares (robust losses)
+    optimum: Optimum | None = None  # none where there is no covariance
+    # the gap and the cost at the end of the stages from the third, and of the search
     stage_costs: tuple[tuple[float, float], ...] = ()
 
     def with_effort_of(self, *earlier: "Fit") -> "Fit":
@@ -245,26 +190,12 @@ class Fit:
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the search: how tight the gaps are, and how long it runs.
+    """A stage of the search: how tight the gaps are, and how long it runs."""
 
-    Parameters
-    ----------
-    gap : float
-        Standard deviation of a gap, as a fraction of the state's nominal size.
-    iterations : int
-        Largest number of iterations.
-    refine : int
-        Integration steps at the end of the stage, as a multiple of those before. Let the last stage have more than 1:
-        with 1 and a gap above `WIDE_GAP` a stage draws log parameters to their start (`has_prior`).
-
-    Raises
-    ------
-    InputError
-        If an option is not in its range.
-    """
-
-    gap: float
-    iterations: int
+    gap: float  # standard deviation of a gap, as a fraction of the state's nominal size
+    iterations: int  # largest number of iterations
+    # integration steps at the end of the stage, as a multiple of those before. Let the last stage have more than 1:
+    # with 1 and a gap above `WIDE_GAP` a stage draws log parameters to their start (`has_prior`).
     refine: int = 1
 
     def __post_init__(self) -> None:
@@ -351,18 +282,9 @@ class LeastSquares:
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:
-    """Solve a transcription that has residuals and bounds, but neither costs nor limits.
+    """Solve a transcription that has residuals and bounds, but neither costs nor limits, from its guesses and values.
 
-    Parameters
-    ----------
-    transcription : Transcription
-        Its phases' guesses and its parameters' values are the start.
-    method : LeastSquares, optional
-
-    Returns
-    -------
-    Fit
-        Whatever its status; an interruption (Ctrl-C) returns the best iterate so far, marked.
+    Whatever its status, a fit is returned; that of an interruption (Ctrl-C) is the best iterate so far, marked.
     """
     began, state = time.perf_counter(), start_search(segment(transcription), method or LeastSquares())
     state = run_search(state)
@@ -390,22 +312,7 @@ def assess_convergence(
 ) -> ConvergenceTest:
     """Test an iterate: converged means that a full undamped step would move no parameter noticeably.
 
-    Parameters
-    ----------
-    equations : NormalEquations
-    space : ParameterScaling
-    z : ndarray, shape (k,)
-        The free parameters as searched.
-    tolerance : float
-        Largest step of a converged iterate, in standard deviations.
-    message : str
-        The first sentence of a converged status.
-    noisy_gaps : bool
-        Whether the gaps stand for noise of the states.
-
-    Returns
-    -------
-    ConvergenceTest
+    `tolerance` is the largest step of a converged iterate [standard deviations], `message` its status's first sentence.
     """
     names = np.array(equations.segments.transcription.parameters.free_names, dtype=object)
     no_sensitivity = np.diag(equations.arrow.corner) == 0  # even at a bound
@@ -501,28 +408,14 @@ class Iterate:
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The lifted least squares with given gaps' weights and integration steps.
-
-    Attributes
-    ----------
-    segments : Segments
-    scaling : ParameterScaling
-    sigma : ndarray, shape (n_states,)
-        Standard deviation of a gap, in nominal sizes.
-    substeps : int
-        Integration steps a sample.
-    correction : IntegrationCorrection or None
-        The change of outputs and ends by finer steps.
-    has_prior : bool
-        Whether log parameters are drawn to their start (`ParameterScaling.add_start_prior`).
-    """
+    """The lifted least squares with given gaps' weights and integration steps."""
 
     segments: Segments
     scaling: ParameterScaling
-    sigma: Array
-    substeps: int
-    correction: IntegrationCorrection | None = None
-    has_prior: bool = False
+    sigma: Array  # (n_states,): standard deviation of a gap, in nominal sizes
+    substeps: int  # integration steps a sample
+    correction: IntegrationCorrection | None = None  # the change of outputs and ends by finer steps
+    has_prior: bool = False  # whether log parameters are drawn to their start (`ParameterScaling.add_start_prior`)
 
     def evaluate(self, nodes: Array, z: Array) -> Iterate:
         """The iterate at these nodes, shape (m, n_states), and searched parameters."""
@@ -540,24 +433,7 @@ IsNegligible = Callable[[Iterate, ReducedEquations, GaussNewtonStep], bool]
 
 
 class Descent:
-    """Levenberg-Marquardt steps on one objective.
-
-    Parameters
-    ----------
-    objective : Objective
-    damping : float
-        Of the first step.
-    is_negligible : callable
-        Whether a step that is hardly damped is not worth a try.
-
-    Attributes
-    ----------
-    damps_nodes : bool
-        Whether nodes that overshoot are damped alone. Near an optimum this saves the rest of the log many short steps;
-        far from it, nodes are left behind that tighter gaps then cannot free.
-    node_damping : ndarray, shape (m,)
-        Of each node alone, over its diagonal.
-    """
+    """Levenberg-Marquardt steps on one objective."""
 
     def __init__(self, objective: Objective, damping: float, is_negligible: IsNegligible) -> None:
         self.damps_nodes, self.promised = False, math.inf
@@ -659,21 +535,13 @@ def _misses_by_gaps(current: Iterate, trial: Iterate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class SearchSetup:
-    """What stays the same during a search.
-
-    Attributes
-    ----------
-    method : LeastSquares
-    scaling : ParameterScaling
-    gap_scales : ndarray, shape (n_states,)
-        Factor on each state's gaps (`segments.gap_scales`).
-    required_substeps, first_substeps : int
-        Integration steps a sample by the stiffness of the start, and those that the search begins with.
-    """
+    """What stays the same during a search."""
 
     method: LeastSquares
     scaling: ParameterScaling
-    gap_scales: Array
+    gap_scales: Array  # (n_states,): factor on each state's gaps (`segments.gap_scales`)
+    # required_substeps, first_substeps: integration steps a sample by the stiffness of the start, and those that the
+    # search begins with
     required_substeps: int
     first_substeps: int
 
@@ -693,68 +561,32 @@ class StageEnd(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SearchState:
-    """Where a search is: its iterate, the stage and the integration steps by which it got there, and what it has tried.
-
-    Attributes
-    ----------
-    setup : SearchSetup
-    iterate : Iterate
-        Nodes, parameters as searched, and the equations linearised there.
-    stage : Stage
-    substeps, output_substeps : int
-        Integration steps a sample of the sensitivities, and of the outputs.
-    stiffness_values : ndarray
-        All parameters' values at which the integration steps were chosen.
-    node_damping : ndarray, shape (m,)
-        Of each node alone, over its diagonal, where the stage has ended.
-    tolerance : float
-        The method's; wider where kinks hold up a search that has settled.
-    correction : IntegrationCorrection, optional
-        What finer steps change in the outputs.
-    is_coarse : bool
-        Whether finer steps are to follow in this stage.
-    noisy_gaps : bool
-        Whether the gaps stand for noise of the states.
-    iterations, stage_began : int
-        Iterations so far, and at the beginning of the stage.
-    has_stalled : bool
-        Whether the stage has converged, or hardly lowered the cost at its end.
-    last_decrease : float
-        Of the stage's cost by its last iteration, over itself.
-    integration_change : float
-        Largest change of an output by the last refinement [noise standard deviations]; NaN where there was none.
-    stage_ends : tuple of StageEnd
-    unsettled_gaps : frozenset of float
-        Gaps at which noise of the states has not settled.
-    tried_state_noise : bool
-        Whether noise of the states was tried before the last stage.
-    end : SearchEnd, optional
-        None while the search goes on.
-    status : Status
-        What is said of the end.
-    """
+    """Where a search is: its iterate, the stage and the steps by which it got there, and what it has tried."""
 
     setup: SearchSetup
-    iterate: Iterate
+    iterate: Iterate  # nodes, parameters as searched, and the equations linearised there
     stage: Stage
+    # substeps, output_substeps: integration steps a sample of the sensitivities, and of the outputs
     substeps: int
     output_substeps: int
-    stiffness_values: Array
-    node_damping: Array
-    tolerance: float
-    correction: IntegrationCorrection | None = None
-    is_coarse: bool = False
-    noisy_gaps: bool = False
+    stiffness_values: Array  # all parameters' values at which the integration steps were chosen
+    node_damping: Array  # (m,): of each node alone, over its diagonal, where the stage has ended
+    tolerance: float  # the method's; wider where kinks hold up a search that has settled
+    correction: IntegrationCorrection | None = None  # what finer steps change in the outputs
+    is_coarse: bool = False  # whether finer steps are to follow in this stage
+    noisy_gaps: bool = False  # whether the gaps stand for noise of the states
+    # iterations, stage_began: iterations so far, and at the beginning of the stage
     iterations: int = 0
     stage_began: int = 0
-    has_stalled: bool = False
-    last_decrease: float = 0.0
+    has_stalled: bool = False  # whether the stage has converged, or hardly lowered the cost at its end
+    last_decrease: float = 0.0  # of the stage's cost by its last iteration, over itself
+    # largest change of an output by the last refinement [noise standard deviations]; NaN where there was none
     integration_change: float = math.nan
     stage_ends: tuple[StageEnd, ...] = ()
-    unsettled_gaps: frozenset[float] = frozenset()
-    tried_state_noise: bool = False
-    end: SearchEnd | None = None
-    status: Status = SearchEnd.UNSETTLED.status
+    unsettled_gaps: frozenset[float] = frozenset()  # gaps at which noise of the states has not settled
+    tried_state_noise: bool = False  # whether noise of the states was tried before the last stage
+    end: SearchEnd | None = None  # none while the search goes on
+    status: Status = SearchEnd.UNSETTLED.status  # what is said of the end
 
     @property
     def method(self) -> LeastSquares:
@@ -1234,19 +1066,7 @@ def repeat_last_stage(state: SearchState) -> SearchState:
 
 @keeps_state
 def free_nodes(state: SearchState, trapped: Indices) -> SearchState:
-    """Run the last stage from where trapped nodes are put to the ends of the segments before them, if that helps.
-
-    Parameters
-    ----------
-    state : SearchState
-    trapped : ndarray of int
-        Positions of nodes.
-
-    Returns
-    -------
-    SearchState
-        The given one, with the iterations of the trial, unless the cost falls.
-    """
+    """Run the last stage with trapped nodes put to the ends of the segments before them, if that lowers the cost."""
     nodes, behind = state.iterate.nodes.copy(), trapped[trapped > 0]
     nodes[behind] += state.iterate.equations.gaps[behind - 1] * state.segments.nominal
     freed = iterate(
@@ -1320,17 +1140,6 @@ def is_negligible_step(state: SearchState, current: Iterate, reduced: ReducedEqu
     does where the model misses the logs and the search is slow: the deviations are then those of the residuals, near
     such an optimum Gauss-Newton steps go to and fro for long, and what is far below a deviation is far below the bias,
     too. Where no parameter is free, the states are what is asked for.
-
-    Parameters
-    ----------
-    state : SearchState
-    current : Iterate
-    reduced : ReducedEquations
-    step : GaussNewtonStep
-
-    Returns
-    -------
-    bool
     """
     promised, equations = 0.5 * current.equations.arrow.descent_rate(step), current.equations
     is_last, misfit = state.stage.gap <= state.method.stages[-1].gap, max(1.0, 2 * current.cost / equations.count)
@@ -1353,21 +1162,7 @@ def is_negligible_step(state: SearchState, current: Iterate, reduced: ReducedEqu
 
 
 def creeps(state: SearchState, before: float, promised: float) -> bool:
-    """Whether a step of a search with noise of the states has fallen far short of its promise, and changed little.
-
-    Parameters
-    ----------
-    state : SearchState
-        After the step.
-    before : float
-        Cost before it.
-    promised : float
-        Decrease of the cost that it has promised.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a step of a search with noise of the states has fallen far short of its promise, and changed little."""
     return state.noisy_gaps and before - state.iterate.cost < min(
         CREEPING_SHARE * promised, STAGE_COST_TOLERANCE * before
     )
@@ -1390,19 +1185,7 @@ def joins_known_search(state: SearchState) -> bool:
 
 
 def end_search(state: SearchState, seconds: float) -> Fit:
-    """The fit where a search has ended.
-
-    Parameters
-    ----------
-    state : SearchState
-        With an end.
-    seconds : float
-        That it has taken.
-
-    Returns
-    -------
-    Fit
-    """
+    """The fit where a search has ended, after so many seconds."""
     transcription, current, equations = state.segments.transcription, state.iterate, state.iterate.equations
     q = state.setup.scaling.values(current.z)
     free = transcription.parameters.free_names
@@ -1493,16 +1276,9 @@ def _integration_error(state: SearchState, run: RolloutResult) -> float:
 
 
 def close_gaps(optimum: Optimum) -> Array | None:
-    """The outputs of a fit's run without gaps between linked segments, shape (m, n, n_outputs).
+    """The outputs (m, n, n_outputs) of a fit's run without gaps between linked segments.
 
-    Parameters
-    ----------
-    optimum : Optimum
-
-    Returns
-    -------
-    ndarray or None
-        None where the gaps do not close in a few steps, as those of a model that runs away from its log.
+    None where the gaps do not close in a few steps, as those of a model that runs away from its log.
     """
     segments, linear = optimum.equations.segments, optimum.equations.linearisation
     slopes = np.where(segments.linked[:, None, None], linear.end_sensitivities[:, :, : optimum.nodes.shape[1]], 0.0)

@@ -1,5 +1,6 @@
 """The numbers that decide in `shooting`, each with its unit and what it decides."""
 
+import math
 
 # Arrow
 
@@ -33,6 +34,7 @@ UNIDENTIFIABLE_PRIOR_RATIO = 1 / 3
 # standard deviation of the prior about a start, in e-folds: lower holds wrong guesses, higher lets what wide gaps hide
 # drift to where tight ones cannot tell it any more
 START_PRIOR_DEVIATION = 1.0
+WEAK_PRIOR_DEVIATION = math.log(10)  # of a weak prior, in e-folds: a factor of ten either way
 # squared residuals that an e-fold change of a log parameter has to move, or it has no effect: smaller searches in
 # rounding, larger holds what good data would show
 MIN_LOG_INFORMATION = 1e-6
