@@ -326,7 +326,9 @@ def define(
         If the right-hand side leaves out a state's rate or an output, or if two signals of a kind share a name.
     """
     for kind, quantities in (("state", states), ("input", inputs), ("output", outputs)):
-        _check_unique_names(kind, quantities)
+        listed = names(quantities)
+        twice = {n for n in listed if listed.count(n) > 1}
+        require(not twice, f"{kind} {', '.join(map(repr, sorted(twice)))} is declared twice; rename one", ModelError)
     t = ca.SX.sym("t")
     x, u = symbols(states), symbols(inputs)
     p = {n: ca.SX.sym(n) for n in parameters}
@@ -379,12 +381,6 @@ def describe(system: System | DiscreteSystem) -> str:
     for kind in ("states", "inputs", "outputs"):
         lines += [f"  {kind}: " + (", ".join(f"{q.name} [{q.unit}]" for q in getattr(system, kind)) or "none")]
     return "\n".join([*lines, "  parameters:", *("    " + line for line in repr(system.parameters).splitlines())])
-
-
-def _check_unique_names(kind: str, quantities: Sequence[Quantity]) -> None:
-    listed = names(quantities)
-    twice = {n for n in listed if listed.count(n) > 1}
-    require(not twice, f"{kind} {', '.join(map(repr, sorted(twice)))} is declared twice; rename one", ModelError)
 
 
 def _stack_in_order(kind: str, values: Symbols, quantities: Sequence[Quantity]) -> ca.SX:

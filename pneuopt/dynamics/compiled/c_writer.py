@@ -119,22 +119,17 @@ class _CWriter:
         elif i.operation == ca.OP_CONST:
             value = CValue(0, f"ALL({_literal(i.constant)})")
         else:
-            value = self._compute(i)
+            values, operation = [self.values[k] for k in i.sources], i.operation
+            if operation in DIVISIONS:
+                rarer = values[-1].rate < max(v.rate for v in values)
+                if operation == ca.OP_INV or rarer or self.divisors[i.sources[-1]] > 1:
+                    divisor = i.sources[-1]
+                    if divisor not in self.reciprocals:
+                        self.reciprocals[divisor] = self._assign(f"r{divisor}", ca.OP_INV, [self.values[divisor]])
+                    values[-1] = self.reciprocals[divisor]
+                    operation = ca.OP_ASSIGN if operation == ca.OP_INV else ca.OP_MUL
+            value = self._assign(f"a{i.target[0]}", operation, values)
         self.values[i.target[0]] = value
-
-    def _compute(self, i: Instruction) -> CValue:
-        values, operation = [self.values[k] for k in i.sources], i.operation
-        if operation in DIVISIONS:
-            rarer = values[-1].rate < max(v.rate for v in values)
-            if operation == ca.OP_INV or rarer or self.divisors[i.sources[-1]] > 1:
-                values[-1] = self._reciprocal(i.sources[-1])
-                operation = ca.OP_ASSIGN if operation == ca.OP_INV else ca.OP_MUL
-        return self._assign(f"a{i.target[0]}", operation, values)
-
-    def _reciprocal(self, divisor: int) -> CValue:
-        if divisor not in self.reciprocals:
-            self.reciprocals[divisor] = self._assign(f"r{divisor}", ca.OP_INV, [self.values[divisor]])
-        return self.reciprocals[divisor]
 
     def _assign(self, name: str, operation: int, values: Sequence[CValue]) -> CValue:
         form = C_OPERATORS.get(operation) or C_FUNCTIONS.get(operation)

@@ -86,7 +86,11 @@ def find_compiler() -> Compiler | None:
     found = _parse_command(os.environ.get("CC", ""))
     if found is not None:
         return found
-    on_path = (path for path in map(shutil.which, COMPILERS) if path and not _is_placeholder(path))
+    on_path = (
+        path
+        for path in map(shutil.which, COMPILERS)
+        if path and not (sys.platform == "darwin" and path.startswith("/usr/bin/") and (not _has_apple_tools()))
+    )
     path = next(on_path, None)
     return _packaged_compiler() if path is None else Compiler((path,))
 
@@ -109,11 +113,6 @@ def _parse_command(text: str) -> Compiler | None:
         return None
     program = shutil.which(words[0]) if words else None
     return None if program is None else Compiler((program, *words[1:]))
-
-
-def _is_placeholder(path: str) -> bool:
-    """Whether a program only asks to install Apple's tools: macOS has such a gcc, clang and cc where they are not."""
-    return sys.platform == "darwin" and path.startswith("/usr/bin/") and not _has_apple_tools()
 
 
 @functools.cache
@@ -226,21 +225,17 @@ def _run_compiler(command: Sequence[str], environment: Mapping[str, str] | None 
         try:
             out, err = process.communicate(timeout=COMPILE_TIMEOUT)
         except BaseException:
-            _end_with_children(process)
+            # Kill a process and those that it started: a compiler is a driver of others, which would go on.
+            kill_group = getattr(os, "killpg", None)  # not on Windows
+            with contextlib.suppress(OSError):
+                if kill_group is None:
+                    process.kill()
+                else:
+                    kill_group(process.pid, signal.SIGKILL)
+            process.wait()
             raise
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command, out, err)
-
-
-def _end_with_children(process: "subprocess.Popen[str]") -> None:
-    """Kill a process and those that it started: a compiler is a driver of others, which would go on."""
-    kill_group = getattr(os, "killpg", None)  # not on Windows
-    with contextlib.suppress(OSError):
-        if kill_group is None:
-            process.kill()
-        else:
-            kill_group(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 @functools.cache
@@ -287,7 +282,9 @@ def find_library(folder: Path, identity: str) -> Path | None:
     """
     for path in sorted(folder.glob(f"{_digest(identity)}-*.so")):
         if _is_own(path) and path.name == _library_name(identity, path.read_bytes()):
-            _note_use(path)
+            with contextlib.suppress(OSError):
+                if time.time() - path.stat().st_mtime > NOTICE_TIME:
+                    os.utime(path)
             return path
         logger.debug("%s is damaged, or another user's: it is built anew", path)
         discard_library(path)
@@ -333,13 +330,6 @@ def trim_cache(folder: Path, keep: Path | None = None) -> None:
         with contextlib.suppress(OSError):
             if now - path.lstat().st_mtime > NOTICE_TIME:
                 shutil.rmtree(path, ignore_errors=True)
-
-
-def _note_use(path: Path) -> None:
-    """Set a library's time to now, once a day."""
-    with contextlib.suppress(OSError):
-        if time.time() - path.stat().st_mtime > NOTICE_TIME:
-            os.utime(path)
 
 
 def discard_library(path: Path) -> None:

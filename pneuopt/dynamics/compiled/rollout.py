@@ -241,18 +241,16 @@ class Rollout:
         m, n, ny, nx, ns = len(x0), t.shape[-1], self.n_outputs, self.n_states, self.n_columns
         if self._library is None:
             u, t, h = np.broadcast_to(u, (m, n, self.n_inputs)), np.broadcast_to(t, (m, n)), np.broadcast_to(h, (m, n))
-            return self._run_vm((x0, u, p, t, h), substeps, states)
+            given = (x0, u, p, t, h)
+            run = run_in_vm(self._functions, given, self._starts, substeps, states, self._threads)
+            if not self.n_columns:
+                return RolloutResult(run.y, run.x_end, run.x)
+            return RolloutResult(run.y, run.x_end, run.x, _swap_last_axes(run.dy), _swap_last_axes(run.dx_end))
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         x = np.empty((m, -(-n // states), nx)) if states else None
         self._call_library((x0, u, p, t, h), substeps, states, (None, None, y, dy, x, x_end, dx_end, None, None, None))
         return RolloutResult(y, x_end, x, _swap_last_axes(dy), _swap_last_axes(dx_end))
-
-    def _run_vm(self, given: tuple[Array, Array, Array, Array, Array], substeps: int, states: int) -> RolloutResult:
-        run = run_in_vm(self._functions, given, self._starts, substeps, states, self._threads)
-        if not self.n_columns:
-            return RolloutResult(run.y, run.x_end, run.x)
-        return RolloutResult(run.y, run.x_end, run.x, _swap_last_axes(run.dy), _swap_last_axes(run.dx_end))
 
     def _gram_native(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         m, nx, ns = len(given[0]), self.n_states, self.n_columns
