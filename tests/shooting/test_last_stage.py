@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from pneuopt.shooting import least_squares as lifted
-from pneuopt.shooting.least_squares import Descent, Iterate, LeastSquares, SearchState, Stage, start_search
+from pneuopt.shooting.least_squares import Iterate, LeastSquares, LevenbergMarquardt, SearchState, Stage, start_search
 from tests.shooting.first_order import first_order_log
 
 N = 30
@@ -44,10 +44,10 @@ def test_a_stage_keeps_by_how_much_its_last_iteration_has_lowered_the_cost(monke
     costs = iter([50.0, 45.0])
     state = with_cost(start_search(first_order_log(N).segments, LeastSquares()), 100.0)
 
-    def step(_: Descent, current: Iterate) -> Iterate:
+    def step(_: LevenbergMarquardt, current: Iterate) -> Iterate:
         return replace(current, equations=replace(current.equations, cost=next(costs)))
 
-    monkeypatch.setattr(Descent, "step", step)
+    monkeypatch.setattr(LevenbergMarquardt, "step", step)
     monkeypatch.setattr(SearchState, "corrects_residuals", False)
     state = lifted.iterate(state, 2)
     assert not state.has_stalled

@@ -19,9 +19,9 @@ from pneuopt.shooting.equations import ParameterScaling, missed_curvature, norma
 from pneuopt.shooting.least_squares import (
     BudgetSpentError,
     CpuBudget,
-    Descent,
     Iterate,
     LeastSquares,
+    LevenbergMarquardt,
     Objective,
     SearchEnd,
     SearchState,
@@ -80,7 +80,7 @@ def descend(problem: Transcription, *, damps_nodes: bool) -> tuple[Iterate, int]
     segments = segment(problem)
     objective = Objective(segments, ParameterScaling(segments.transcription), np.array([GAP]), 1)
     current, count = objective.evaluate(start_nodes(segments), objective.scaling.start), 0
-    descent = Descent(objective, 1e-3, lambda at, _, step: at.equations.arrow.descent_rate(step) < 1e-6)
+    descent = LevenbergMarquardt(objective, 1e-3, lambda at, _, step: at.equations.arrow.descent_rate(step) < 1e-6)
     descent.damps_nodes = damps_nodes
     while (found := descent.step(current)) is not None and count < 60:
         current, count = found, count + 1
@@ -135,10 +135,10 @@ def test_nodes_are_damped_alone_near_an_optimum_only(
     state = replace(start_search(segment(wrong_squares()), method), noisy_gaps=noisy)
     at = replace(state.iterate, equations=replace(state.iterate.equations, cost=cost))
 
-    def take_no_step(descent: Descent, *_: object) -> None:
+    def take_no_step(descent: LevenbergMarquardt, *_: object) -> None:
         damped.append(descent.damps_nodes)
 
-    monkeypatch.setattr(Descent, "step", take_no_step)
+    monkeypatch.setattr(LevenbergMarquardt, "step", take_no_step)
     monkeypatch.setattr(SearchState, "corrects_residuals", False)
     lifted.iterate(replace(state, iterate=at), 8)
     assert damped == [damps]
@@ -198,9 +198,9 @@ def test_undamped_steps_may_raise_the_cost_for_a_while(
 ) -> None:
     """Undamped steps end at a negligible one, or where the model is not finite; the least cost counts."""
     steps = iter([*map(iterate, costs), None])
-    monkeypatch.setattr(Descent, "_step_undamped", lambda *_: next(steps))
+    monkeypatch.setattr(LevenbergMarquardt, "_step_undamped", lambda *_: next(steps))
     objective = start_search(segment(wrong_squares()), LeastSquares()).objective()
-    found, count = Descent(objective, 0.0, lambda *_: False).undamped_steps(iterate(10.0))
+    found, count = LevenbergMarquardt(objective, 0.0, lambda *_: False).undamped_steps(iterate(10.0))
     assert (found.cost, count) == (best, taken)
 
 
@@ -212,17 +212,17 @@ def test_a_search_with_noise_of_the_states_that_creeps_takes_undamped_steps(
     begun, walks, taken = start_search(segment(wrong_squares()), LeastSquares()), list[float](), list[float]()
     state = replace(begun, noisy_gaps=True, iterate=iterate(1000.0))
 
-    def creep(descent: Descent, current: Iterate) -> Iterate:
+    def creep(descent: LevenbergMarquardt, current: Iterate) -> Iterate:
         descent.promised = 35.0
         taken.append(current.cost)
         return iterate(current.cost - 0.1)
 
-    def walk(_: Descent, current: Iterate) -> tuple[Iterate, int]:
+    def walk(_: LevenbergMarquardt, current: Iterate) -> tuple[Iterate, int]:
         walks.append(current.cost)
         return iterate(current.cost - 1.0) if helps and len(walks) < 3 else current, 4
 
-    monkeypatch.setattr(Descent, "step", creep)
-    monkeypatch.setattr(Descent, "undamped_steps", walk)
+    monkeypatch.setattr(LevenbergMarquardt, "step", creep)
+    monkeypatch.setattr(LevenbergMarquardt, "undamped_steps", walk)
     monkeypatch.setattr(SearchState, "segments", begun.segments)
     monkeypatch.setattr(SearchState, "is_at_noise", False)
     lifted.iterate(state, 30)
@@ -237,7 +237,7 @@ def test_a_budget_ends_a_step_between_its_tries() -> None:
     segments, budget = segment(wrong_squares()), CpuBudget(1e9)
     objective = Objective(segments, ParameterScaling(segments.transcription), np.array([GAP]), 1)
     current, tried = objective.evaluate(start_nodes(segments), objective.scaling.start), list[Iterate]()
-    descent = Descent(objective, 1e-3, lambda *_: False)
+    descent = LevenbergMarquardt(objective, 1e-3, lambda *_: False)
     go_on = descent._trial
 
     def spend(*given: Any) -> Iterate:
@@ -393,7 +393,7 @@ def test_nodes_follow_the_step_that_a_bound_has_left(move: str, monkeypatch: pyt
     problem = replace(problem, parameters=bounded, residuals=(replace(linear, measured=measured),))
     monkeypatch.setattr(lifted, "MAX_NODE_STEPS", 0)  # which would mend it
     objective = start_search(segment(problem), LeastSquares(substeps=1)).objective()
-    descent = Descent(objective, 0.0, lambda *_: False)
+    descent = LevenbergMarquardt(objective, 0.0, lambda *_: False)
     begun = objective.evaluate(np.zeros((N // 2, 1)), objective.scaling.start)
     if move == "step":
         found = descent.step(begun)
