@@ -1,6 +1,7 @@
 """The shortcuts of a search: the last stage right after the first, and finer integration steps without derivatives."""
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 from unittest.mock import Mock
@@ -12,6 +13,7 @@ from numpy.testing import assert_allclose
 from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting import least_squares
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.equations import ParameterScaling, correct_residuals, normal_equations, weigh_gaps
 from pneuopt.shooting.least_squares import (
@@ -44,6 +46,7 @@ from pneuopt.shooting.least_squares import (
     solve_least_squares,
     stages_to_loosen,
     start_search,
+    tighten,
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, segment, start_nodes
 from pneuopt.shooting.tolerances import FINE_TOLERANCE, MAX_CHI_SQUARE_RATIO
@@ -475,3 +478,52 @@ def test_an_interruption_leaves_the_last_iterate() -> None:
     assert state.status.code is Code.INTERRUPTED
     assert state.iterations == len(costs)
     assert state.stage.gap == LeastSquares().stages[-1].gap
+
+
+def loosened(monkeypatch: pytest.MonkeyPatch) -> tuple[SearchState, list[float]]:
+    """An optimum of the two logs, which the model explains, with noise of the states; and the gaps entered since."""
+    entered, (_, stage, *_, last) = list[float](), LeastSquares().stages
+
+    def record(state: SearchState, into: Stage, nodes: Array, z: Array) -> SearchState:
+        entered.append(into.gap)
+        return enter_stage(state, into, nodes, z)
+
+    state = run_stage(replace(begun(), noisy_gaps=True), replace(stage, iterations=last.iterations, refine=2))
+    state = state.conclude()
+    assert state.end is SearchEnd.OPTIMUM
+    monkeypatch.setattr("pneuopt.shooting.least_squares.enter_stage", record)
+    return state, entered
+
+
+def test_loosened_gaps_are_tightened_again_where_that_leads_to_an_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes of a first stage across kinks let its equations foresee a misfit that a right model has not."""
+    state, entered = loosened(monkeypatch)
+    tight = tighten(state)
+    assert entered == [1e-3, 3e-4, 1e-4, 1e-5]
+    assert (tight.end, tight.noisy_gaps, tight.stage) == (SearchEnd.OPTIMUM, False, LeastSquares().stages[-1])
+    assert tight.iterations > state.iterations
+    fit, whole = end_search(tight, 0.0), solve_least_squares(two_logs())
+    assert fit.jumps is None
+    assert whole.covariance is not None
+    assert (np.abs(found(fit) - found(whole)) < 1e-2 * np.sqrt(np.diag(whole.covariance))).all()
+
+
+def test_loosened_gaps_stay_where_tight_ones_lead_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, entered = loosened(monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr(SearchState, "is_at_noise", property(lambda at: at.stage.gap > 1e-4))
+        back = tighten(state)
+    assert entered == [1e-3, 3e-4, 1e-4]
+    assert (back.end, back.noisy_gaps, back.stage) == (SearchEnd.OPTIMUM, True, state.stage)
+    assert back.iterate is state.iterate
+    assert back.iterations > state.iterations
+    entered.clear()
+    monkeypatch.setattr(SearchState, "promised_squares", lambda *_: math.inf)
+    assert tighten(state) is state
+    assert entered == []
+
+
+def test_the_head_of_the_file_lists_every_stage_and_end() -> None:
+    page = least_squares.__doc__ or ""
+    assert [float(gap) for gap in re.findall(r"\de-\d", page)] == [stage.gap for stage in LeastSquares().stages]
+    assert set(re.findall(r"^    ([A-Z_]+) ", page, re.MULTILINE)) == set(SearchEnd.__members__)
