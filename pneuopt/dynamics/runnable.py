@@ -4,10 +4,9 @@
 by `simulate` and, where it is fittable, by `identify`. Nobody asks a model for its type. A drive is none: `as_system`
 and `as_runnable` take its system, and every verb that is given a model begins with one of them.
 
-`count_from_centre`: a plant whose command is counted from the centre of its valve, as a controller counts it.
-
-A valve for 0 to 10 V is closed near 5 V. Its wire and its logs count from 0 V; a controller's command, its limits and
-its dither count from the centre, whatever that is. What a loop puts on the wire is the centre plus its command.
+`count_from_centre` makes a plant whose command counts from the centre of its valve. A valve for 0 to 10 V is closed
+near 5 V. Its wire and its logs count from 0 V; a controller's command, its limits and its dither count from the centre,
+whatever that is. What a loop puts on the wire is the centre plus its command.
 """
 
 from collections.abc import Mapping, Sequence
@@ -107,19 +106,7 @@ DRIVE_OR_SYSTEM = "a drive (read_drive gives one beside its parameters) or its s
 
 
 def as_system(model: HasSystem, argument: str = "system", meant: str = DRIVE_OR_SYSTEM) -> System:
-    """The system of a drive; a system stays what it is.
-
-    Parameters
-    ----------
-    model : drive or System
-    argument, meant : str
-        For the message: the name of the argument, and what it takes.
-
-    Raises
-    ------
-    InputError
-        If it has no system.
-    """
+    """The system of a drive; a system stays what it is; what has none is an `InputError` on that `argument`."""
     if isinstance(model, type) or not callable(getattr(model, "system", None)):
         raise wrong_argument(argument, model, meant)
     return model.system()
@@ -164,12 +151,9 @@ def check_smooth(model: Runnable) -> None:
 
 
 def count_from_centre(system: System) -> System:
-    """A system whose command is the deviation from the centre of its final element.
+    """A system whose command is the deviation from the centre of its final element; the same one where it has none.
 
-    Returns
-    -------
-    System
-        Its parameter of the centre remains, without an effect. The same system where it has none.
+    Its parameter of the centre remains, without an effect.
     """
     axis, centre = system.axis, centre_name(system)
     if axis is None or axis.final_element is None or centre is None:

@@ -35,19 +35,11 @@ class EventKind(Enum):
 
 @dataclass(frozen=True)
 class Event:
-    """A change between sticking and sliding.
+    """A change between sticking and sliding."""
 
-    Attributes
-    ----------
-    t : float
-        When [s].
-    direction : int
-        Of the motion afterwards: 1, -1, or 0 where the mass sticks.
-    """
-
-    t: float
+    t: float  # when [s]
     kind: EventKind
-    direction: int
+    direction: int  # of the motion afterwards: 1, -1, or 0 where the mass sticks
 
 
 class StickSlipIntegration:

@@ -1,9 +1,8 @@
 """`System` (an ODE with named signals) and `DiscreteSystem` (its sampled step), which every solver reads.
 
-Inputs that run linearly from sample to sample: as an integration reads them, and as inputs of a sampled step.
-
-A held input stays what it is, so that it costs nothing. Of a linear one the sampled step also gets its slope, and the
-instant of the sample, from which it computes the input wherever within the sample RK4 asks for it.
+`define` makes the first from named signals, `discretise` the second. Inputs that run linearly from sample to sample
+(`Ramp`, `add_slopes`) stand last: a held one costs nothing; of a linear one the sampled step also gets its slope and
+the sample's instant, from which it computes the input wherever within the sample RK4 asks for it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -234,19 +233,11 @@ class System:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The equations of a model between two samples, and its controller's update at a sample.
-
-    Attributes
-    ----------
-    update : casadi.Function, optional
-        ``(t, x, u, p) -> x``: the state after a sampled controller has acted.
-    sample_time : float, optional
-        From one sample to the next [s].
-    """
+    """The equations of a model between two samples, and its controller's update at a sample."""
 
     system: System
-    update: ca.Function | None = None
-    sample_time: float | None = None
+    update: ca.Function | None = None  # ``(t, x, u, p) -> x``: the state after a sampled controller has acted
+    sample_time: float | None = None  # from one sample to the next [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,11 +409,6 @@ def add_slopes(discrete: DiscreteSystem, linear: Mask) -> DiscreteSystem:
 
     Its inputs are those of `discrete`, then a slope for each linear one, then the instant of the sample [s], as
     `append_slopes` gives them. It takes every slope, zero too, so one system serves logs that differ in what they hold.
-
-    Raises
-    ------
-    ModelError
-        If the system has no right-hand side, only a step.
     """
     if not linear.any():
         return discrete
@@ -447,16 +433,5 @@ def add_slopes(discrete: DiscreteSystem, linear: Mask) -> DiscreteSystem:
 
 
 def append_slopes(t: Array, u: Array, linear: Mask, rising: Mask) -> Array:
-    """The inputs of `add_slopes` along a log, of which only some are `rising`.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-    u : ndarray, shape (n, n_inputs)
-    linear, rising : ndarray of bool, shape (n_inputs,)
-
-    Returns
-    -------
-    ndarray, shape (n, n_inputs + linear.sum() + 1)
-    """
+    """The inputs of `add_slopes` along a log, (n, n_inputs + linear.sum() + 1), of which only some are `rising`."""
     return np.column_stack([u, slopes(t, u, rising)[:, linear], t]) if linear.any() else u

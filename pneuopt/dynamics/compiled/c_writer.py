@@ -35,18 +35,11 @@ DIVISIONS = (ca.OP_DIV, ca.OP_INV)
 
 
 class CFunction(NamedTuple):
-    """One CasADi Function to write as C.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        SX, with dense results.
-    inputs, outputs : sequence of str
-        The members of the C struct that hold its arguments and results.
-    """
+    """One CasADi Function to write as C."""
 
     name: str
-    function: ca.Function
+    function: ca.Function  # SX, with dense results
+    # inputs, outputs: the members of the C struct that hold its arguments and results
     inputs: Sequence[str]
     outputs: Sequence[str]
 
@@ -68,23 +61,10 @@ class CValue(NamedTuple):
 
 
 def write_c(c_function: CFunction, rates: Mapping[str, int]) -> tuple[str, int]:
-    """C functions ``NAME_segment``, ``NAME_sample`` and ``NAME_call`` on a struct ``Segment *s``.
+    """C functions ``NAME_segment``, ``NAME_sample``, ``NAME_call`` on a struct ``Segment *s``; and their storage size.
 
-    Parameters
-    ----------
-    rates : mapping of str to int
-        How often each input changes: an index into `RATES`.
-
-    Returns
-    -------
-    text : str
-    storage : int
-        How many values the struct's member ``NAME_kept`` has to hold.
-
-    Raises
-    ------
-    NotImplementedError
-        For an operation of CasADi that has no C here.
+    `rates` says how often each input changes, an index into `RATES`; the storage is the struct's member ``NAME_kept``.
+    An operation of CasADi that has no C here is a `NotImplementedError`.
     """
     writer = _CWriter(c_function, rates)
     functions = []

@@ -1,11 +1,9 @@
 """`compile_library`: C source compiled and loaded as a library, from the cache where it was compiled before.
 
-Compiled libraries kept on the disk. A file is loaded only if it is whole and this user's own: it runs as our code.
-
-A library is named by what it was made of (source, flags, compiler, CPU) and by the hash of its bytes, so that one that
-is damaged, cut or exchanged does not fit its name. Loading such a file ends the process (SIGBUS, SIGSEGV), or worse.
-
-`find_compiler`: the C compiler that is used, as a command, and the flags that it gets.
+First the compiler (`find_compiler`) and its flags, then compiling, then the cache (`cache_directory`, `find_library`).
+A file is loaded only if it is whole and this user's own: it runs as our code. It is named by what it was made of
+(source, flags, compiler, CPU) and by the hash of its bytes, so that one that is damaged, cut or exchanged does not fit
+its name. Loading such a file ends the process (SIGBUS, SIGSEGV), or worse.
 """
 
 import atexit
@@ -50,15 +48,9 @@ NO_COMPILER = (
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler.
+    """A C compiler."""
 
-    Parameters
-    ----------
-    command : tuple of str
-        The program, and the arguments that stand before all others.
-    """
-
-    command: tuple[str, ...]
+    command: tuple[str, ...]  # the program, and the arguments that stand before all others
 
     def __str__(self) -> str:
         return shlex.join(self.command)
@@ -152,12 +144,8 @@ logger = logging.getLogger("pneuopt")
 def compile_library(source: str, *definitions: str) -> ctypes.CDLL | None:
     """Compile a source, or load its product from the cache; None where that cannot be done, which is said once.
 
-    Parameters
-    ----------
-    source : str
-        The same one, compiled or not, is answered from memory.
-    *definitions : str
-        Macros, each tried after the one before it failed (``"LANES=1"``); none: the source as it is.
+    The same source is answered from memory. Each definition, a macro as ``LANES=1``, is tried after the one before it
+    failed.
     """
     cc = find_compiler()
     if cc is None:
@@ -273,13 +261,7 @@ def cache_directory() -> Path:
 
 
 def find_library(folder: Path, identity: str) -> Path | None:
-    """The library that was made of this, if it is kept, whole and this user's own; others in its place are deleted.
-
-    Parameters
-    ----------
-    identity : str
-        All that the library was made of.
-    """
+    """The library that was made of this, if it is kept, whole and this user's own; others in its place are deleted."""
     for path in sorted(folder.glob(f"{_digest(identity)}-*.so")):
         if _is_own(path) and path.name == _library_name(identity, path.read_bytes()):
             with contextlib.suppress(OSError):
@@ -314,13 +296,7 @@ def cached_libraries(folder: Path) -> dict[Path, os.stat_result]:
 
 
 def trim_cache(folder: Path, keep: Path | None = None) -> None:
-    """Delete libraries that were not used for long, or are too many, and what killed processes left behind.
-
-    Parameters
-    ----------
-    keep : Path, optional
-        A library that stays in any case.
-    """
+    """Delete libraries, but not `keep`, that are old or too many, and what killed processes left behind."""
     now, size = time.time(), 0
     for path, entry in cached_libraries(folder).items():
         size += entry.st_size

@@ -2,9 +2,8 @@
 
 It is cached machine code, or runs in the CasADi VM where there is no compiler. Both give the same answers. Binaries
 are cached by content (source, flags, compiler, CPU); logs, values and step sizes are arguments, so one binary serves
-every log and every continuation step.
-
-The pieces of a sampled system with their sensitivities, symbolically and as the C of a run over segments.
+every log and every continuation step. Below `Rollout` stand the pieces of a system with their sensitivities,
+symbolically and as the C of a run (`prepare_rollout`).
 """
 
 import ctypes
@@ -46,93 +45,47 @@ def check_during_runs(check: Callable[[], None]) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """The SX Functions of one sampled system, as `Rollout` runs them.
+    """The SX Functions of one sampled system, as `Rollout` runs them."""
 
-    Parameters
-    ----------
-    step : casadi.Function
-        ``(t, h, x, u, p) -> (x_next, y)``.
-    update : casadi.Function or None
-        ``(t, x, u, p) -> x``.
-    ode : casadi.Function or None
-        ``(t, x, u, p) -> (xdot, y)``, of which `step` is the RK4 step: its sensitivities are cheaper stage by stage.
-    implicit : int, optional
-        Position of the state in which the ODE is integrated implicitly (`partitioned_step`), in place of RK4.
-    """
-
-    step: ca.Function
-    update: ca.Function | None = None
+    step: ca.Function  # ``(t, h, x, u, p) -> (x_next, y)``
+    update: ca.Function | None = None  # ``(t, x, u, p) -> x``
+    # ``(t, x, u, p) -> (xdot, y)``, of which `step` is the RK4 step: its sensitivities are cheaper stage by stage
     ode: ca.Function | None = None
+    # position of the state in which the ODE is integrated implicitly (`partitioned_step`), in place of RK4
     implicit: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutResult:
-    """The outputs, end states and sensitivities of m segments of n samples.
+    """The outputs, end states and sensitivities of m segments of n samples."""
 
-    Attributes
-    ----------
-    y : ndarray, shape (m, n, n_outputs)
-    x_end : ndarray, shape (m, n_states)
-        State after the last sample's step.
-    x : ndarray, shape (m, ceil(n / states), n_states), or None
-        State at each so many samples, before the controller's update.
-    dy : ndarray, shape (m, n, n_outputs, n_columns), or None
-    dx_end : ndarray, shape (m, n_states, n_columns), or None
-        Sensitivities; the columns are the start state, then the chosen parameters.
-    """
-
-    y: Array
-    x_end: Array
+    y: Array  # (m, n, n_outputs)
+    x_end: Array  # (m, n_states): state after the last sample's step
+    # (m, ceil(n / states), n_states): state at each so many samples, before the controller's update
     x: Array | None = None
-    dy: Array | None = None
+    dy: Array | None = None  # (m, n, n_outputs, n_columns), or None
+    # (m, n_states, n_columns), or None: sensitivities; the columns are the start state, then the chosen parameters
     dx_end: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The normal equations of the residuals of m segments; s sensitivity columns, as for `RolloutResult`.
+    """The normal equations of the residuals of m segments; s sensitivity columns, as for `RolloutResult`."""
 
-    Attributes
-    ----------
-    grams : ndarray, shape (m, s + 1, s + 1)
-        Sum over samples and outputs of e e', with e = [dy | y - measured], weighted.
-    squares : ndarray, shape (m, n_outputs)
-        Sum over samples of each output's squared residuals, weighted.
-    sums : ndarray, shape (m, n_outputs, s)
-        Sum over samples of each output's weighted derivatives, of the residuals that count.
-    y : ndarray, shape (m, n, n_outputs)
-    x_end : ndarray, shape (m, n_states)
-    dx_end : ndarray, shape (m, n_states, s)
-    """
-
-    grams: Array
-    squares: Array
+    grams: Array  # (m, s + 1, s + 1): sum over samples and outputs of e e', with e = [dy | y - measured], weighted
+    squares: Array  # (m, n_outputs): sum over samples of each output's squared residuals, weighted
+    # (m, n_outputs, s): sum over samples of each output's weighted derivatives, of the residuals that count
     sums: Array
-    y: Array
-    x_end: Array
-    dx_end: Array
+    y: Array  # (m, n, n_outputs)
+    x_end: Array  # (m, n_states)
+    dx_end: Array  # (m, n_states, s)
 
 
 class Rollout:
-    """Run a sampled system over many segments at once.
+    """Run a sampled system over many segments at once, with sensitivities to parameters `wrt` and to the `start` state.
 
-    Parameters
-    ----------
-    wrt : sequence of int
-        Positions in the parameter vector of which sensitivities are wanted.
-    start : bool
-        Whether sensitivities to the start state are wanted.
-    threads : int, optional
-        Default: one a processor.
-    lanes : int, optional
-        Segments that one processor runs at once, a power of 2. Default: as many as pay on the CPU (4 with AVX), or one
-        where the compiler knows no vectors; 0: the CasADi VM.
-
-    Attributes
-    ----------
-    lanes : int
-        Lanes in use; 0 where the CasADi VM runs.
+    Defaults: as many threads as processors, and as many `lanes` (segments that one processor runs at once, a power of
+    2) as pay on the CPU: 4 with AVX, one where the compiler knows no vectors; 0 is the CasADi VM.
     """
 
     def __init__(
@@ -170,20 +123,10 @@ class Rollout:
         substeps: int = 1,
         states: int = 0,
     ) -> RolloutResult:
-        """Integrate m segments of n samples each.
+        """Integrate m segments from x0 (m, n_states) over n samples at t with steps h [s], (m, n) or (n,) for all.
 
-        Parameters
-        ----------
-        x0 : array_like, shape (m, n_states)
-        u : array_like, shape (m, n, n_inputs), or (n, n_inputs) for all segments
-            Held over each sample.
-        p : array_like, shape (n_parameters,) or (m, n_parameters)
-        t, h : array_like, shape (m, n), or (n,) for all segments
-            Instant of each sample and the step that follows it [s]; h = 0 pads a short segment.
-        substeps : int
-            Integration steps a sample.
-        states : int
-            Return the state at each so many samples, from the first one on: 1, or True, at each sample; 0: none.
+        Inputs u, (m, n, n_inputs) or (n, n_inputs) for all, are held over each sample; p is (m, n_parameters) or one
+        for all; h = 0 pads a short segment. The state is returned at each so many samples (`states`), or at none (0).
         """
         _check.get()()
         return self._run(*self._check_arrays(x0, u, p, t, h, substeps), substeps, states)
@@ -202,14 +145,7 @@ class Rollout:
     ) -> Gram:
         """Integrate as `run` does, and sum up the residuals' normal equations without storing their derivatives.
 
-        Parameters
-        ----------
-        x0, u, p, t, h, substeps
-            As for `run`.
-        measured : array_like, shape (m, n, n_outputs)
-            NaN: no residual.
-        weight : array_like, shape (m, n, n_outputs)
-            One over the standard deviation of the noise.
+        `measured` and `weight`, one over the noise, are (m, n, n_outputs); NaN: no residual.
         """
         _check.get()()
         given = self._check_arrays(x0, u, p, t, h, substeps)
@@ -390,25 +326,11 @@ def prepare_rollout(
     start: bool,
     implicit: int | None = None,
 ) -> tuple[dict[str, ca.Function], str]:
-    """The pieces of a sampled system (see `rollout.Pieces`) with their sensitivities, and the C of a run of them.
+    """The pieces of a sampled system (see `Pieces`) with sensitivities to parameters `wrt` and `start`, and their C.
 
-    Parameters
-    ----------
-    update, ode : casadi.Function or None
-    wrt : sequence of int
-        Positions in the parameter vector of which sensitivities are wanted.
-    start : bool
-        Whether sensitivities to the start state are wanted.
-    implicit : int, optional
-        Position of the state in which the steps of an ODE are implicit (`partitioned_step`), in place of RK4's.
-
-    Returns
-    -------
-    functions : dict of str to casadi.Function
-        "step", "output" and, if there is one, "update": ``(..., x, u, p, S) -> (value, its sensitivity)``; of an ODE
-        in RK4 steps "rate", too: ``(t, x, u, p) -> (xdot, its Jacobians to x and to the chosen parameters)``.
-    source : str
-        Empty where an operation has no form in C, which is said once.
+    Each is ``(..., x, u, p, S) -> (value, its sensitivity)``; of an ODE in RK4 steps "rate", too: ``(t, x, u, p) ->
+    (xdot, its Jacobians to x and to the chosen parameters)``. The C is empty where an operation has none, which is said
+    once.
     """
     return prepare_by_content(str(step.serialize()), _serialize(update), _serialize(ode), tuple(wrt), start, implicit)
 

@@ -22,25 +22,14 @@ WAYS = {"vm": 0, "scalar": 1, "lanes": None}  # the lanes of a Rollout
 
 @dataclass(frozen=True)
 class SelfCheck:
-    """What was found.
+    """What was found."""
 
-    Attributes
-    ----------
-    nanoseconds : dict of str to float
-        CPU time of a step, by "vm", "scalar" and "lanes"; without a compiler by "vm" alone.
-    distance : float
-        The largest of machine code from the VM, of states and sensitivities, relative to their largest value; 0
-        without a compiler.
-    derivative_error : float
-        The largest distance of sensitivities from central differences, likewise.
-    lanes : int
-        Segments that run at once; 0 without a compiler.
-    """
-
-    nanoseconds: dict[str, float]
+    nanoseconds: dict[str, float]  # CPU time of a step, by "vm", "scalar" and "lanes"; without a compiler by "vm" alone
+    # the largest of machine code from the VM, of states and sensitivities, relative to their largest value; 0 without
+    # a compiler
     distance: float
-    derivative_error: float
-    lanes: int
+    derivative_error: float  # the largest distance of sensitivities from central differences, likewise
+    lanes: int  # segments that run at once; 0 without a compiler
 
     @property
     def is_good(self) -> bool:
@@ -49,16 +38,9 @@ class SelfCheck:
 
 
 def check_machine_code(pieces: Pieces, x0: Array, u: Array, p: Array, step: float) -> SelfCheck:
-    """Run a system each way, with sensitivities to all parameters that are not zero, and without.
+    """Run a system each way, with sensitivities to all parameters that are not zero, and without, by steps [s].
 
-    Parameters
-    ----------
-    x0 : ndarray, shape (n_states,)
-    u : ndarray, shape (n_inputs,)
-        The largest inputs; segments get them from -1 to 1 times.
-    p : ndarray, shape (n_parameters,)
-    step : float
-        Between two samples [s].
+    Segments get the largest inputs `u` (n_inputs,) from -1 to 1 times.
     """
     shares = np.linspace(-1, 1, SEGMENTS * SAMPLES).reshape(SEGMENTS, SAMPLES, 1)
     t, h = np.tile(np.arange(SAMPLES) * step, (SEGMENTS, 1)), np.full((SEGMENTS, SAMPLES), step)
