@@ -9,14 +9,14 @@ near 5 V. Its wire and its logs count from 0 V; a controller's command, its limi
 whatever that is. What a loop puts on the wire is the centre plus its command.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Protocol, TypeVar
 
 import casadi as ca
 
-from pneuopt.dynamics.hooks import Log, LogWarningHook, Rest, RestHook, Start, StartHook
+from pneuopt.dynamics.hooks import Log, Rest, RestHook, Start
 from pneuopt.dynamics.system import FRICTION_DIRECTION, DiscreteSystem, Motion, System
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
@@ -101,7 +101,7 @@ class HasSystem(Protocol):
         ...
 
 
-M = TypeVar("M", bound=Runnable)
+M, R = TypeVar("M", bound=Runnable), TypeVar("R")
 DRIVE_OR_SYSTEM = "a drive (read_drive gives one beside its parameters) or its system"
 
 
@@ -164,8 +164,8 @@ def count_from_centre(system: System) -> System:
         ode=_without_centre(system, centre, system.ode),
         meter=None if system.meter is None else _without_centre(system, centre, system.meter),
         rest_hook=None if rest is None else partial(_rest, rest, centre),
-        start_hook=None if start is None else partial(_starts, start, centre),
-        log_warning_hook=None if warn is None else partial(_warnings, warn, centre),
+        start_hook=None if start is None else partial(_read_at_zero, start, centre),
+        log_warning_hook=None if warn is None else partial(_read_at_zero, warn, centre),
         axis=axis._replace(final_element=axis.final_element._replace(centre=None)),
     )
 
@@ -200,9 +200,5 @@ def _rest(hook: RestHook, centre: str, parameters: ParameterSet, outputs: Mappin
     return hook(_at_zero(parameters, centre), outputs)
 
 
-def _starts(hook: StartHook, centre: str, logs: Mapping[str, Log]) -> Sequence[Start]:
-    return hook({n: log._replace(parameters=_at_zero(log.parameters, centre)) for n, log in logs.items()})
-
-
-def _warnings(hook: LogWarningHook, centre: str, logs: Mapping[str, Log]) -> Sequence[str]:
+def _read_at_zero(hook: Callable[[Mapping[str, Log]], R], centre: str, logs: Mapping[str, Log]) -> R:
     return hook({n: log._replace(parameters=_at_zero(log.parameters, centre)) for n, log in logs.items()})

@@ -119,7 +119,12 @@ class System:
         """
         if self.start_hook is not None:
             return self.start_hook(logs)
-        return [Start({name: self._states_from_log(log.measured) for name, log in logs.items()}, {}, "as given")]
+        found = {}
+        for name, (measured, *_) in logs.items():
+            logged = [n for n in names(self.states) if n in measured and np.isfinite(measured[n]).any()]
+            zeros = {n: np.zeros(len(measured)) for n in names(self.states)}
+            found[name] = Trajectory(measured.t, zeros | {n: measured.fill_gaps(n) for n in logged})
+        return [Start(found, {}, "as given")]
 
     def log_warnings(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """What is wrong with the logs, a sentence each; without a `log_warning_hook`, nothing."""
@@ -160,11 +165,6 @@ class System:
 
     def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> None:
         """See `Fittable`; None, as every initial state of a plant is estimated."""
-
-    def _states_from_log(self, measured: Trajectory) -> Trajectory:
-        logged = [n for n in names(self.states) if n in measured and np.isfinite(measured[n]).any()]
-        zeros = {n: np.zeros(len(measured)) for n in names(self.states)}
-        return Trajectory(measured.t, zeros | {n: measured.fill_gaps(n) for n in logged})
 
     def equilibrium(self, u: Mapping[str, float], p: ParameterSet, guess: Mapping[str, float] | None = None) -> Array:
         """Solve ``xdot(x, u, p) = 0`` by Newton from `guess` (zeros where absent), by least-norm steps.

@@ -101,9 +101,8 @@ class _CWriter:
         else:
             values, operation = [self.values[k] for k in i.sources], i.operation
             if operation in DIVISIONS:
-                rarer = values[-1].rate < max(v.rate for v in values)
-                if operation == ca.OP_INV or rarer or self.divisors[i.sources[-1]] > 1:
-                    divisor = i.sources[-1]
+                divisor, rarer = i.sources[-1], values[-1].rate < max(v.rate for v in values)
+                if operation == ca.OP_INV or rarer or self.divisors[divisor] > 1:
                     if divisor not in self.reciprocals:
                         self.reciprocals[divisor] = self._assign(f"r{divisor}", ca.OP_INV, [self.values[divisor]])
                     values[-1] = self.reciprocals[divisor]

@@ -78,13 +78,11 @@ def find_compiler() -> Compiler | None:
     found = _parse_command(os.environ.get("CC", ""))
     if found is not None:
         return found
-    on_path = (
-        path
-        for path in map(shutil.which, COMPILERS)
-        if path and not (sys.platform == "darwin" and path.startswith("/usr/bin/") and (not _has_apple_tools()))
-    )
-    path = next(on_path, None)
-    return _packaged_compiler() if path is None else Compiler((path,))
+    for path in filter(None, map(shutil.which, COMPILERS)):
+        # macOS has such a gcc, clang and cc where Apple's tools are not, which only ask to install them
+        if not (sys.platform == "darwin" and path.startswith("/usr/bin/")) or _has_apple_tools():
+            return Compiler((path,))
+    return _packaged_compiler()
 
 
 def explain_missing_compiler() -> str:
@@ -184,19 +182,16 @@ def _load_library(cc: Compiler, flags: tuple[str, ...], source: str) -> ctypes.C
             return ctypes.CDLL(str(binary))
         except OSError:  # whole, but of a system whose loader has changed
             discard_library(binary)
-    return ctypes.CDLL(str(_compile(cc, flags, source, folder, identity)))
-
-
-def _compile(cc: Compiler, flags: tuple[str, ...], source: str, cache: Path, identity: str) -> Path:
-    """Compile in a temporary folder, then move the binary: another process may do the same, or this one be killed."""
-    with tempfile.TemporaryDirectory(prefix=COMPILE_FOLDER_PREFIX, dir=cache) as folder:
-        text, product = Path(folder) / "model.c", Path(folder) / "model.so"
+    # compile apart, then move the binary: another process may do the same, or this one be killed
+    with tempfile.TemporaryDirectory(prefix=COMPILE_FOLDER_PREFIX, dir=folder) as apart:
+        text, product = Path(apart) / "model.c", Path(apart) / "model.so"
         text.write_text(source, encoding="utf-8")
         # what zig keeps for all libraries, its C runtime, has its place; what it makes for this one is not wanted
-        folders = {"ZIG_GLOBAL_CACHE_DIR": str(cache / "zig"), "ZIG_LOCAL_CACHE_DIR": folder}
+        folders = {"ZIG_GLOBAL_CACHE_DIR": str(folder / "zig"), "ZIG_LOCAL_CACHE_DIR": apart}
         command = [*cc.command, *flags, str(text), "-o", str(product), *LINKER_FLAGS]
         _run_compiler(command, {**folders, **os.environ})
-        return keep_library(cache, identity, product)
+        binary = keep_library(folder, identity, product)
+    return ctypes.CDLL(str(binary))
 
 
 def _run_compiler(command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
@@ -213,7 +208,7 @@ def _run_compiler(command: Sequence[str], environment: Mapping[str, str] | None 
         try:
             out, err = process.communicate(timeout=COMPILE_TIMEOUT)
         except BaseException:
-            # Kill a process and those that it started: a compiler is a driver of others, which would go on.
+            # and those that it started: a compiler is a driver of others, which would go on
             kill_group = getattr(os, "killpg", None)  # not on Windows
             with contextlib.suppress(OSError):
                 if kill_group is None:
@@ -264,7 +259,7 @@ def find_library(folder: Path, identity: str) -> Path | None:
     """The library that was made of this, if it is kept, whole and this user's own; others in its place are deleted."""
     for path in sorted(folder.glob(f"{_digest(identity)}-*.so")):
         if _is_own(path) and path.name == _library_name(identity, path.read_bytes()):
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # its time becomes now, once a day
                 if time.time() - path.stat().st_mtime > NOTICE_TIME:
                     os.utime(path)
             return path
@@ -328,13 +323,13 @@ def _temporary_folder(reason: str, process: int) -> Path:
     """One a reason and process: a forked child has its own, since its parent removes the other."""
     logger.warning("the cache of compiled models cannot be written (%s): compiling anew in each run", reason)
     folder = Path(tempfile.mkdtemp(prefix="pneuopt-"))
-    atexit.register(_remove_folder, folder, process)
+
+    def remove() -> None:
+        if os.getpid() == process:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
     return folder
-
-
-def _remove_folder(folder: Path, process: int) -> None:
-    if os.getpid() == process:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _library_name(identity: str, content: bytes) -> str:

@@ -153,7 +153,9 @@ class _BoundCode:
         """Of a Function of which only the first `wanted` results are kept."""
         buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
         results = [_buffer(function.size_out(i)) for i in range(function.n_out())][:wanted]
-        library = compile_library(_casadi_source(function))
+        generator = ca.CodeGenerator("generated.c", {"with_header": False, "verbose": False})
+        generator.add(function)
+        library = compile_library(str(generator.dump()) + ROWS_SOURCE)
         if library is None:
             return cls(bind_function(function, buffers, results), (), buffers, results, ())
         work = np.zeros(max(1, function.sz_w()))
@@ -163,12 +165,6 @@ class _BoundCode:
         call.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int]
         pointers = (ctypes.addressof(arg), ctypes.addressof(res), None, work.ctypes.data, 0)
         return cls(call, pointers, buffers, results, (library, arg, res, work), library)
-
-
-def _casadi_source(function: ca.Function) -> str:
-    generator = ca.CodeGenerator("generated.c", {"with_header": False, "verbose": False})
-    generator.add(function)
-    return str(generator.dump()) + ROWS_SOURCE
 
 
 def _with_dense_outputs(function: ca.Function, name: str) -> ca.Function:

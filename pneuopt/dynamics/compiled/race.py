@@ -60,7 +60,7 @@ class RaceOutcome:
     x_end: Array  # (m, n_cases, n_states)
 
 
-class _Race(ctypes.Structure):
+class _RaceStruct(ctypes.Structure):
     """The struct Race of race.c."""
 
     _fields_ = (
@@ -115,5 +115,5 @@ def race(rollout: Rollout, course: RaceCourse, merit: RaceMerit, candidates: Rac
         merit.runaway,
     )
     work = m * cases * course.t.shape[1] * course.substeps
-    rollout.race(_Race(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, work, list(kept.values()))
+    rollout.race(_RaceStruct(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, work, list(kept.values()))
     return outcome

@@ -11,7 +11,7 @@ import functools
 import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -156,7 +156,14 @@ class Rollout:
         shape = (*given[3].shape, self.n_outputs)
         for name, array in (("measured", y), ("weight", w)):
             require(array.shape == shape, f"{name}: {array.shape}, expected {shape}", ModelError)
-        return (self._gram_native if self._library is not None else self._gram_vm)(given, y, w, substeps)
+        if self._library is None:
+            return self._gram_vm(given, y, w, substeps)
+        m, nx, ns = len(given[0]), self.n_states, self.n_columns
+        grams, squares = np.empty((m, ns + 1, ns + 1)), np.empty((m, self.n_outputs))
+        sums = np.empty((m, ns, self.n_outputs))
+        outputs, x_end, dx_end = np.empty(shape), np.empty((m, nx)), np.empty((m, ns, nx))
+        self._call_library(given, substeps, 0, (y, w, outputs, None, None, x_end, dx_end, grams, squares, sums))
+        return Gram(grams, squares, np.swapaxes(sums, 1, 2), outputs, x_end, np.swapaxes(dx_end, 1, 2))
 
     def _check_arrays(
         self, x0: ArrayLike, u: ArrayLike, p: ArrayLike, t: ArrayLike, h: ArrayLike, substeps: int
@@ -187,14 +194,6 @@ class Rollout:
         x = np.empty((m, -(-n // states), nx)) if states else None
         self._call_library((x0, u, p, t, h), substeps, states, (None, None, y, dy, x, x_end, dx_end, None, None, None))
         return RolloutResult(y, x_end, x, _swap_last_axes(dy), _swap_last_axes(dx_end))
-
-    def _gram_native(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
-        m, nx, ns = len(given[0]), self.n_states, self.n_columns
-        grams, squares = np.empty((m, ns + 1, ns + 1)), np.empty((m, self.n_outputs))
-        sums = np.empty((m, ns, self.n_outputs))
-        y, x_end, dx_end = np.empty(measured.shape), np.empty((m, nx)), np.empty((m, ns, nx))
-        self._call_library(given, substeps, 0, (measured, weight, y, None, None, x_end, dx_end, grams, squares, sums))
-        return Gram(grams, squares, np.swapaxes(sums, 1, 2), y, x_end, np.swapaxes(dx_end, 1, 2))
 
     def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         parts = []
@@ -266,20 +265,13 @@ class Rollout:
         running = [_pool(self._threads).submit(_call_part, function, call, (stop, *kept)) for call in calls]
         try:
             for each in running:
-                _await(each)
+                while not wait([each], CHECK_SECONDS).done:
+                    _check.get()()
+                each.result()
         except BaseException:
             stop.value = 1
             wait(running)
             raise
-
-
-def _await(part: Future[None]) -> None:
-    """Wait for a thread's part, with checks (`check_during_runs`)."""
-    while True:
-        try:
-            return part.result(CHECK_SECONDS)
-        except TimeoutError:
-            _check.get()()
 
 
 def _call_part(function: Callable[..., None], call: tuple[object, ...], kept: tuple[Any, ...]) -> None:  # noqa: ARG001

@@ -26,10 +26,6 @@ def _if_else_zero(condition: Array, value: Array, out: Array) -> None:
     out[...] = np.where(condition != 0, value, 0.0)
 
 
-def _twice(value: Array, out: Array) -> None:
-    np.add(value, value, out)
-
-
 def _erf(value: Array, out: Array) -> None:
     from scipy.special import erf
 
@@ -44,7 +40,7 @@ OPERATIONS: dict[int, Operation] = {
     ca.OP_DIV: np.divide,
     ca.OP_NEG: np.negative,
     ca.OP_SQ: np.square,
-    ca.OP_TWICE: _twice,
+    ca.OP_TWICE: lambda value, out: np.add(value, value, out),
     ca.OP_INV: np.reciprocal,
     ca.OP_CONSTPOW: np.power,
     ca.OP_POW: np.power,
@@ -144,7 +140,11 @@ class ArrayProgram:
             self._places[i.target[0]] = _Place("own", 0, self.n_rows - 1)
             return
         sources = tuple(self._places[s] for s in i.sources)
-        self._free += {self._places[s].row for s in i.sources if self._last_use[s] == k and self._is_reusable(s)}
+        self._free += {
+            self._places[s].row
+            for s in i.sources
+            if self._last_use[s] == k and self._places[s].owner == "own" and self._places[s].row not in self._constants
+        }
         if i.operation == ca.OP_OUTPUT:
             self._steps.append(_Step(np.positive, (*sources, _Place("result", *i.target))))
             return
@@ -155,10 +155,6 @@ class ArrayProgram:
             self._free.append(self.n_rows - 1)
         self._places[i.target[0]] = _Place("own", 0, self._free.pop())
         self._steps.append(_Step(OPERATIONS[i.operation], (*sources, self._places[i.target[0]])))
-
-    def _is_reusable(self, value: int) -> bool:
-        place = self._places[value]
-        return place.owner == "own" and place.row not in self._constants
 
 
 class VmRun(NamedTuple):
