@@ -36,7 +36,6 @@ from pneuopt.shooting.tolerances import (
     LEAD_SEGMENTS,
     LEAST_DAMPING,
     MAX_BATCH_NUMBERS,
-    MAX_STEP,
     PIECE_SEGMENTS,
     ROBUST_SQUARES,
     SETTLED_DECREASE,
@@ -253,7 +252,7 @@ class PredictionErrors:
         own = curvature[np.ix_(free, free)]
         step = np.zeros(len(z))
         step[free] = -np.linalg.lstsq(own + damping * np.diag(np.diag(own)), gradient[free], rcond=None)[0]
-        longest = MAX_STEP * np.where(self.scaling.log, 1.0, np.maximum(np.abs(z), 1.0))
+        longest = np.where(self.scaling.log, 1.0, np.maximum(np.abs(z), 1.0))  # a longer step leaves the model's range
         return self.scaling.project_to_bounds(z + np.clip(step, -longest, longest))
 
 

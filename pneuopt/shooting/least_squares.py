@@ -77,9 +77,7 @@ from pneuopt.shooting.tolerances import (
     FINE_TOLERANCE,
     FIRST_JOINING_STAGE,
     INITIAL_DAMPING,
-    JOINED_COST_TOLERANCE,
     JUMP_COST_TOLERANCE,
-    JUMP_ITERATIONS,
     MAX_CHI_SQUARE_RATIO,
     MAX_CREEPING_STEPS,
     MAX_GAP_SHARE,
@@ -95,7 +93,6 @@ from pneuopt.shooting.tolerances import (
     MAX_SHIFT,
     MAX_STAGE_REFINEMENT,
     MAX_STEP_HALVINGS,
-    MAX_STEPS,
     MAX_TRIES,
     MAX_UNDAMPED_STEPS,
     MIN_DAMPING,
@@ -103,13 +100,13 @@ from pneuopt.shooting.tolerances import (
     MIN_IMPLICIT_SUBSTEPS,
     MISFIT_TOLERANCE,
     PATIENT_ITERATIONS,
-    REPEAT_ITERATIONS,
     SETTLED_COST_DECREASE,
     STAGE_COST_TOLERANCE,
     STALL_COST_DECREASE,
     STEEP_DECREASE,
     STIFFNESS_UPDATE_CHANGE,
     TRAPPING_DAMPING,
+    TRIAL_ITERATIONS,
     UNIDENTIFIABLE_PRIOR_RATIO,
     WIDE_GAP,
 )
@@ -633,7 +630,7 @@ def pass_stage(state: SearchState, stage: Stage) -> SearchState:
 def joins_known_search(state: SearchState) -> bool:
     """Whether a search has come to where a known one was after the same stage, and would go on as that one."""
     known = [cost for gap, cost in state.method.known_costs if gap == state.stage.gap]
-    return any(abs(state.cost - cost) <= JOINED_COST_TOLERANCE * cost for cost in known)
+    return any(abs(state.cost - cost) <= STAGE_COST_TOLERANCE * cost for cost in known)
 
 
 def run_stage(state: SearchState, stage: Stage) -> SearchState:
@@ -825,9 +822,9 @@ def jump_to_last_stage(state: SearchState) -> SearchState:
     """The optimum that the last stage soon reaches; where it does not, the state goes on from there."""
     trial = enter_stage(state, state.method.stages[-1], state.iterate.nodes, state.iterate.z)
     if math.isfinite(trial.iterate.cost):
-        trial = iterate(trial, JUMP_ITERATIONS)
+        trial = iterate(trial, TRIAL_ITERATIONS)
         if trial.is_at_noise:  # finer steps are lost on what has not come near the noise by then
-            trial = finish_stage(trial, JUMP_ITERATIONS).conclude()
+            trial = finish_stage(trial, TRIAL_ITERATIONS).conclude()
             if trial.end is SearchEnd.OPTIMUM and trial.is_at_noise:
                 return trial
     return state.resumed_after(trial)
@@ -849,7 +846,7 @@ def choose_repeat(state: SearchState, found: ConvergenceTest) -> Repeat:
     no longer move it is trapped, and keeps the rest of the log from its optimum. Gaps that stand for noise of the
     states are what is estimated, and free no node.
     """
-    is_trial = state.stage.iterations <= REPEAT_ITERATIONS
+    is_trial = state.stage.iterations <= TRIAL_ITERATIONS
     falls = state.last_decrease > STEEP_DECREASE and not is_trial
     goes_on = state.noisy_gaps or state.is_near_end or falls
     if found.status.converged or found.unidentifiable.size or not goes_on:
@@ -869,7 +866,7 @@ def repeat_last_stage(state: SearchState) -> SearchState:
     Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
     """
     least_decrease = 0.5 * state.method.tolerance**2  # that of a step of so many deviations
-    count = min(REPEAT_ITERATIONS, state.stage.iterations)
+    count = min(TRIAL_ITERATIONS, state.stage.iterations)
     for _ in range(MAX_REPEATS * state.stage.iterations // max(1, count)):
         before, found = state, state.assess()
         repeat = choose_repeat(state, found)
@@ -1285,7 +1282,7 @@ def close_gaps(optimum: Optimum) -> Array | None:
     segments, linear = optimum.equations.segments, optimum.equations.linearisation
     slopes = np.where(segments.linked[:, None, None], linear.end_sensitivities[:, :, : optimum.nodes.shape[1]], 0.0)
     nodes, y, x_end = optimum.nodes, optimum.run.y, optimum.run.x_end
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_NODE_STEPS):
         with np.errstate(all="ignore"):  # a run that leaves the model's range has no number, and is not taken
             shift = propagate_shifts(slopes, segment_gaps(segments, nodes, x_end))
             if not np.abs(shift).max(initial=0.0) > MAX_SHIFT:

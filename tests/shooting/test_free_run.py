@@ -28,5 +28,5 @@ def test_closed_gaps_leave_the_run_from_end_to_end() -> None:
 
 
 def test_gaps_that_stay_open_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_STEPS", 1)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.MAX_NODE_STEPS", 1)
     assert close_gaps(jumping_fit()) is None

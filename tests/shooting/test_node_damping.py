@@ -31,7 +31,7 @@ from pneuopt.shooting.least_squares import (
     start_search,
 )
 from pneuopt.shooting.segments import segment, start_nodes
-from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO, MAX_REPEATS, REPEAT_ITERATIONS, TRAPPING_DAMPING
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO, MAX_REPEATS, TRAPPING_DAMPING, TRIAL_ITERATIONS
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 N, H, NOISE, GAP = 60, 0.1, 0.1, 0.5
@@ -362,7 +362,7 @@ def test_a_search_with_noise_of_the_states_that_moves_is_repeated_once(monkeypat
 
     monkeypatch.setattr(lifted, "iterate", count)
     assert lifted.repeat_last_stage(replace(state, noisy_gaps=True)).end is SearchEnd.UNSETTLED
-    assert taken == [REPEAT_ITERATIONS]
+    assert taken == [TRIAL_ITERATIONS]
 
 
 @pytest.mark.parametrize("iterations", [4, 10, 30])
@@ -380,7 +380,7 @@ def test_a_last_stage_is_repeated_three_times_in_all(iterations: int, monkeypatc
     monkeypatch.setattr(SearchState, "is_at_noise", True)
     lifted.repeat_last_stage(replace(state, setup=setup, stage=stage))
     assert sum(taken) == MAX_REPEATS * iterations
-    assert max(taken) == min(iterations, REPEAT_ITERATIONS)
+    assert max(taken) == min(iterations, TRIAL_ITERATIONS)
 
 
 @pytest.mark.parametrize("move", ["step", "undamped_steps"])

@@ -89,7 +89,7 @@ def test_a_first_stage_that_explains_the_logs_is_followed_by_the_last() -> None:
 def test_a_last_stage_that_does_not_soon_converge_is_left_for_the_stages_between(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("pneuopt.shooting.least_squares.JUMP_ITERATIONS", 1)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.TRIAL_ITERATIONS", 1)
     fit, stages = fit_by_stages(LeastSquares())
     assert stages.index("6/6") < stages.index("2/6")
     assert fit.status.converged
@@ -164,7 +164,7 @@ def test_a_last_stage_that_stays_above_the_noise_is_not_integrated_by_finer_step
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A log with hysteresis in the valve lost two thirds of its search to that."""
-    monkeypatch.setattr("pneuopt.shooting.least_squares.JUMP_ITERATIONS", 1)
+    monkeypatch.setattr("pneuopt.shooting.least_squares.TRIAL_ITERATIONS", 1)
     jumps = list[bool]()
 
     def jumped(state: SearchState) -> SearchState:

@@ -26,7 +26,7 @@ from pneuopt.dynamics.compiled.c_writer import CFunction, write_c
 from pneuopt.dynamics.compiled.compiler import compile_library, warn_once
 from pneuopt.dynamics.compiled.vm import run_in_vm
 from pneuopt.dynamics.integrators import OwnRate, partitioned_step, rk4
-from pneuopt.dynamics.tolerances import BRIEF_STEPS, CHECK_SECONDS, MAX_SUBSTEPS, UNSHARED_STEPS, VM_BATCH
+from pneuopt.dynamics.tolerances import BLOCK_SEGMENTS, BRIEF_STEPS, CHECK_SECONDS, UNSHARED_STEPS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 
@@ -177,7 +177,8 @@ class Rollout:
             require(array.shape == expected[name], f"{name}: {array.shape}, expected {expected[name]}", ModelError)
         require(p.shape in ((self.n_parameters,), (m, self.n_parameters)), f"p has shape {p.shape}", ModelError)
         require(substeps >= 1, f"substeps must be at least 1, got {substeps}", ModelError)
-        require(substeps <= MAX_SUBSTEPS, f"substeps may be {MAX_SUBSTEPS} at most, got {substeps}", ModelError)
+        most = int(np.iinfo(np.intc).max)  # a C int counts them
+        require(substeps <= most, f"substeps may be {most} at most, got {substeps}", ModelError)
         return x0, u, p, t, h
 
     def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
@@ -197,9 +198,9 @@ class Rollout:
 
     def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         parts = []
-        for i in range(0, len(measured), VM_BATCH):
+        for i in range(0, len(measured), BLOCK_SEGMENTS):
             _check.get()()
-            x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + VM_BATCH] for a in (*given, measured, weight))
+            x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + BLOCK_SEGMENTS] for a in (*given, measured, weight))
             run = run_in_vm(self._functions, (x0, u, p, t, h), self._starts, substeps, 0, self._threads)
             dy, dx_end = (np.swapaxes(a, -1, -2) for a in (run.dy, run.dx_end))
             e = np.concatenate([dy, (run.y - y)[..., None]], axis=-1) * w[..., None]
