@@ -101,7 +101,8 @@ class HasSystem(Protocol):
         ...
 
 
-M, R = TypeVar("M", bound=Runnable), TypeVar("R")
+M = TypeVar("M", bound=Runnable)
+R = TypeVar("R")
 DRIVE_OR_SYSTEM = "a drive (read_drive gives one beside its parameters) or its system"
 
 
