@@ -75,6 +75,7 @@ from pneuopt.shooting.segments import IntegrationCorrection, Segments, segment, 
 from pneuopt.shooting.tolerances import (
     FINE_TOLERANCE,
     MAX_CHI_SQUARE_RATIO,
+    MAX_GAP_SHARE,
     MAX_REPEATS,
     PATIENT_ITERATIONS,
     TRAPPING_DAMPING,
@@ -234,7 +235,7 @@ def test_a_bound_stops_it_and_is_marked(bounds: tuple[float, float], value: floa
 def test_two_parameters_that_only_appear_as_a_product_are_named() -> None:
     fit = solve_least_squares(two_logs(extra=True))
     assert fit.status.code is Code.NOT_CONVERGED
-    assert "do not determine damping and factor" in fit.status.message
+    assert set(fit.unidentifiable) < {"damping", "factor"}
     assert fit.covariance is None
 
 
@@ -243,7 +244,7 @@ def test_a_parameter_without_effect_is_named() -> None:
     parameters = problem.parameters.fixed("factor").freed("idle")
     fit = solve_least_squares(replace(problem, parameters=parameters))
     assert fit.status.code is Code.NOT_CONVERGED
-    assert "do not depend on idle" in fit.status.message
+    assert fit.unidentifiable == ("idle",)
     assert fit.covariance is not None
     position = list(fit.parameters.free_names).index("idle")
     assert np.isnan(fit.covariance[position]).all()
@@ -265,7 +266,7 @@ def test_a_model_that_cannot_follow_does_not_converge() -> None:
     wrong = problem.parameters.fixed("stiffness").with_values({"stiffness": 150.0})
     fit = solve_least_squares(replace(problem, parameters=wrong), LeastSquares(stages=(Stage(1e-2, 60),)))
     assert fit.status.code is Code.NOT_CONVERGED
-    assert "gaps between segments carry" in fit.status.message
+    assert fit.stats["gap_share"] > MAX_GAP_SHARE
 
 
 def shaken(size: float, seed: int = 0) -> Transcription:
@@ -320,8 +321,8 @@ def test_what_a_wrong_model_leaves_counts_as_noise_of_its_states() -> None:
     problem = shaken(2e-3)
     fit = solve_least_squares(problem)
     assert fit.status.converged
-    assert "does not explain the log to its noise" in fit.status.message
-    assert "speed jumps by" in fit.status.message
+    assert fit.jumps is not None
+    assert np.argmax(np.std(fit.jumps, axis=0)) == 1  # the speed
     runs = zip(problem.phases, fit.trajectories, strict=True)
     nodes = [run.matrix(("position", "speed"))[phase.nodes].ravel() for phase, run in runs]
     here = np.concatenate([found(fit), *nodes])
@@ -340,16 +341,16 @@ def test_what_a_wrong_model_leaves_counts_as_noise_of_its_states() -> None:
 def test_residuals_beyond_the_noise_are_reported() -> None:
     problem = two_logs()
     proud = tuple(replace(r, noise=r.noise / 3) for r in problem.residuals)
-    status = solve_least_squares(replace(problem, residuals=proud)).status
-    assert status.converged
-    assert "residuals are 2.9 times the noise of position" in status.message
-    assert "explain" not in solve_least_squares(problem).status.message
+    fit = solve_least_squares(replace(problem, residuals=proud))
+    assert fit.status.converged
+    assert len(fit.status.sentences) > len(solve_least_squares(problem).status.sentences)
+    assert math.sqrt(fit.chi_square / fit.count) == pytest.approx(2.9, abs=0.05)
 
 
 def test_too_few_iterations_are_no_convergence() -> None:
     fit = solve_least_squares(two_logs(), LeastSquares(stages=(Stage(1e-5, 1),)))
     assert fit.status.code is Code.NOT_CONVERGED
-    assert "would still move by" in fit.status.message
+    assert len(fit.unsettled) == 1
 
 
 def test_a_model_too_stiff_to_search_is_refused_at_once() -> None:
@@ -357,7 +358,7 @@ def test_a_model_too_stiff_to_search_is_refused_at_once() -> None:
     stiff = problem.parameters.with_bounds({"damping": (0.0, 1e6)}).with_values({"damping": 3e4})
     fit = solve_least_squares(replace(problem, parameters=stiff))
     assert fit.status.code is Code.NOT_CONVERGED
-    assert "takes 300 integration steps" in fit.status.message
+    assert fit.end is SearchEnd.TOO_STIFF
     assert fit.stats["iterations"] == 0
 
 
@@ -367,7 +368,7 @@ def test_a_start_that_is_not_finite_is_reported() -> None:
     phases = (replace(problem.phases[0], guess=guess), problem.phases[1])
     fit = solve_least_squares(replace(problem, phases=phases))
     assert fit.status.code is Code.DIVERGED
-    assert "not finite at the start" in fit.status.message
+    assert fit.end is SearchEnd.DIVERGED
     assert fit.covariance is None
 
 
@@ -464,28 +465,25 @@ def test_the_steps_fall_again_where_a_start_was_stiffer_than_the_answer(monkeypa
 
 
 @pytest.mark.parametrize(
-    ("make", "option", "allowed"),
+    ("make", "option"),
     [
-        (lambda: LeastSquares(stages=()), "stages=()", "one Stage or more"),
-        (lambda: LeastSquares(segment_time=math.nan), "segment_time=nan", "seconds above 0"),
-        (lambda: LeastSquares(segment_time=-1.0), "segment_time=-1.0", "seconds above 0"),
-        (lambda: LeastSquares(substeps=0), "substeps=0", "a whole number from 1"),
-        (lambda: LeastSquares(substeps=2.5), "substeps=2.5", "a whole number from 1"),  # type: ignore[arg-type]
-        (lambda: LeastSquares(tolerance=0.0), "tolerance=0.0", "a positive number"),
-        (lambda: LeastSquares(kinematic=math.nan), "kinematic=nan", "a positive number"),
-        (lambda: Stage(-1e-3, 8), "gap=-0.001", "a positive fraction"),
-        (lambda: Stage(math.nan, 8), "gap=nan", "a positive fraction"),
-        (lambda: Stage(1e-3, -1), "iterations=-1", "0 or more"),
-        (lambda: Stage(1e-3, 8, refine=0), "refine=0", "or more"),
+        (lambda: LeastSquares(stages=()), "stages=()"),
+        (lambda: LeastSquares(segment_time=math.nan), "segment_time=nan"),
+        (lambda: LeastSquares(segment_time=-1.0), "segment_time=-1.0"),
+        (lambda: LeastSquares(substeps=0), "substeps=0"),
+        (lambda: LeastSquares(substeps=2.5), "substeps=2.5"),  # type: ignore[arg-type]
+        (lambda: LeastSquares(tolerance=0.0), "tolerance=0.0"),
+        (lambda: LeastSquares(kinematic=math.nan), "kinematic=nan"),
+        (lambda: Stage(-1e-3, 8), "gap=-0.001"),
+        (lambda: Stage(math.nan, 8), "gap=nan"),
+        (lambda: Stage(1e-3, -1), "iterations=-1"),
+        (lambda: Stage(1e-3, 8, refine=0), "refine=0"),
     ],
 )
-def test_an_option_out_of_its_range_is_refused_by_its_name(
-    make: Callable[[], object], option: str, allowed: str
-) -> None:
+def test_an_option_out_of_its_range_is_refused_by_its_name(make: Callable[[], object], option: str) -> None:
     """They ended in a traceback from inside, or meant another search: a gap of -1e-3 was one of 1e-3."""
-    with pytest.raises(ValueError, match=re.escape(option)) as refused:
+    with pytest.raises(ValueError, match=re.escape(option)):
         make()
-    assert allowed in str(refused.value)
 
 
 def test_options_at_the_ends_of_their_ranges_are_taken() -> None:

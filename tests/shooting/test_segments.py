@@ -129,7 +129,7 @@ def test_a_state_is_felt_through_a_phase_that_follows() -> None:
 
 
 def test_a_free_duration_is_refused() -> None:
-    with pytest.raises(ModelError, match="a: a free duration needs another method"):
+    with pytest.raises(ModelError, match=r"a: .*duration"):
         segment(posed(phase("a", 8, duration="load.mass")))
 
 
