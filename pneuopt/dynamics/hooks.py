@@ -1,9 +1,8 @@
 """Model hooks: what a model hands its `System` beside the equations.
 
-How an identification starts from logs, what is wrong with logs, where the plant rests, which hardware cannot exist, and
-the limits beyond which the equations no longer hold (end stops, a vacuum).
-
-Which motion a log must show for a model's parameters to be identifiable (`System.identification_hints`).
+How an identification starts from logs, what is wrong with logs, where the plant rests, which hardware cannot exist, the
+limits beyond which the equations no longer hold (end stops, a vacuum), and which motion a log must show for the model's
+parameters to be identifiable (`System.identification_hints`).
 
 Names are those of parameters. A part of a plant uses its own ("viscous") for its own parameters and whole ones
 ("load.force") for those of other parts; `IdentificationHints.with_prefix` turns the first into the second.
@@ -33,32 +32,17 @@ class Log(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A candidate from which an identification can start.
+    """A candidate from which an identification can start."""
 
-    Attributes
-    ----------
-    states : mapping of str to Trajectory
-        States along each log, by the log's name.
-    parameters : mapping of str to float
-        By name; a `per_log` one as "name[log]".
-    trial_parameters : tuple of str
-        Those of the parameters that the logs do not determine: each candidate tries one value of them.
-    """
-
-    states: Mapping[str, Trajectory]
-    parameters: Mapping[str, float]
+    states: Mapping[str, Trajectory]  # states along each log, by the log's name
+    parameters: Mapping[str, float]  # by name; a `per_log` one as "name[log]"
     label: str = ""
+    # those of the parameters that the logs do not determine: each candidate tries one value of them
     trial_parameters: tuple[str, ...] = ()
 
 
 class Starts(Sequence[Start]):
-    """Starts of which each is computed when it is first asked for: most searches end at the first one.
-
-    Parameters
-    ----------
-    makers : sequence of callable
-        Each returns a start.
-    """
+    """Starts of which each is computed when it is first asked for: most searches end at the first one."""
 
     def __init__(self, makers: Sequence[Callable[[], Start]]) -> None:
         self._makers, self._made = tuple(makers), dict[int, Start]()
@@ -122,42 +106,22 @@ class HardwareCheckHook(Protocol):
 
 @dataclass(frozen=True)
 class ValidityLimit:
-    """A value of a state beyond which the model's equations no longer describe the plant: an end stop, a vacuum.
-
-    Attributes
-    ----------
-    limit : callable
-        From the plant's parameters, all of them, to the value [the state's unit].
-    side : int
-        1 where the state normally lies below the limit, -1 above.
-    event : str
-        The event as a clause, "the load reached the front end stop".
-    meaning : str
-        What holds from there on, as a clause, "the response is the stop's".
-    """
+    """A value of a state beyond which the model's equations no longer describe the plant: an end stop, a vacuum."""
 
     state: str
-    limit: Callable[[ParameterSet], float]
-    side: int
-    event: str
-    meaning: str
+    limit: Callable[[ParameterSet], float]  # from the plant's parameters, all of them, to the value [the state's unit]
+    side: int  # 1 where the state normally lies below the limit, -1 above
+    event: str  # the event as a clause, "the load reached the front end stop"
+    meaning: str  # what holds from there on, as a clause, "the response is the stop's"
 
 
 @dataclass(frozen=True)
 class Contact:
-    """A validity limit that a response has reached; printed, it is the sentence that a user reads.
+    """A validity limit that a response has reached; printed, it is the sentence that a user reads."""
 
-    Attributes
-    ----------
-    t : float
-        When, for the first time [s].
-    value, rate : float
-        The state there and its rate [its unit, and that over s].
-    """
-
-    t: float
-    value: float
-    rate: float
+    t: float  # when, for the first time [s]
+    value: float  # of the state there [its unit]
+    rate: float  # [that unit over s]
     state: Quantity
     validity_limit: ValidityLimit
 
@@ -169,54 +133,28 @@ class Contact:
 
 
 class FinalElement(NamedTuple):
-    """The final control element between the command and the body, a valve say: its signals, and words for it.
+    """The final control element between the command and the body, a valve say: its signals, and words for it."""
 
-    Attributes
-    ----------
-    name, moving_part, medium : str
-        Nouns for a sentence: the element, its part that the command moves, the spring through which it pushes the body.
-    limit, dead_zone, bandwidth, centre : str
-        Parameters: the size of the command that moves the part by its half travel; its dead zone [half travels] and,
-        where it lags, its bandwidth [Hz]; the command at which the part stands in its middle, None where that is 0.
-    stroke : str
-        The state of the part [half travels], where it lags.
-    pushing : tuple of str
-        The states whose forces move the body.
-    """
-
-    name: str
-    moving_part: str
-    medium: str
-    limit: str
-    dead_zone: str
-    bandwidth: str
-    stroke: str
-    pushing: tuple[str, ...]
-    centre: str | None = None
+    name: str  # a noun for a sentence, as the next two
+    moving_part: str  # which the command moves
+    medium: str  # the spring through which it pushes the body
+    limit: str  # the parameter: size of the command that moves the part by its half travel
+    dead_zone: str  # the parameter: its dead zone [half travels]
+    bandwidth: str  # the parameter, where it lags [Hz]
+    stroke: str  # the state of the part [half travels], where it lags
+    pushing: tuple[str, ...]  # the states whose forces move the body
+    centre: str | None = None  # the parameter: the command at which the part stands in its middle; None where that is 0
 
 
 class Axis(NamedTuple):
-    """The body that a plant moves against friction: the names of its states and of its mass.
+    """The body that a plant moves against friction: the names of its states and of its mass."""
 
-    Attributes
-    ----------
-    position, speed : str
-        States.
-    inertia : str
-        The parameter that multiplies the speed's rate: a mass, or a moment of inertia.
-    force : str
-        The unit of what pushes the body.
-    noun : str
-        The body in a sentence.
-    final_element : FinalElement, optional
-        What the command moves first; None where the command is the force itself.
-    """
-
-    position: str = "position"
+    position: str = "position"  # a state, as the next one
     speed: str = "speed"
-    inertia: str = "load.mass"
-    force: str = "N"
-    noun: str = "mass"
+    inertia: str = "load.mass"  # the parameter that multiplies the speed's rate: a mass, or a moment of inertia
+    force: str = "N"  # the unit of what pushes the body
+    noun: str = "mass"  # the body in a sentence
+    # what the command moves first; None where the command is the force itself
     final_element: FinalElement | None = None
 
 
@@ -226,30 +164,16 @@ DEFAULT_WIDTH = "default; identify chooses it by the logs"
 
 @dataclass(frozen=True, eq=False)
 class LoggedMotion:
-    """Statistics of the speed over all logs, and the parameters as far as they are known.
+    """Statistics of the speed over all logs, and the parameters as far as they are known."""
 
-    Attributes
-    ----------
-    slow, fast : float
-        The speed [m/s] that a tenth of the moving samples stay below, and a tenth exceed.
-    forward : float
-        Share of the moving samples, 0 to 1.
-    acceleration : float
-        Root mean square [m/s^2] of slopes over a hundredth of a log.
-    speed : ndarray
-        Every known sample [m/s].
-    values, given : ParameterSet
-        As estimated so far, and as the user gave them.
-    """
-
-    slow: float
-    fast: float
-    forward: float
+    slow: float  # the speed [m/s] that a tenth of the moving samples stay below
+    fast: float  # the one that a tenth exceed
+    forward: float  # share of the moving samples, 0 to 1
     reversals: int
-    acceleration: float
-    speed: Array
-    values: ParameterSet
-    given: ParameterSet
+    acceleration: float  # root mean square [m/s^2] of slopes over a hundredth of a log
+    speed: Array  # every known sample [m/s]
+    values: ParameterSet  # as estimated so far
+    given: ParameterSet  # as the user gave them
 
 
 class Lack(NamedTuple):
@@ -261,30 +185,18 @@ class Lack(NamedTuple):
 
 @dataclass(frozen=True)
 class Need:
-    """The motion that a parameter needs in the logs to be identifiable.
+    """The motion that a parameter needs in the logs to be identifiable."""
 
-    Parameters
-    ----------
-    lack : callable
-        From the motion to what is lacking; None where nothing is.
-    confused_with : frozenset of str
-        The need counts only where one of these parameters is free, too; empty: always.
-    """
-
-    lack: Callable[[LoggedMotion], Lack | None]
+    lack: Callable[[LoggedMotion], Lack | None]  # from the motion to what is lacking; None where nothing is
+    # the need counts only where one of these parameters is free, too; empty: always
     confused_with: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
 class SeparatingRun:
-    """The run that separates some parameters from others, in words.
+    """The run that separates some parameters from others, in words."""
 
-    Parameters
-    ----------
-    some, others : frozenset of str
-        It suits a group that holds one of each, or one of `some` alone.
-    """
-
+    # some, others: it suits a group that holds one of each, or one of `some` alone
     some: frozenset[str]
     others: frozenset[str]
     words: str
@@ -295,22 +207,12 @@ class Width:
     """A width over which a model rounds a kink so that it can be integrated: a means, and no property of the plant.
 
     An identification chooses it by the logs, unless the user states it (`IdentificationResult.widths`).
-
-    Parameters
-    ----------
-    name : str
-        The parameter; it is on a logarithmic scale.
-    factor : float
-        By which a search narrows or widens it.
-    follows : tuple of str
-        Parameters that are narrowed or widened with it.
-    hides : str
-        The parameter that a width of its size hides, as a rounded edge does a dead zone; empty if there is none.
     """
 
-    name: str
-    factor: float
-    follows: tuple[str, ...] = ()
+    name: str  # the parameter; it is on a logarithmic scale
+    factor: float  # by which a search narrows or widens it
+    follows: tuple[str, ...] = ()  # parameters that are narrowed or widened with it
+    # the parameter that a width of its size hides, as a rounded edge does a dead zone; empty if there is none
     hides: str = ""
 
 

@@ -1,12 +1,10 @@
-"""The classical Runge-Kutta step of fourth order (RK4), symbolically.
-
-An integration step that is implicit in one state, symbolically, with sensitivities; explicit in all others.
+"""Integration steps, symbolically: the classical Runge-Kutta step (`rk4`), and one that is implicit in one state.
 
 Regularised friction on a light mass makes the rate of the speed depend on the speed a thousand times as steeply as on
 anything else: an explicit step then has to be a thousandth of what the motion asks for. A scalar equation a stage takes
-that away. The method is the L-stable ARS(2,3,2) of second order, source: Ascher, Ruuth and Spiteri, Applied Numerical
-Mathematics 25 (1997) 151-167, section 2.5, whose implicit half integrates the one state, and whose explicit half the
-others.
+that away (`partitioned_step`). The method is the L-stable ARS(2,3,2) of second order, source: Ascher, Ruuth and
+Spiteri, Applied Numerical Mathematics 25 (1997) 151-167, section 2.5, whose implicit half integrates the one state, and
+whose explicit half the others.
 """
 
 import math
@@ -22,20 +20,7 @@ from pneuopt.dynamics.tolerances import (
 
 
 def rk4(rate: Callable[[ca.SX, ca.SX], ca.SX], t: ca.SX, h: ca.SX, x: ca.SX) -> ca.SX:
-    """One step of ``dx/dt = rate(t, x)``; stable for h < 2.78/|lambda|.
-
-    Parameters
-    ----------
-    t, h : SX
-        Instant and step [s].
-    x : SX
-        A vector, or a matrix of which each column is a state or a sensitivity.
-
-    Returns
-    -------
-    SX
-        x at t + h.
-    """
+    """One step of ``dx/dt = rate(t, x)``, a column each state or sensitivity; stable for h < 2.78/|lambda|."""
     k1 = rate(t, x)
     k2 = rate(t + h / 2, x + h / 2 * k1)
     k3 = rate(t + h / 2, x + h / 2 * k2)
@@ -52,39 +37,17 @@ Rate = Callable[[ca.SX, ca.SX], ca.SX]
 
 
 class OwnRate(NamedTuple):
-    """The rate of the implicit state as a function of that state alone, and what it does to all rates.
+    """The rate of the implicit state as a function of that state alone, and what it does to all rates."""
 
-    Attributes
-    ----------
-    position : int
-        Of the implicit state among the states.
-    value : callable
-        ``(t, x) -> (its rate, its slope over the state itself)``.
-    column : callable
-        ``(t, x) -> d(all rates)/d(this state)``.
-    """
-
-    position: int
-    value: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]]
-    column: Callable[[ca.SX, ca.SX], ca.SX]
+    position: int  # of the implicit state among the states
+    value: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]]  # ``(t, x) -> (its rate, its slope over the state itself)``
+    column: Callable[[ca.SX, ca.SX], ca.SX]  # ``(t, x) -> d(all rates)/d(this state)``
 
 
 def partitioned_step(rate: Rate, own: OwnRate, t: ca.SX, h: ca.SX, z: ca.SX) -> ca.SX:
-    """One step of ``dx/dt = f(t, x)`` and of sensitivities that go with it.
+    """One step of ``dx/dt = f(t, x)`` and of its sensitivities: z holds the states, then a column each sensitivity.
 
-    Parameters
-    ----------
-    rate : callable
-        ``(t, z) -> dz/dt``: the first column f, the others linear in the sensitivities.
-    t, h : SX
-        Instant and step [s].
-    z : SX
-        The states, then the sensitivities: a column each.
-
-    Returns
-    -------
-    SX
-        z at t + h.
+    `rate` is ``(t, z) -> dz/dt``: the first column f, the others linear in the sensitivities.
     """
     first = rate(t, z)
     middle, middle_slope = _stage(rate, own, t, h, z + h * DIAGONAL * first, z[own.position, :])
@@ -136,18 +99,9 @@ def _stage(
 def solve_scalar(residual: Callable[[ca.SX], tuple[ca.SX, ca.SX]], guess: ca.SX) -> ca.SX:
     """The root of an increasing function by Newton's method, halved where that leaves what encloses the root.
 
-    Parameters
-    ----------
-    residual : callable
-        Value and slope of the function at a point; its slope is `MIN_SLOPE` at least, on average from the guess on.
-    guess : SX
-        A point near it. Zero is tried next where it may lie between: friction is steepest at rest, and from there
-        Newton's method goes uphill to a root on either side without a step too far.
-
-    Returns
-    -------
-    SX
-        After `SOLVER_ITERATIONS`.
+    Its slope is `MIN_SLOPE` at least, on average from the guess on. Zero is tried next where it may lie between:
+    friction is steepest at rest, and from there Newton's method goes uphill to a root on either side without a step too
+    far.
     """
     value, slope = residual(guess)
     far = guess - value / MIN_SLOPE

@@ -4,20 +4,19 @@
 by `simulate` and, where it is fittable, by `identify`. Nobody asks a model for its type. A drive is none: `as_system`
 and `as_runnable` take its system, and every verb that is given a model begins with one of them.
 
-`count_from_centre`: a plant whose command is counted from the centre of its valve, as a controller counts it.
-
-A valve for 0 to 10 V is closed near 5 V. Its wire and its logs count from 0 V; a controller's command, its limits and
-its dither count from the centre, whatever that is. What a loop puts on the wire is the centre plus its command.
+`count_from_centre` makes a plant whose command counts from the centre of its valve. A valve for 0 to 10 V is closed
+near 5 V. Its wire and its logs count from 0 V; a controller's command, its limits and its dither count from the centre,
+whatever that is. What a loop puts on the wire is the centre plus its command.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Protocol, TypeVar
 
 import casadi as ca
 
-from pneuopt.dynamics.hooks import Log, LogWarningHook, Rest, RestHook, Start, StartHook
+from pneuopt.dynamics.hooks import Log, Rest, RestHook, Start
 from pneuopt.dynamics.system import FRICTION_DIRECTION, DiscreteSystem, Motion, System
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
@@ -103,23 +102,12 @@ class HasSystem(Protocol):
 
 
 M = TypeVar("M", bound=Runnable)
+R = TypeVar("R")
 DRIVE_OR_SYSTEM = "a drive (read_drive gives one beside its parameters) or its system"
 
 
 def as_system(model: HasSystem, argument: str = "system", meant: str = DRIVE_OR_SYSTEM) -> System:
-    """The system of a drive; a system stays what it is.
-
-    Parameters
-    ----------
-    model : drive or System
-    argument, meant : str
-        For the message: the name of the argument, and what it takes.
-
-    Raises
-    ------
-    InputError
-        If it has no system.
-    """
+    """The system of a drive; a system stays what it is; what has none is an `InputError` on that `argument`."""
     if isinstance(model, type) or not callable(getattr(model, "system", None)):
         raise wrong_argument(argument, model, meant)
     return model.system()
@@ -164,12 +152,9 @@ def check_smooth(model: Runnable) -> None:
 
 
 def count_from_centre(system: System) -> System:
-    """A system whose command is the deviation from the centre of its final element.
+    """A system whose command is the deviation from the centre of its final element; the same one where it has none.
 
-    Returns
-    -------
-    System
-        Its parameter of the centre remains, without an effect. The same system where it has none.
+    Its parameter of the centre remains, without an effect.
     """
     axis, centre = system.axis, centre_name(system)
     if axis is None or axis.final_element is None or centre is None:
@@ -180,8 +165,8 @@ def count_from_centre(system: System) -> System:
         ode=_without_centre(system, centre, system.ode),
         meter=None if system.meter is None else _without_centre(system, centre, system.meter),
         rest_hook=None if rest is None else partial(_rest, rest, centre),
-        start_hook=None if start is None else partial(_starts, start, centre),
-        log_warning_hook=None if warn is None else partial(_warnings, warn, centre),
+        start_hook=None if start is None else partial(_read_at_zero, start, centre),
+        log_warning_hook=None if warn is None else partial(_read_at_zero, warn, centre),
         axis=axis._replace(final_element=axis.final_element._replace(centre=None)),
     )
 
@@ -216,9 +201,5 @@ def _rest(hook: RestHook, centre: str, parameters: ParameterSet, outputs: Mappin
     return hook(_at_zero(parameters, centre), outputs)
 
 
-def _starts(hook: StartHook, centre: str, logs: Mapping[str, Log]) -> Sequence[Start]:
-    return hook({n: log._replace(parameters=_at_zero(log.parameters, centre)) for n, log in logs.items()})
-
-
-def _warnings(hook: LogWarningHook, centre: str, logs: Mapping[str, Log]) -> Sequence[str]:
+def _read_at_zero(hook: Callable[[Mapping[str, Log]], R], centre: str, logs: Mapping[str, Log]) -> R:
     return hook({n: log._replace(parameters=_at_zero(log.parameters, centre)) for n, log in logs.items()})

@@ -166,14 +166,8 @@ def continue_simulation(
 ) -> tuple[Trajectory, tuple[Contact, ...]]:
     """Continue a run from the state in which `simulate` ended, to the inputs' end or to the first contact.
 
-    Parameters are those of `simulate`, and a sampled controller has already acted at ``inputs.t[0]``.
-
-    Returns
-    -------
-    trajectory : Trajectory
-        It ends before the instant of a contact with a validity limit.
-    contacts : tuple of Contact
-        What it met there; empty otherwise.
+    A sampled controller has already acted at ``inputs.t[0]``; the trajectory ends before the instant of a contact,
+    which is returned, too.
     """
     run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol), continues=True)
     return run.trajectory(), met

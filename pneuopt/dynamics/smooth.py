@@ -1,10 +1,8 @@
 """`SmoothIntegration`: a smooth plant integrated by LSODA; `LimitMonitor` watches its validity limits.
 
-`stick_slip` holds the integrator for Karnopp's friction.
-
-`WorkArrays`: LSODA restarts with the work arrays that it had; SciPy 1.17 never frees those that a run has seen.
-
-A sampled loop restarts at each sample: a megabyte of lost arrays for each second that is simulated at 1 kHz.
+A sampled loop restarts LSODA at each sample, with the work arrays that it had (`WorkArrays`): SciPy 1.17 never frees
+those that a run has seen, a megabyte for each second that is simulated at 1 kHz. `stick_slip` holds the integrator for
+Karnopp's friction.
 """
 
 import math
@@ -109,17 +107,8 @@ class LimitMonitor:
     def follow(self, run: Integration, instants: Array, recorded: int, *, stops: bool) -> Array:
         """Advance a run that was just restarted through instants, and record it at the first `recorded` of them.
 
-        Parameters
-        ----------
-        instants : ndarray, shape (n,)
-            [s]
-        stops : bool
-            Whether the run ends before the first instant to be recorded by which a limit was met.
-
-        Returns
-        -------
-        ndarray, shape (n_states,)
-            The state at the last instant, if the run does not end before.
+        Returns the state at the last instant. With `stops` the run ends before the first recorded one by which a limit
+        was met.
         """
         t, places = self._with_checks(instants)
         x = run.advance_along(t) if isinstance(run, SmoothIntegration) else None
@@ -329,11 +318,8 @@ class WorkArrays:
     def give_to(self, solver: Any) -> None:
         """Let SciPy's LSODA, just restarted, work in these; in its own the first time.
 
-        Parameters
-        ----------
-        solver : ode or LSODA
-            SciPy's. No public name leads to its arrays: one that does not show them where this one does keeps its own,
-            with the same answer.
+        No public name leads to its arrays: a solver that does not show them where this one does keeps its own, with the
+        same answer.
         """
         integrator: Any = getattr(getattr(solver, "_lsoda_solver", solver), "_integrator", None)
         fresh = [getattr(integrator, name, None) for name in ("rwork", "iwork")]

@@ -35,19 +35,11 @@ class EventKind(Enum):
 
 @dataclass(frozen=True)
 class Event:
-    """A change between sticking and sliding.
+    """A change between sticking and sliding."""
 
-    Attributes
-    ----------
-    t : float
-        When [s].
-    direction : int
-        Of the motion afterwards: 1, -1, or 0 where the mass sticks.
-    """
-
-    t: float
+    t: float  # when [s]
     kind: EventKind
-    direction: int
+    direction: int  # of the motion afterwards: 1, -1, or 0 where the mass sticks
 
 
 class StickSlipIntegration:
@@ -120,23 +112,20 @@ class StickSlipIntegration:
         """Restart the solver at t in this mode: 0 sticks, 1 and -1 slide."""
         before = self._mode if self._mode is not None else mode * int(x[self._speed] != 0)
         if mode != before:
-            self._note_event(t, mode, before)
+            self._steps = 0
+            kind = EventKind.STANDSTILL if mode == 0 else EventKind.BREAK_AWAY if before == 0 else EventKind.REVERSAL
+            self._events.append(Event(float(self._origin + t), kind, mode))
+            require(
+                len(self._events) <= MAX_EVENTS,
+                f"{MAX_EVENTS} changes between sticking and sliding by t = {self._origin + t:.9g} s: the loop "
+                "chatters; simulate a shorter time, or mend the gains",
+                ConvergenceError,
+            )
         self._mode, self._event_time, self._dense = mode, inf, None
         self._now, self._x = t, x
         self._solver = integrate.LSODA(self._rate, t, x, self._end, **self._options)
         self._work.give_to(self._solver)
         self._last_indicator = self._mode_indicator(t, x)
-
-    def _note_event(self, t: float, mode: int, before: int) -> None:
-        self._steps = 0
-        kind = EventKind.STANDSTILL if mode == 0 else EventKind.BREAK_AWAY if before == 0 else EventKind.REVERSAL
-        self._events.append(Event(float(self._origin + t), kind, mode))
-        require(
-            len(self._events) <= MAX_EVENTS,
-            f"{MAX_EVENTS} changes between sticking and sliding by t = {self._origin + t:.9g} s: the loop chatters; "
-            "simulate a shorter time, or mend the gains",
-            ConvergenceError,
-        )
 
     def _rate(self, t: float, x: Array) -> Array:
         """Rate of the state; while stuck, the speed's entry is its rate without friction, for the step size to heed."""

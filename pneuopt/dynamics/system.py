@@ -1,9 +1,8 @@
 """`System` (an ODE with named signals) and `DiscreteSystem` (its sampled step), which every solver reads.
 
-Inputs that run linearly from sample to sample: as an integration reads them, and as inputs of a sampled step.
-
-A held input stays what it is, so that it costs nothing. Of a linear one the sampled step also gets its slope, and the
-instant of the sample, from which it computes the input wherever within the sample RK4 asks for it.
+`define` makes the first from named signals, `discretise` the second. Inputs that run linearly from sample to sample
+(`Ramp`, `add_slopes`) stand last: a held one costs nothing; of a linear one the sampled step also gets its slope and
+the sample's instant, from which it computes the input wherever within the sample RK4 asks for it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -120,7 +119,12 @@ class System:
         """
         if self.start_hook is not None:
             return self.start_hook(logs)
-        return [Start({name: self._states_from_log(log.measured) for name, log in logs.items()}, {}, "as given")]
+        found = {}
+        for name, (measured, *_) in logs.items():
+            logged = [n for n in names(self.states) if n in measured and np.isfinite(measured[n]).any()]
+            zeros = {n: np.zeros(len(measured)) for n in names(self.states)}
+            found[name] = Trajectory(measured.t, zeros | {n: measured.fill_gaps(n) for n in logged})
+        return [Start(found, {}, "as given")]
 
     def log_warnings(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """What is wrong with the logs, a sentence each; without a `log_warning_hook`, nothing."""
@@ -161,11 +165,6 @@ class System:
 
     def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> None:
         """See `Fittable`; None, as every initial state of a plant is estimated."""
-
-    def _states_from_log(self, measured: Trajectory) -> Trajectory:
-        logged = [n for n in names(self.states) if n in measured and np.isfinite(measured[n]).any()]
-        zeros = {n: np.zeros(len(measured)) for n in names(self.states)}
-        return Trajectory(measured.t, zeros | {n: measured.fill_gaps(n) for n in logged})
 
     def equilibrium(self, u: Mapping[str, float], p: ParameterSet, guess: Mapping[str, float] | None = None) -> Array:
         """Solve ``xdot(x, u, p) = 0`` by Newton from `guess` (zeros where absent), by least-norm steps.
@@ -234,19 +233,11 @@ class System:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The equations of a model between two samples, and its controller's update at a sample.
-
-    Attributes
-    ----------
-    update : casadi.Function, optional
-        ``(t, x, u, p) -> x``: the state after a sampled controller has acted.
-    sample_time : float, optional
-        From one sample to the next [s].
-    """
+    """The equations of a model between two samples, and its controller's update at a sample."""
 
     system: System
-    update: ca.Function | None = None
-    sample_time: float | None = None
+    update: ca.Function | None = None  # ``(t, x, u, p) -> x``: the state after a sampled controller has acted
+    sample_time: float | None = None  # from one sample to the next [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +317,9 @@ def define(
         If the right-hand side leaves out a state's rate or an output, or if two signals of a kind share a name.
     """
     for kind, quantities in (("state", states), ("input", inputs), ("output", outputs)):
-        _check_unique_names(kind, quantities)
+        listed = names(quantities)
+        twice = {n for n in listed if listed.count(n) > 1}
+        require(not twice, f"{kind} {', '.join(map(repr, sorted(twice)))} is declared twice; rename one", ModelError)
     t = ca.SX.sym("t")
     x, u = symbols(states), symbols(inputs)
     p = {n: ca.SX.sym(n) for n in parameters}
@@ -381,12 +374,6 @@ def describe(system: System | DiscreteSystem) -> str:
     return "\n".join([*lines, "  parameters:", *("    " + line for line in repr(system.parameters).splitlines())])
 
 
-def _check_unique_names(kind: str, quantities: Sequence[Quantity]) -> None:
-    listed = names(quantities)
-    twice = {n for n in listed if listed.count(n) > 1}
-    require(not twice, f"{kind} {', '.join(map(repr, sorted(twice)))} is declared twice; rename one", ModelError)
-
-
 def _stack_in_order(kind: str, values: Symbols, quantities: Sequence[Quantity]) -> ca.SX:
     check_names(kind, values, names(quantities))
     for q in quantities:
@@ -422,11 +409,6 @@ def add_slopes(discrete: DiscreteSystem, linear: Mask) -> DiscreteSystem:
 
     Its inputs are those of `discrete`, then a slope for each linear one, then the instant of the sample [s], as
     `append_slopes` gives them. It takes every slope, zero too, so one system serves logs that differ in what they hold.
-
-    Raises
-    ------
-    ModelError
-        If the system has no right-hand side, only a step.
     """
     if not linear.any():
         return discrete
@@ -451,16 +433,5 @@ def add_slopes(discrete: DiscreteSystem, linear: Mask) -> DiscreteSystem:
 
 
 def append_slopes(t: Array, u: Array, linear: Mask, rising: Mask) -> Array:
-    """The inputs of `add_slopes` along a log, of which only some are `rising`.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-    u : ndarray, shape (n, n_inputs)
-    linear, rising : ndarray of bool, shape (n_inputs,)
-
-    Returns
-    -------
-    ndarray, shape (n, n_inputs + linear.sum() + 1)
-    """
+    """The inputs of `add_slopes` along a log, (n, n_inputs + linear.sum() + 1), of which only some are `rising`."""
     return np.column_stack([u, slopes(t, u, rising)[:, linear], t]) if linear.any() else u

@@ -16,20 +16,16 @@ NOTICE_TIME = 24 * 3600.0
 
 # Compiled/rollout
 
+# steps of a lane that run to their end in the main thread [1]: more delay Ctrl-C (at 10 us a step by .2 s), fewer make
+# short runs wait for a thread (30 us)
 BRIEF_STEPS = 20_000
-"""Steps of a lane that run to their end in the main thread [1]: more delay Ctrl-C (at 10 us a step by .2 s); fewer make
-short runs wait for a thread (30 us)."""
 # integration steps of all segments [1] up to which a run is not shared out to threads: lower waits for threads (.3 ms)
 # that save less, higher leaves cores idle
 UNSHARED_STEPS = 1000
-MAX_SUBSTEPS = 2**31 - 1  # integration steps a sample [1]: more do not fit the C int that counts them
-VM_BATCH = 1000  # segments of a batch in the CasADi VM; more take memory for their derivatives, fewer time
 CHECK_SECONDS = 0.1  # between two checks of a long run [s]: longer overruns a CPU budget, shorter takes time itself
 
 # Compiled/self check
 
-SEGMENTS, SAMPLES, SUBSTEPS = 40, 25, 10
-DIFFERENCE = 1e-6  # step of a central difference, relative; more bends with friction, less is lost to roundings
 # Largest relative distance of machine code from the VM, and of derivatives from differences. Below, roundings count as
 # errors (1e-13, and 1e-8 of differences); above, a wrong term of a model may hide.
 LARGEST_DISTANCE, LARGEST_DERIVATIVE_ERROR = 1e-9, 1e-5
@@ -44,10 +40,8 @@ OPERATIONS_A_THREAD = 100_000
 ARRAY_SEGMENTS = 120
 # Steps of a sample that are written as one Function. More take longer to write; a call of each takes 4 us.
 FOLDED_STEPS = 100
-# Segments of a block of arrays. Fewer waste time in NumPy's calls; more do not fit the processor's cache.
+# Segments that run at once without machine code. Fewer waste time in calls; more do not fit the processor's cache.
 BLOCK_SEGMENTS = 1000
-LATER_STAGES = ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0))
-"""Where a step's later stages stand, a fraction of it, and their weights."""
 
 # Integrators
 

@@ -24,30 +24,21 @@ class GaussNewtonStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ReducedEquations:
-    """The normal equations with the nodes eliminated.
+    """The normal equations with the nodes eliminated."""
 
-    Attributes
-    ----------
-    nodes : ndarray, shape (m, n)
-        The nodes' step with the parameters fixed: - D^-1 g_s.
-    node_sensitivity : ndarray, shape (m, n, k)
-        D^-1 B: the negative derivative of the nodes' step by the parameters' step.
-    schur : ndarray, shape (k, k)
-    gradient : ndarray, shape (k,)
-        The gradient by the parameters, with the nodes following them.
-    """
-
-    nodes: Array
-    node_sensitivity: Array
-    schur: Array
-    gradient: Array
+    nodes: Array  # (m, n): the nodes' step with the parameters fixed, - D^-1 g_s
+    node_sensitivity: Array  # (m, n, k): D^-1 B, the negative derivative of the nodes' step by the parameters' step
+    schur: Array  # (k, k)
+    gradient: Array  # (k,): the gradient by the parameters, with the nodes following them
 
     def step(self, keep: Mask) -> GaussNewtonStep | None:
         """Gauss-Newton step with the parameters of mask `keep` free, shape (k,); None if not positive definite."""
         moved = np.zeros(len(keep))
         try:
             if keep.any():
-                moved[keep] = _solve_positive_definite(self.schur[np.ix_(keep, keep)], -self.gradient[keep])
+                scaled, scale = _unit_diagonal(self.schur[np.ix_(keep, keep)])
+                factor = cho_factor(scaled, check_finite=False)
+                moved[keep] = scale * cho_solve(factor, scale * -self.gradient[keep], check_finite=False)
         except LinAlgError:
             return None
         return GaussNewtonStep(self.back_substitute(moved), moved)
@@ -60,39 +51,19 @@ class ReducedEquations:
 
 @dataclass(frozen=True, eq=False)
 class ArrowEquations:
-    """Normal equations of m nodes with n states each, and k parameters.
+    """Normal equations of m nodes with n states each, and k parameters."""
 
-    Attributes
-    ----------
-    diagonal : ndarray, shape (m, n, n)
-    coupling : ndarray, shape (m, n, n)
-        Block between a node (rows) and the next (columns); the last is zero.
-    border : ndarray, shape (m, n, k)
-    corner : ndarray, shape (k, k)
-    node_gradient : ndarray, shape (m, n)
-    gradient : ndarray, shape (k,)
-    """
-
-    diagonal: Array
-    coupling: Array
-    border: Array
-    corner: Array
-    node_gradient: Array
-    gradient: Array
+    diagonal: Array  # (m, n, n)
+    coupling: Array  # (m, n, n): block between a node (rows) and the next (columns); the last is zero
+    border: Array  # (m, n, k)
+    corner: Array  # (k, k)
+    node_gradient: Array  # (m, n)
+    gradient: Array  # (k,)
 
     def eliminate(self, damping: float, node_damping: Array | float = 0.0) -> ReducedEquations | None:
-        """Eliminate the nodes, with Marquardt's multiplicative damping of the diagonal.
+        """Eliminate the nodes, the diagonal damped as Marquardt does; None where it is not positive definite.
 
-        Parameters
-        ----------
-        damping : float
-        node_damping : float or ndarray, shape (m,)
-            Damping of each node, on top.
-
-        Returns
-        -------
-        ReducedEquations or None
-            None where the nodes' matrix is not positive definite.
+        `node_damping` (m,) adds to the damping at each node.
         """
         if damping == 0 and not np.any(node_damping):
             return self._undamped_elimination
@@ -122,13 +93,7 @@ class ArrowEquations:
             )
 
     def node_step(self, damping: Array) -> Array | None:
-        """The Gauss-Newton step of the nodes alone, shape (m, n); None where their matrix is not positive definite.
-
-        Parameters
-        ----------
-        damping : ndarray, shape (m,)
-            Of each node's diagonal.
-        """
+        """The Gauss-Newton step of the nodes alone (m, n), damped by node; None where D is not positive definite."""
         with np.errstate(all="ignore"):  # as in an elimination
             try:
                 return -self.solve_nodes(self.node_gradient.reshape(-1, 1), damping).reshape(self.node_gradient.shape)
@@ -162,12 +127,6 @@ class ArrowEquations:
         return banded
 
 
-def _solve_positive_definite(matrix: Array, right: Array) -> Array:
-    scaled, scale = _unit_diagonal(matrix)
-    factor = cho_factor(scaled, check_finite=False)
-    return np.asarray(scale * cho_solve(factor, scale * right, check_finite=False))
-
-
 def positive_definite_inverse(matrix: Array) -> Array:
     """Inverse of a positive definite matrix, whatever the units of its rows."""
     scaled, scale = _unit_diagonal(matrix)
@@ -175,17 +134,9 @@ def positive_definite_inverse(matrix: Array) -> Array:
 
 
 def indistinguishable_parameters(schur: Array, corner: Array) -> Indices:
-    """Positions of parameters that act only together: the weakest direction, if it is no more than rounding.
+    """Positions of parameters that act only together, the worst last: the weakest direction, if only rounding.
 
-    Parameters
-    ----------
-    schur, corner : ndarray, shape (k, k)
-        The diagonal of the Schur complement over the corner's gives the number of digits that elimination left.
-
-    Returns
-    -------
-    ndarray of int
-        Empty if all are separable; the one with the largest part, or with the most digits lost, comes last.
+    The diagonal of the Schur complement (k, k) over the corner's (k, k) gives the digits that elimination left.
     """
     if not schur.size:
         return np.arange(0)

@@ -1,4 +1,8 @@
-"""The lifted least squares at one iterate: data and gap residuals of all segments as normal equations."""
+"""The lifted least squares at one iterate: data and gap residuals of all segments as normal equations.
+
+`normal_equations` runs the segments; `weigh_gaps` and `correct_residuals` change the equations without a run.
+`ParameterScaling` holds the free parameters as they are searched, with their bounds and priors.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,63 +28,40 @@ from pneuopt.shooting.tolerances import (
     MIN_OVERSHOOTING_NODES,
     SCHUR_ROUNDING,
     START_PRIOR_DEVIATION,
+    WEAK_PRIOR_DEVIATION,
 )
 from pneuopt.shooting.transcription import Transcription
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentLinearisation:
-    """Data and gaps at an iterate with their derivatives, before the gaps are weighed.
+    """Data and gaps at an iterate with their derivatives, before the gaps are weighed."""
 
-    Attributes
-    ----------
-    grams : ndarray, shape (m, n + c + 1, n + c + 1)
-        Gram matrix of each segment's data residuals: by its states (in nominal sizes), its sensitivity columns, and
-        last the residuals themselves.
-    squares : ndarray, shape (m, n_outputs)
-        Squared data residuals.
-    sums : ndarray, shape (m, n_outputs, n + c)
-        Derivatives of each segment's summed data residuals, by its states (in nominal sizes) and sensitivity columns.
-    end_sensitivities : ndarray, shape (m, n, n + c)
-        Sensitivity of each segment's end, in nominal sizes.
-    y : ndarray, shape (m, n_samples, n_outputs)
-        The outputs, without the correction.
-    x_end : ndarray, shape (m, n)
-        Where each segment ends, likewise.
-    gaps, start_errors : ndarray, shape (m, n)
-        Gap behind each segment, zero where nothing follows; distance from a known start; in nominal sizes.
-    chain : ndarray, shape (k,)
-        d(parameter)/d(searched parameter).
-    """
-
+    # (m, n + c + 1, n + c + 1): Gram matrix of each segment's data residuals by its states (in nominal sizes), its
+    # sensitivity columns, and last the residuals themselves
     grams: Array
-    squares: Array
+    squares: Array  # (m, n_outputs): squared data residuals
+    # (m, n_outputs, n + c): derivatives of each segment's summed data residuals, by its states (in nominal sizes) and
+    # sensitivity columns
     sums: Array
-    end_sensitivities: Array
-    y: Array
-    x_end: Array
+    end_sensitivities: Array  # (m, n, n + c): sensitivity of each segment's end, in nominal sizes
+    y: Array  # (m, n_samples, n_outputs): the outputs, without the correction
+    x_end: Array  # (m, n): where each segment ends, likewise
+    # gaps, start_errors (m, n): gap behind each segment, zero where nothing follows; distance from a known start; in
+    # nominal sizes
     gaps: Array
     start_errors: Array
-    chain: Array
+    chain: Array  # (k,): d(parameter)/d(searched parameter)
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """The problem linearised at an iterate.
-
-    Attributes
-    ----------
-    segments : Segments
-    linearisation : SegmentLinearisation
-    arrow : ArrowEquations
-        The equations of data and gaps together.
-    chi_square, cost : float
-        Squared data residuals; half the sum of all squares.
-    """
+    """The problem linearised at an iterate."""
 
     segments: Segments
     linearisation: SegmentLinearisation
-    arrow: ArrowEquations
+    arrow: ArrowEquations  # the equations of data and gaps together
+    # chi_square, cost: squared data residuals; half the sum of all squares
     chi_square: float
     cost: float
 
@@ -141,18 +122,9 @@ class NormalEquations:
         return np.asarray(out * np.outer(self.linearisation.chain, self.linearisation.chain))
 
     def prior_covariance(self, keep: Mask, fixed: Mask, prior: Array) -> Array | None:
-        """Covariance (own units) that the kept parameters take over from a prior of the fixed ones.
+        """Covariance (k, k), own units, that the kept parameters take over from a prior of the fixed ones; or None.
 
-        Parameters
-        ----------
-        keep, fixed : ndarray of bool, shape (k,)
-        prior : ndarray, shape (k,)
-            Standard deviation, as searched; an infinite one counts as `FLAT_PRIOR_WIDTH`.
-
-        Returns
-        -------
-        ndarray, shape (k, k), or None
-            None where the data do not determine the kept ones.
+        `prior` (k,) are standard deviations as searched; an infinite one counts as `FLAT_PRIOR_WIDTH`.
         """
         reduced = self.arrow.eliminate(0.0)
         if reduced is None or self.unidentifiable_parameters(reduced, keep).size:
@@ -186,21 +158,10 @@ def normal_equations(
     substeps: int,
     correction: IntegrationCorrection | None = None,
 ) -> NormalEquations:
-    """Run all segments with sensitivities and assemble data and gap residuals.
+    """Run all segments with sensitivities from their nodes (m, n), and assemble data and gap residuals.
 
-    Parameters
-    ----------
-    segments : Segments
-    nodes : ndarray, shape (m, n)
-    q : ndarray
-        All the problem's parameter values.
-    chain : ndarray, shape (k,)
-        d(parameter)/d(searched parameter) of the free ones.
-    sigma : ndarray, shape (n,)
-        Standard deviation of a gap, in nominal sizes.
-    substeps : int
-    correction : IntegrationCorrection, optional
-        The change of outputs and ends by finer steps.
+    `q` holds all parameters, `chain` (k,) the slopes of the free ones over those searched, `sigma` (n,) the gaps'
+    deviations in nominal sizes.
     """
     run = segments.gram(nodes, q, substeps, correction)
     scale = np.concatenate([segments.nominal, np.ones(run.grams.shape[1] - nodes.shape[1])])
@@ -231,6 +192,31 @@ def weigh_gaps(segments: Segments, slopes: SegmentLinearisation, sigma: Array) -
     return NormalEquations(segments, slopes, arrow, chi_square, 0.5 * squares if finite else math.inf)
 
 
+def _assemble(segments: Segments, slopes: SegmentLinearisation, weight: Array) -> ArrowEquations:
+    """Data, the gaps between linked segments, and the distances from known starts, as one arrow."""
+    (m, n), k = slopes.gaps.shape, len(slopes.chain)
+    W = np.concatenate([slopes.end_sensitivities, slopes.gaps[..., None]], axis=2)
+    W *= np.tile(weight[:, None], W.shape[2])
+    W[~segments.linked] = 0.0
+    G = slopes.grams + np.swapaxes(W, 1, 2) @ W
+    diagonal, node_gradient = G[:, :n, :n].copy(), G[:, :n, -1].copy()
+    coupling = -np.swapaxes(W[:, :, :n], 1, 2) * weight
+    is_next = np.append(False, segments.linked[:-1])[:, None]
+    diagonal[:, range(n), range(n)] += (is_next + 1.0 * np.isfinite(segments.fixed_start)) * weight**2
+    node_gradient[1:] -= weight * W[:-1, :, -1]
+    node_gradient += slopes.start_errors * weight**2
+    between = G[:, :n, n:-1]
+    between[1:] -= weight[:, None] * W[:-1, :, n:-1]
+    border, corner, gradient = np.zeros((m, n, k)), np.zeros((k, k)), np.zeros(k)
+    for rows, columns, unknowns in segments.blocks:
+        chain, own = slopes.chain[unknowns], n + columns
+        border[rows, :, unknowns] = between[rows][:, :, columns] * chain
+        total = G[rows].sum(axis=0)
+        corner[np.ix_(unknowns, unknowns)] += total[np.ix_(own, own)] * np.outer(chain, chain)
+        gradient[unknowns] += total[own, -1] * chain
+    return ArrowEquations(diagonal, coupling, border, corner, node_gradient, gradient)
+
+
 def correct_residuals(
     equations: NormalEquations, nodes: Array, correction: IntegrationCorrection, sigma: Array
 ) -> NormalEquations:
@@ -238,16 +224,6 @@ def correct_residuals(
 
     The gradient by the data stays that of the old residuals, which moves no parameter by more standard deviations than
     the root of the sum of squares by which they have changed.
-
-    Parameters
-    ----------
-    equations : NormalEquations
-    nodes : ndarray, shape (m, n)
-        Where they are linearised.
-    correction : IntegrationCorrection
-        Of the run without any correction.
-    sigma : ndarray, shape (n,)
-        Standard deviation of a gap, in nominal sizes.
     """
     segments, slopes = equations.segments, equations.linearisation
     squares = np.nansum(((slopes.y + correction.y - segments.measured) * segments.weights) ** 2, axis=1)
@@ -264,33 +240,36 @@ def segment_gaps(segments: Segments, nodes: Array, x_end: Array) -> Array:
     return gaps
 
 
+def propagate_shifts(own: Array, excess: Array) -> Array:
+    """Shifts s of the nodes with s[0] = 0 and s[i + 1] = own[i] s[i] + excess[i], as one banded triangle."""
+    m, n, _ = own.shape
+    band = np.zeros((2 * n, m * n))
+    for a in range(n):
+        for b in range(n):
+            band[n + a - b, b::n] = -own[:, a, b]
+    right = np.concatenate([np.zeros(n), excess[:-1].ravel()])
+    return np.asarray(dtbtrs(band, right[:, None], uplo="L", diag="U")[0]).reshape(m, n)
+
+
 def missed_curvature(
     equations: NormalEquations, step: Array, moved: Array, trial: NormalEquations, sigma: Array
 ) -> Array:
-    """The curvature that Gauss-Newton's model has missed along a step, by node, where a few nodes missed nearly all.
+    """The curvature that Gauss-Newton's model has missed along a step, by node (m,), where a few missed nearly all.
 
     A segment's residuals are nonlinear in its own node. What its cost exceeds the model's by is put down to a term
-    ``damping * diagonal`` of that node, which added to the model would have promised the cost that came.
-
-    Parameters
-    ----------
-    equations : NormalEquations
-        Where the step (nodes `step`, shape (m, n) in nominal sizes; parameters `moved`, shape (k,)) was computed.
-    step, moved : ndarray
-    trial : NormalEquations
-        After the step.
-    sigma : ndarray, shape (n,)
-        Standard deviation of a gap, in nominal sizes.
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        The damping; 0 at all nodes where many have missed some, for then the step was too long as a whole.
+    ``damping * diagonal`` of that node, which added to the model would have promised the cost that came. Where many
+    nodes have missed some, the step was too long as a whole, and no node is damped.
     """
-    change = _unknown_changes(equations, step, moved)
+    linear, linked, n = equations.linearisation, equations.segments.linked, step.shape[1]
+    change = np.zeros(linear.end_sensitivities.shape[::2])  # of each segment's start state, and of its columns
+    change[:, :n] = step
+    for rows, columns, unknowns in equations.segments.blocks:
+        change[rows, n + columns] = (linear.chain * moved)[unknowns]
+    gaps = linear.gaps + (linear.end_sensitivities @ change[..., None])[..., 0]
+    gaps[:-1] -= change[1:, :n]
     own = np.concatenate([change, np.ones((len(change), 1))], axis=1)
-    squares = np.einsum("mi,mi->m", own, (equations.linearisation.grams @ own[..., None])[..., 0])
-    promised = squares + np.sum((_promised_gaps(equations, change) / sigma) ** 2, axis=1)
+    squares = np.einsum("mi,mi->m", own, (linear.grams @ own[..., None])[..., 0])
+    promised = squares + np.sum((np.where(linked[:, None], gaps, 0.0) / sigma) ** 2, axis=1)
     found = trial.linearisation.squares.sum(axis=1) + np.sum((trial.gaps / sigma) ** 2, axis=1)
     diagonal = np.einsum("mii,mi->m", equations.arrow.diagonal, step**2)
     excess = np.where(found - promised > CURVATURE_RESOLUTION * np.sum(diagonal), found - promised, 0.0)
@@ -321,77 +300,8 @@ def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: boo
     return f"{lead}residuals are {misfit[worst]:.2g} times the noise of {output}", tail
 
 
-def _unknown_changes(equations: NormalEquations, step: Array, moved: Array) -> Array:
-    """The change of each segment's own unknowns by a step: its start state, then its sensitivity columns."""
-    slopes, n = equations.linearisation, step.shape[1]
-    change = np.zeros(slopes.end_sensitivities.shape[::2])
-    change[:, :n] = step
-    for rows, columns, unknowns in equations.segments.blocks:
-        change[rows, n + columns] = (slopes.chain * moved)[unknowns]
-    return change
-
-
-def _promised_gaps(equations: NormalEquations, change: Array) -> Array:
-    """The gaps that the linear model promises after a step; zero where nothing follows."""
-    segments, slopes, n = equations.segments, equations.linearisation, equations.gaps.shape[1]
-    promised = slopes.gaps + (slopes.end_sensitivities @ change[..., None])[..., 0]
-    promised[:-1] -= change[1:, :n]
-    return np.where(segments.linked[:, None], promised, 0.0)
-
-
-def propagate_shifts(own: Array, excess: Array) -> Array:
-    """Shifts s of the nodes with s[0] = 0 and s[i + 1] = own[i] s[i] + excess[i], as one banded triangle."""
-    m, n, _ = own.shape
-    band = np.zeros((2 * n, m * n))
-    for a in range(n):
-        for b in range(n):
-            band[n + a - b, b::n] = -own[:, a, b]
-    right = np.concatenate([np.zeros(n), excess[:-1].ravel()])
-    return np.asarray(dtbtrs(band, right[:, None], uplo="L", diag="U")[0]).reshape(m, n)
-
-
-def _assemble(segments: Segments, slopes: SegmentLinearisation, weight: Array) -> ArrowEquations:
-    """Data, the gaps between linked segments, and the distances from known starts, as one arrow."""
-    (m, n), k = slopes.gaps.shape, len(slopes.chain)
-    W = np.concatenate([slopes.end_sensitivities, slopes.gaps[..., None]], axis=2)
-    W *= np.tile(weight[:, None], W.shape[2])
-    W[~segments.linked] = 0.0
-    G = slopes.grams + np.swapaxes(W, 1, 2) @ W
-    diagonal, node_gradient = G[:, :n, :n].copy(), G[:, :n, -1].copy()
-    coupling = -np.swapaxes(W[:, :, :n], 1, 2) * weight
-    is_next = np.append(False, segments.linked[:-1])[:, None]
-    diagonal[:, range(n), range(n)] += (is_next + 1.0 * np.isfinite(segments.fixed_start)) * weight**2
-    node_gradient[1:] -= weight * W[:-1, :, -1]
-    node_gradient += slopes.start_errors * weight**2
-    between = G[:, :n, n:-1]
-    between[1:] -= weight[:, None] * W[:-1, :, n:-1]
-    border, corner, gradient = np.zeros((m, n, k)), np.zeros((k, k)), np.zeros(k)
-    for rows, columns, unknowns in segments.blocks:
-        chain, own = slopes.chain[unknowns], n + columns
-        border[rows, :, unknowns] = between[rows][:, :, columns] * chain
-        total = G[rows].sum(axis=0)
-        corner[np.ix_(unknowns, unknowns)] += total[np.ix_(own, own)] * np.outer(chain, chain)
-        gradient[unknowns] += total[own, -1] * chain
-    return ArrowEquations(diagonal, coupling, border, corner, node_gradient, gradient)
-
-
-# What the data of a search do not determine; each threshold is in the units in which the search moves.
-WEAK_PRIOR_DEVIATION = math.log(10)  # standard deviation of a weak prior, in e-folds: a factor of ten either way
-
-
 class ParameterScaling:
-    """Free parameters as searched (z, shape (k,)), and all the problem's values at them.
-
-    Attributes
-    ----------
-    log : ndarray of bool, shape (k,)
-    lower, upper : ndarray, shape (k,)
-        As searched.
-    fixed : ndarray of bool, shape (k,)
-        Which parameters have equal bounds.
-    start : ndarray, shape (k,)
-        The given values, within the bounds.
-    """
+    """Free parameters as searched (z, shape (k,)), and all the problem's values at them."""
 
     def __init__(self, transcription: Transcription) -> None:
         self._free = [p for p in transcription.parameters.values() if p.free]
@@ -401,7 +311,7 @@ class ParameterScaling:
         self.lower, self.upper = (
             self._to_search_units(np.array([getattr(p, b) for p in self._free])) for b in ("lower", "upper")
         )
-        self.fixed = np.array([p.lower == p.upper for p in self._free], dtype=bool)
+        self.fixed = np.array([p.lower == p.upper for p in self._free], dtype=bool)  # (k,), as all of these
         self.start = self.project_to_bounds(self._to_search_units(self._given[self._positions]))
 
     def project_to_bounds(self, z: Array) -> Array:

@@ -36,7 +36,6 @@ from pneuopt.shooting.tolerances import (
     LEAD_SEGMENTS,
     LEAST_DAMPING,
     MAX_BATCH_NUMBERS,
-    MAX_STEP,
     PIECE_SEGMENTS,
     ROBUST_SQUARES,
     SETTLED_DECREASE,
@@ -48,22 +47,10 @@ from pneuopt.shooting.tolerances import (
 
 
 def filter_nodes(segments: Segments, nodes: Array, q: Array, gathered: float = GATHERED_DEVIATION) -> Array:
-    """Filter the states at the nodes.
+    """Filter the states at the nodes (m, n_states): estimates from the measurements up to each segment's end.
 
-    Parameters
-    ----------
-    segments : Segments
-    nodes : ndarray, shape (m, n_states)
-        Rough states, from which the pieces start.
-    q : ndarray, shape (k,)
-        Values of all parameters of the problem.
-    gathered : float
-        Deviation that a state gathers from one node to the next, in nominal sizes.
-
-    Returns
-    -------
-    ndarray, shape (m, n_states)
-        Estimates from the measurements up to each segment's end.
+    The pieces start from rough `nodes`; `q` (k,) holds all parameters, and `gathered` is the deviation that a state
+    gathers from node to node, in nominal sizes.
     """
     first = np.arange(0, segments.count, PIECE_SEGMENTS)
     segments, substeps = choose_integration(segments, nodes, q)
@@ -84,27 +71,17 @@ def filter_nodes(segments: Segments, nodes: Array, q: Array, gathered: float = G
 
 
 class StateUpdate(NamedTuple):
-    """The states of g segments by what was known of them before and by their data; n of them, of nominal size 1.
+    """The states of g segments by what was known of them before and by their data; n of them, of nominal size 1."""
 
-    Attributes
-    ----------
-    state, end : ndarray, shape (g, n)
-        At the node, and at the segment's end; NaN there where the model is not finite.
-    squares : ndarray, shape (g,)
-        Those of the residuals, and of the state's change over what was known of it.
-    gram : ndarray, shape (g, n + n_columns + 1, n + n_columns + 1)
-        Of the slopes of what is predicted, in the states and the parameters, and of its errors, in noise deviations.
-    moved : ndarray, shape (g, n, n + n_columns)
-        Slopes of the end.
-    prior, information : ndarray, shape (g, n, n)
-        The inverse covariance of the states, without these data and with them.
-    """
-
+    # state, end (g, n): at the node, and at the segment's end; NaN there where the model is not finite
     state: Array
     end: Array
-    squares: Array
+    squares: Array  # (g,): those of the residuals, and of the state's change over what was known of it
+    # (g, n + n_columns + 1, n + n_columns + 1): of the slopes of what is predicted, in the states and the parameters,
+    # and of its errors, in noise deviations
     gram: Array
-    moved: Array
+    moved: Array  # (g, n, n + n_columns): slopes of the end
+    # prior, information (g, n, n): the inverse covariance of the states, without these data and with them
     prior: Array
     information: Array
 
@@ -123,21 +100,7 @@ def update_states(
 ) -> StateUpdate:
     """Update the states of some segments by their data: Gauss-Newton, whose steps are cut where they do not help.
 
-    Parameters
-    ----------
-    segments : Segments
-    at : ndarray of int, shape (g,)
-        Positions of the segments, one of which may be there several times.
-    before, P : ndarray, shape (g, n) and (g, n, n)
-        The states and their covariance without these data, of nominal size 1.
-    values : ndarray, shape (g, n_system_parameters)
-        The parameters of each.
-    substeps : int
-        Integration steps a sample.
-
-    Returns
-    -------
-    StateUpdate
+    Segment `at` (g,) has states `before` (g, n) of covariance `P` (g, n, n) in nominal sizes, and parameters (g, k).
     """
     n, nominal = before.shape[1], segments.nominal
     prior = solve_each(P, np.tile(np.eye(n), (len(at), 1, 1)))
@@ -192,16 +155,9 @@ class Errors(NamedTuple):
 
 
 class PredictionErrors:
-    """The prediction errors of an extended Kalman filter, for several sets of parameters side by side.
+    """The prediction errors of an extended Kalman filter over part of a log, for sets of parameters side by side.
 
-    Parameters
-    ----------
-    segments : Segments
-    nodes : ndarray, shape (m, n_states)
-        Rough states, from which the filter begins where a segment does not continue the one before it.
-    scaling : ParameterScaling
-    part : ndarray of int
-        Positions of the segments, rising.
+    It begins at the rough `nodes` (m, n_states) where a segment of `part`, in order, does not continue the one before.
     """
 
     def __init__(self, segments: Segments, nodes: Array, scaling: ParameterScaling, part: Indices) -> None:
@@ -223,20 +179,7 @@ class PredictionErrors:
 
     @np.errstate(all="ignore")  # what overflows is lost, and its cost infinite
     def evaluate(self, z: Array, gathered: float) -> Errors:
-        """The errors of sets of searched parameters.
-
-        The gain of the filter counts as constant in the derivatives.
-
-        Parameters
-        ----------
-        z : ndarray, shape (s, k)
-        gathered : float
-            Deviation that each state gathers along a segment, over its nominal size.
-
-        Returns
-        -------
-        Errors
-        """
+        """The errors of sets of searched parameters (s, k); the filter's gain counts as constant in the derivatives."""
         (count, k), n = z.shape, self._rough.shape[1]
         q = np.array([self.scaling.values(each) for each in z])
         chain = np.array([self.scaling.chain(each) for each in z])[:, None]
@@ -264,7 +207,10 @@ class PredictionErrors:
         """Add a segment's errors; return the states, their slopes and covariance at its end from those before it."""
         (x, X), n, prior = before, before[0].shape[1], found.prior
         gram, errors = found.gram[:, :-1, :-1], found.gram[:, :-1, -1:]
-        direct = self._parameter_moves(at, chain)
+        unknowns = self.segments.unknowns[at]
+        own = np.flatnonzero(unknowns >= 0)  # the segment's own parameters, which move with those searched
+        direct = np.zeros((len(chain), len(unknowns), chain.shape[2]))
+        direct[:, own, unknowns[own]] = chain[:, 0, unknowns[own]]
         moved = solve_each(found.information, prior @ X - gram[:, :n, n:] @ direct)
         moves, away = np.concatenate([moved, direct], axis=1), moved - X
         turned, pull = moves.transpose(0, 2, 1), prior @ away
@@ -277,31 +223,8 @@ class PredictionErrors:
         sums.curvatures[:] += weights[:, None, None] * squares
         return found.end, found.moved @ moves, found.spread(gathered)
 
-    def _parameter_moves(self, at: int, chain: Array) -> Array:
-        """How a segment's own parameters move with those searched, of sets with these chains. Shape (s, n_own, k)."""
-        unknowns = self.segments.unknowns[at]
-        own = np.flatnonzero(unknowns >= 0)
-        moves = np.zeros((len(chain), len(unknowns), chain.shape[2]))
-        moves[:, own, unknowns[own]] = chain[:, 0, unknowns[own]]
-        return moves
-
     def descend(self, z: Array, gathered: float, steps: int) -> tuple[Array, Array]:
-        """Levenberg-Marquardt steps from several sets of searched parameters, side by side.
-
-        Parameters
-        ----------
-        z : ndarray, shape (s, k)
-        gathered : float
-            As of `evaluate`.
-        steps : int
-            At most.
-
-        Returns
-        -------
-        z : ndarray, shape (s, k)
-            Where they end.
-        costs : ndarray, shape (s,)
-        """
+        """Levenberg-Marquardt from sets of searched parameters (s, k) side by side: their ends, and costs (s,)."""
         self.adapt_steps(z)
         z, damping = z.copy(), np.full(len(z), FIRST_DAMPING)
         costs, gradients, curvatures = (a.copy() for a in self.evaluate(z, gathered))
@@ -329,22 +252,17 @@ class PredictionErrors:
         own = curvature[np.ix_(free, free)]
         step = np.zeros(len(z))
         step[free] = -np.linalg.lstsq(own + damping * np.diag(np.diag(own)), gradient[free], rcond=None)[0]
-        longest = MAX_STEP * np.where(self.scaling.log, 1.0, np.maximum(np.abs(z), 1.0))
+        longest = np.where(self.scaling.log, 1.0, np.maximum(np.abs(z), 1.0))  # a longer step leaves the model's range
         return self.scaling.project_to_bounds(z + np.clip(step, -longest, longest))
 
 
 @dataclass(frozen=True, eq=False)
 class FitScores:
-    """The scores and the information of m segments about the k parameters that a fit has kept free, in their own units.
-
-    Attributes
-    ----------
-    optimum : Optimum
-    directions : ndarray, shape (m, n_columns, k)
-        How a segment's start state (in nominal sizes) and sensitivity columns move with the parameters.
-    """
+    """The scores and the information of m segments about the k parameters that a fit has kept free, in own units."""
 
     optimum: Optimum
+    # (m, n_columns, k): how a segment's start state (in nominal sizes) and sensitivity columns move with the
+    # parameters
     directions: Array
 
     @cached_property
@@ -426,17 +344,7 @@ class FitScores:
 
 
 def fit_scores(optimum: Optimum) -> FitScores | None:
-    """The scores of a fit's segments.
-
-    Parameters
-    ----------
-    optimum : Optimum
-
-    Returns
-    -------
-    FitScores or None
-        None where the nodes' equations cannot be eliminated.
-    """
+    """The scores of a fit's segments; None where the nodes' equations cannot be eliminated."""
     equations, keep = optimum.equations, np.flatnonzero(optimum.keep)
     reduced, linear = equations.arrow.eliminate(0.0), equations.linearisation
     if reduced is None or not len(keep):

@@ -2,7 +2,8 @@
 
 The unknowns are the free parameters, in units of their range or as logarithms, and the states at the nodes, in units
 of their nominal size; a transcription becomes one MX graph of unknowns, objective and constraints. `prepare_full_space`
-makes the graph and its derivatives once; `solve_from` solves it from any start, `follow_path` along a path.
+makes the graph and its derivatives once; `solve_from` solves it from any start, `follow_path` along a path. Below these
+stand the graph (`flatten`), the unknowns with their bounds and guesses, and what a solver's outcome says.
 """
 
 import itertools
@@ -28,33 +29,57 @@ from pneuopt.shooting.tolerances import (
     MAX_EXTRAPOLATION,
     WARM_START_BARRIER,
 )
-from pneuopt.shooting.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, phases_of
+from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, phases_of
 
-ArrayOrMX = TypeVar("ArrayOrMX", NDArray[np.float64], ca.MX)
+
+@dataclass(frozen=True)
+class FullSpace:
+    """Full-space multiple shooting with IPOPT and exact second derivatives.
+
+    Parameters
+    ----------
+    max_iterations : int
+    tolerance : float
+        IPOPT's `tol`, on the scaled problem.
+    max_seconds : float
+        Wall time after which the solver gives up [s].
+    first_barrier : float
+        IPOPT's `mu_init`: how far from the limits the first iterates keep.
+    verbose : bool
+        Print IPOPT's own table.
+    """
+
+    max_iterations: int = 500
+    tolerance: float = 1e-8
+    max_seconds: float = 3600.0
+    first_barrier: float = 0.1
+    verbose: bool = False
+
+    def __post_init__(self) -> None:
+        require(self.max_iterations >= 1, f"max_iterations must be at least 1, got {self.max_iterations}")
+        require(0 < self.tolerance < 1, f"tolerance must lie between 0 and 1, got {self.tolerance}")
+        require(self.first_barrier > 0, f"first_barrier must be positive, got {self.first_barrier}")
+        require(self.max_seconds > 0, f"max_seconds must be positive, got {self.max_seconds}")
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The solution of a problem with costs and limits.
+    """The solution of a problem with costs and limits."""
 
-    Attributes
-    ----------
-    trajectories : tuple of Trajectory
-        States and outputs, one a phase.
-    parameters : ParameterSet
-        The problem's parameters with the free ones solved for.
-    status : Status
-    stats : mapping of str to float
-        Iterations, seconds, final cost, largest gap, ...
-    multipliers : mapping of str to float
-        Largest absolute multiplier of each limit and of each bound that is active, by name.
-    """
-
-    trajectories: tuple[Trajectory, ...]
-    parameters: ParameterSet
+    trajectories: tuple[Trajectory, ...]  # states and outputs, one a phase
+    parameters: ParameterSet  # the problem's parameters with the free ones solved for
     status: Status
-    stats: Mapping[str, float] = field(default_factory=dict)
+    stats: Mapping[str, float] = field(default_factory=dict)  # iterations, seconds, final cost, largest gap
+    # largest absolute multiplier of each limit and of each bound that is active, by name
     multipliers: Mapping[str, float] = field(default_factory=dict)
+
+
+def solve_full_space(transcription: Transcription, method: FullSpace | None = None) -> Solution:
+    """Solve a problem with all nodes as unknowns, from each phase's guess or, where it has none, from a simulation.
+
+    The physical ranges of the states bound the nodes. The status names the limit, state or equation at fault.
+    """
+    return solve_from(prepare_full_space(transcription, method), transcription.parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,31 +96,132 @@ class ConstraintRows:
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Minimise the sum of `terms` (of w and q) subject to lower <= g(w, q) <= upper; `constraint_rows` names the rows.
-
-    Attributes
-    ----------
-    transcription : Transcription
-    w, q, terms, g : casadi.MX
-        Unknowns, given parameter values, pieces of the objective, constraints.
-    evaluate : casadi.Function
-        ``(w, q) -> (terms, g)``.
-    rollouts : tuple of casadi.Function
-        ``(w, q) -> (t, states, outputs)`` at the samples, one a phase.
-    constraint_rows : tuple of ConstraintRows
-    term_names : tuple of str
-        The name of each term.
-    """
+    """Minimise the sum of `terms` (of w and q) subject to lower <= g(w, q) <= upper, the rows of `constraint_rows`."""
 
     transcription: Transcription
+    # w, q, terms, g: unknowns, given parameter values, pieces of the objective, constraints
     w: ca.MX
     q: ca.MX
     terms: ca.MX
     g: ca.MX
-    evaluate: ca.Function
-    rollouts: tuple[ca.Function, ...]
+    evaluate: ca.Function  # ``(w, q) -> (terms, g)``
+    rollouts: tuple[ca.Function, ...]  # ``(w, q) -> (t, states, outputs)`` at the samples, one a phase
     constraint_rows: tuple[ConstraintRows, ...]
-    term_names: tuple[str, ...]
+    term_names: tuple[str, ...]  # the name of each term
+
+
+@dataclass(frozen=True, eq=False)
+class FullSpaceProblem:
+    """A graph, its solver, and on request a second solver that starts from a neighbour's solution."""
+
+    graph: Graph
+    solver: ca.Function
+    warm_solver: ca.Function | None = None
+
+
+def prepare_full_space(
+    transcription: Transcription, method: FullSpace | None = None, *, warm_start: bool = False
+) -> FullSpaceProblem:
+    """Flatten and differentiate a problem once for any number of starts; with `warm_start` for `follow_path`, too."""
+    graph, method = flatten(transcription), method or FullSpace()
+    cold = _ipopt_solver(graph, method, {"mu_init": method.first_barrier})
+    pushes = {f"warm_start_{n}": WARM_START_BARRIER for n in _PUSH_OPTIONS}
+    near = {"mu_init": WARM_START_BARRIER, "warm_start_init_point": "yes", **pushes}
+    return FullSpaceProblem(graph, cold, _ipopt_solver(graph, method, near) if warm_start else None)
+
+
+_PUSH_OPTIONS = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
+
+
+def _ipopt_solver(graph: Graph, method: FullSpace, own: Mapping[str, Any]) -> ca.Function:
+    ipopt = {
+        "print_level": 5 if method.verbose else 0,
+        "sb": "yes",
+        "max_iter": method.max_iterations,
+        "tol": method.tolerance,
+        "acceptable_iter": 0,
+        "max_wall_time": method.max_seconds,
+        **own,
+    }
+    system, samples = graph.transcription.system, sum(phase.n for phase in graph.transcription.phases)
+    operations = samples * system.substeps * system.step.n_instructions()
+    nlp: Any = {"x": graph.w, "p": graph.q, "f": ca.sum1(graph.terms), "g": graph.g}
+    options: Any = {
+        "print_time": False,
+        "show_eval_warnings": False,
+        "expand": operations <= MAX_EXPANDED_OPERATIONS,
+        "ipopt": ipopt,
+    }
+    return ca.nlpsol("full_space", "ipopt", nlp, options)
+
+
+def solve_from(problem: FullSpaceProblem, start: ParameterSet, guesses: Sequence[Array | None] = ()) -> Solution:
+    """Solve a prepared problem from these parameters, and from `guesses` (n, n_states) in place of the phases' own."""
+    transcription = problem.graph.transcription
+    require(tuple(start) == tuple(transcription.parameters), "the start's names are not the problem's", ModelError)
+    q = np.array([p.value for p in start.values()])
+    low, up = variable_bounds(transcription)
+    nodes = node_guesses(transcription, q, guesses)
+    w = np.clip(np.concatenate([to_unknowns(transcription, q), *nodes]), low, up)
+    fault = _find_nan(problem, w, q)
+    if fault:
+        return _solution(problem, w, q, Status(Code.DIVERGED, (f"at the start {fault}", "start elsewhere")), {}, {})
+    return _run_solver(problem, w, q)[0]
+
+
+def follow_path(problem: FullSpaceProblem, start: ParameterSet, path: Sequence[Mapping[str, float]]) -> list[Solution]:
+    """Solve along a path of fixed parameters' values, each problem from its neighbours' solutions, extrapolated.
+
+    The problem is prepared with `warm_start`. A step that fails starts the next one from the last that did not.
+    """
+    if problem.warm_solver is None:
+        raise ModelError("the problem has no warm-start solver: prepare_full_space(..., warm_start=True)")
+    transcription, warm = problem.graph.transcription, replace(problem, solver=problem.warm_solver)
+    (low, up), found, done = variable_bounds(transcription), list[Solution](), list[tuple[Array, dict[str, Array]]]()
+    for step in path:
+        q = np.array([p.value for p in start.with_values(step).values()])
+        if not done:
+            w = np.clip(np.concatenate([to_unknowns(transcription, q), *node_guesses(transcription, q, ())]), low, up)
+            solution, raw = _run_solver(problem, w, q)
+        else:
+            last = done[-1][1]
+            w = np.clip(_extrapolate(done[-2:], q), low, up)
+            solution, raw = _run_solver(warm, w, q, {"lam_x0": last["lam_x"], "lam_g0": last["lam_g"]})
+        done += [(q, raw)] if solution.status.converged else []
+        found.append(solution)
+    return found
+
+
+def _extrapolate(done: Sequence[tuple[Array, Mapping[str, Array]]], q: Array) -> Array:
+    """The unknowns at q, extrapolated from the last two solutions along the difference of their parameters."""
+    (before, x), (last, y) = ((known, raw["x"]) for known, raw in (done[0], done[-1]))
+    step = last - before
+    length = float(step @ step)
+    share = min(max(float(step @ (q - last)) / length, 0.0), MAX_EXTRAPOLATION) if length else 0.0
+    return np.asarray(y + share * (y - x))
+
+
+def _run_solver(
+    problem: FullSpaceProblem, w: Array, q: Array, multipliers: Mapping[str, Array] | None = None
+) -> tuple[Solution, dict[str, Array]]:
+    """Run the solver: the solution, and the solver's raw output."""
+    begun, (low, up) = time.perf_counter(), variable_bounds(problem.graph.transcription)
+    low_g, up_g = (
+        np.concatenate([np.zeros(0), *(getattr(r, s) for r in problem.graph.constraint_rows)])
+        for s in ("lower", "upper")
+    )
+    raw = problem.solver(x0=w, p=q, lbx=low, ubx=up, lbg=low_g, ubg=up_g, **(multipliers or {}))
+    found = {k: np.array(v).ravel() for k, v in raw.items()}
+    stats = problem.solver.stats()
+    figures = {
+        "iterations": float(stats.get("iter_count", 0)),
+        "seconds": time.perf_counter() - begun,
+        "cost": float(found["f"][0]),
+        "largest_gap": _largest_violation(problem, found["g"], continuity=True),
+        "largest_violation": _largest_violation(problem, found["g"], continuity=False),
+    }
+    status = _solver_status(problem, str(stats["return_status"]), found, q, figures)
+    return _solution(problem, found["x"], q, status, figures, _multipliers(problem, found, low, up)), found
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +245,11 @@ def flatten(transcription: Transcription) -> Graph:
     given = ca.MX.sym("q", len(transcription.parameters))
     theta = ca.MX.sym("theta", len(transcription.free))
     scaled = [ca.MX.sym(f"x{i}", len(system.states), len(phase.nodes)) for i, phase in enumerate(phases)]
-    q = _physical_values(transcription, given, theta)
+    entries = ca.vertsplit(given)
+    for k, i in enumerate(transcription.free):
+        parameter = list(transcription.parameters.values())[i]
+        entries[i] = ca.exp(theta[k]) if parameter.log else theta[k] * parameter_scale(parameter)
+    q = ca.vertcat(*entries)
     nominal = np.array([s.nominal for s in system.states])
     runs = [_build_phase(transcription, phase, x * nominal, q) for phase, x in zip(phases, scaled, strict=True)]
     table, rows = _constraints(transcription, runs, q)
@@ -130,87 +260,7 @@ def flatten(transcription: Transcription) -> Graph:
     return Graph(transcription, w, given, parts, g, evaluate, rollouts, table, ("nothing", *costs))
 
 
-# The unknowns: the free parameters first, then the nodes, phase by phase.
-
-
-def parameter_scale(parameter: Parameter) -> float:
-    """The unit in which the solver measures a parameter: its range, or its size."""
-    span = parameter.upper - parameter.lower
-    return span if 0 < span < math.inf else abs(parameter.value) or 1.0
-
-
-def _physical_values(transcription: Transcription, given: ca.MX, theta: ca.MX) -> ca.MX:
-    q = ca.vertsplit(given)
-    for k, i in enumerate(transcription.free):
-        parameter = list(transcription.parameters.values())[i]
-        q[i] = ca.exp(theta[k]) if parameter.log else theta[k] * parameter_scale(parameter)
-    return ca.vertcat(*q)
-
-
-def to_unknowns(transcription: Transcription, q: Array) -> Array:
-    """The free parameters in the solver's units."""
-    parameters = list(transcription.parameters.values())
-    return np.array([_to_unknown(parameters[i], q[i]) for i in transcription.free])
-
-
-def to_values(transcription: Transcription, w: Array) -> dict[str, float]:
-    """The free parameters' values, by name, inside their bounds."""
-    found = {}
-    for k, name in enumerate(transcription.parameters.free_names):
-        parameter = transcription.parameters[name]
-        value = math.exp(w[k]) if parameter.log else w[k] * parameter_scale(parameter)
-        found[name] = min(max(value, parameter.lower), parameter.upper)
-    return found
-
-
-def _to_unknown(parameter: Parameter, value: float) -> float:
-    if not parameter.log:
-        return value / parameter_scale(parameter)
-    return math.log(value) if value > 0 else -math.inf
-
-
-def variable_bounds(transcription: Transcription) -> tuple[Array, Array]:
-    """Bounds of the unknowns; a known start state is pinned."""
-    free = [list(transcription.parameters.values())[i] for i in transcription.free]
-    bounds = [np.array([[_to_unknown(p, p.lower), _to_unknown(p, p.upper)] for p in free]).reshape(-1, 2)]
-    states = transcription.system.states
-    for phase in transcription.phases:
-        nodes = np.tile([[s.lower / s.nominal, s.upper / s.nominal] for s in states], (len(phase.nodes), 1))
-        if phase.start is not None:
-            nodes[: len(states)] = np.array([[x / s.nominal] for x, s in zip(phase.start, states, strict=True)])
-        bounds.append(nodes)
-    low, up = np.concatenate(bounds).T
-    return low, up
-
-
-def node_guesses(transcription: Transcription, q: Array, guesses: Sequence[Array | None] = ()) -> list[Array]:
-    """The nodes' scaled states to start from: `guesses`, the phases' own, or a simulation."""
-    nominal = np.array([s.nominal for s in transcription.system.states])
-    x, found = np.zeros(len(nominal)), []
-    for i, phase in enumerate(transcription.phases):
-        guess = guesses[i] if i < len(guesses) else phase.guess
-        x = x if phase.follows else np.zeros(len(nominal)) if phase.start is None else phase.start
-        if guess is None:
-            guess, x = _simulate_guess(transcription, phase, q, x, 1e3 * nominal)
-        else:
-            x = guess[-1]
-        found.append((guess[phase.nodes] / nominal).ravel())
-    return found
-
-
-def _simulate_guess(transcription: Transcription, phase: Phase, q: Array, x: Array, most: Array) -> tuple[Array, Array]:
-    """States at the samples, and after the last; a state that runs away is held where it is."""
-    sample = _sample_function(transcription)
-    length = _duration(transcription, phase, q)
-    p, states = q[transcription.parameter_positions(phase)], np.empty((phase.n, len(x)))
-    for k in range(phase.n):
-        states[k] = x
-        x_next = np.array(sample(phase.t[k] * length, phase.h[k] * length, x, phase.inputs[k], p)[0]).ravel()
-        x = x_next if bool(np.all(np.abs(x_next) < most)) else x
-    return states, x
-
-
-# The graph of one phase.
+ArrayOrMX = TypeVar("ArrayOrMX", NDArray[np.float64], ca.MX)
 
 
 def _build_phase(transcription: Transcription, phase: Phase, nodes: ca.MX, q: ca.MX) -> _PhaseGraph:
@@ -286,8 +336,10 @@ def _objective(
     for residual in transcription.residuals:
         run = runs[residual.phase]
         for k, name in enumerate(residual.outputs):
-            parts[f"the residual of {name!r} in phase {run.phase.name!r}"] = _residual_cost(
-                transcription, residual, run, k
+            seen = np.flatnonzero(np.isfinite(residual.measured[:, k])).tolist()
+            y = run.outputs[names(transcription.system.outputs).index(residual.outputs[k]), seen]
+            parts[f"the residual of {name!r} in phase {run.phase.name!r}"] = 0.5 * ca.sumsqr(
+                (y - ca.DM(residual.measured[seen, k]).T) / float(residual.noise[k])
             )
     for cost in transcription.costs:
         for phase, value in _term_values(cost, transcription, runs, q):
@@ -296,221 +348,91 @@ def _objective(
     return tuple(parts), list(parts.values())
 
 
-def _residual_cost(transcription: Transcription, residual: Residuals, run: _PhaseGraph, k: int) -> ca.MX:
-    seen = np.flatnonzero(np.isfinite(residual.measured[:, k])).tolist()
-    y = run.outputs[names(transcription.system.outputs).index(residual.outputs[k]), seen]
-    return 0.5 * ca.sumsqr((y - ca.DM(residual.measured[seen, k]).T) / float(residual.noise[k]))
-
-
 def _term_values(
     term: Cost | Limit, transcription: Transcription, runs: Sequence[_PhaseGraph], q: ca.MX
 ) -> list[tuple[str, ca.MX]]:
     """The values of a term wherever it holds, with the phase's name."""
     if term.where is Where.PARAMETERS:
         return [("", term.function(q))]
-    return [(runs[i].phase.name, _phase_values(term, runs[i])) for i in phases_of(term, transcription)]
-
-
-def _phase_values(term: Cost | Limit, run: _PhaseGraph) -> ca.MX:
-    if term.where is Where.END:
-        return term.function(run.t[-1] + run.h[-1], run.ends[:, -1], run.u[:, -1], run.p)
-    nodes = run.phase.nodes.tolist() if term.where is Where.NODES else [0]
-    n = len(nodes)
-    return term.function.map(n)(run.t[nodes], run.nodes[:, :n], run.u[:, nodes], ca.repmat(run.p, 1, n))
-
-
-_PUSH_OPTIONS = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
-
-
-@dataclass(frozen=True)
-class FullSpace:
-    """Full-space multiple shooting with IPOPT and exact second derivatives.
-
-    Parameters
-    ----------
-    max_iterations : int
-    tolerance : float
-        IPOPT's `tol`, on the scaled problem.
-    max_seconds : float
-        Wall time after which the solver gives up [s].
-    first_barrier : float
-        IPOPT's `mu_init`: how far from the limits the first iterates keep.
-    verbose : bool
-        Print IPOPT's own table.
-    """
-
-    max_iterations: int = 500
-    tolerance: float = 1e-8
-    max_seconds: float = 3600.0
-    first_barrier: float = 0.1
-    verbose: bool = False
-
-    def __post_init__(self) -> None:
-        require(self.max_iterations >= 1, f"max_iterations must be at least 1, got {self.max_iterations}")
-        require(0 < self.tolerance < 1, f"tolerance must lie between 0 and 1, got {self.tolerance}")
-        require(self.first_barrier > 0, f"first_barrier must be positive, got {self.first_barrier}")
-        require(self.max_seconds > 0, f"max_seconds must be positive, got {self.max_seconds}")
-
-
-@dataclass(frozen=True, eq=False)
-class FullSpaceProblem:
-    """A graph, its solver, and on request a second solver that starts from a neighbour's solution."""
-
-    graph: Graph
-    solver: ca.Function
-    warm_solver: ca.Function | None = None
-
-
-def solve_full_space(transcription: Transcription, method: FullSpace | None = None) -> Solution:
-    """Solve a multiple-shooting problem with all nodes as unknowns.
-
-    Parameters
-    ----------
-    transcription : Transcription
-        Each phase starts from its `guess`, or from a simulation with the given parameters where it has none. The
-        physical ranges of the states (`Quantity.lower`, `upper`) bound the nodes.
-    method : FullSpace, optional
-
-    Returns
-    -------
-    Solution
-        Its status names the limit, state or equation at fault where the solver did not converge.
-    """
-    return solve_from(prepare_full_space(transcription, method), transcription.parameters)
-
-
-def prepare_full_space(
-    transcription: Transcription, method: FullSpace | None = None, *, warm_start: bool = False
-) -> FullSpaceProblem:
-    """Flatten and differentiate a problem once for any number of starts; with `warm_start` for `follow_path`, too."""
-    graph, method = flatten(transcription), method or FullSpace()
-    cold = _ipopt_solver(graph, method, {"mu_init": method.first_barrier})
-    pushes = {f"warm_start_{n}": WARM_START_BARRIER for n in _PUSH_OPTIONS}
-    near = {"mu_init": WARM_START_BARRIER, "warm_start_init_point": "yes", **pushes}
-    return FullSpaceProblem(graph, cold, _ipopt_solver(graph, method, near) if warm_start else None)
-
-
-def _ipopt_solver(graph: Graph, method: FullSpace, own: Mapping[str, Any]) -> ca.Function:
-    ipopt = {
-        "print_level": 5 if method.verbose else 0,
-        "sb": "yes",
-        "max_iter": method.max_iterations,
-        "tol": method.tolerance,
-        "acceptable_iter": 0,
-        "max_wall_time": method.max_seconds,
-        **own,
-    }
-    nlp: Any = {"x": graph.w, "p": graph.q, "f": ca.sum1(graph.terms), "g": graph.g}
-    options: Any = {
-        "print_time": False,
-        "show_eval_warnings": False,
-        "expand": _operation_count(graph.transcription) <= MAX_EXPANDED_OPERATIONS,
-        "ipopt": ipopt,
-    }
-    return ca.nlpsol("full_space", "ipopt", nlp, options)
-
-
-def solve_from(problem: FullSpaceProblem, start: ParameterSet, guesses: Sequence[Array | None] = ()) -> Solution:
-    """Solve a prepared problem from the given parameters.
-
-    Parameters
-    ----------
-    problem : FullSpaceProblem
-    start : ParameterSet
-        Names as in the problem; the values may differ, those of the fixed ones too.
-    guesses : sequence of ndarray, shape (n, n_states), optional
-        States to start from, one a phase, in place of the phases' own.
-
-    Returns
-    -------
-    Solution
-    """
-    transcription = problem.graph.transcription
-    require(tuple(start) == tuple(transcription.parameters), "the start's names are not the problem's", ModelError)
-    q = np.array([p.value for p in start.values()])
-    low, up = variable_bounds(transcription)
-    nodes = node_guesses(transcription, q, guesses)
-    w = np.clip(np.concatenate([to_unknowns(transcription, q), *nodes]), low, up)
-    fault = _find_nan(problem, w, q)
-    if fault:
-        return _solution(problem, w, q, Status(Code.DIVERGED, (f"at the start {fault}", "start elsewhere")), {}, {})
-    return _run_solver(problem, w, q)[0]
-
-
-def follow_path(problem: FullSpaceProblem, start: ParameterSet, path: Sequence[Mapping[str, float]]) -> list[Solution]:
-    """Solve along a path of fixed parameters, each problem from its neighbours' solutions, carried on along the path.
-
-    Parameters
-    ----------
-    problem : FullSpaceProblem
-        One made by ``prepare_full_space(..., warm_start=True)``.
-    start : ParameterSet
-        Parameters that start the first problem; names as in the problem.
-    path : sequence of mapping of str to float
-        Values of fixed parameters.
-
-    Returns
-    -------
-    list of Solution
-        One a step; a step that fails starts the next one from the last that did not.
-    """
-    if problem.warm_solver is None:
-        raise ModelError("the problem has no warm-start solver: prepare_full_space(..., warm_start=True)")
-    transcription, warm = problem.graph.transcription, replace(problem, solver=problem.warm_solver)
-    (low, up), found, done = variable_bounds(transcription), list[Solution](), list[tuple[Array, dict[str, Array]]]()
-    for step in path:
-        q = np.array([p.value for p in start.with_values(step).values()])
-        if not done:
-            w = np.clip(np.concatenate([to_unknowns(transcription, q), *node_guesses(transcription, q, ())]), low, up)
-            solution, raw = _run_solver(problem, w, q)
+    found = []
+    for run in (runs[i] for i in phases_of(term, transcription)):
+        if term.where is Where.END:
+            value = term.function(run.t[-1] + run.h[-1], run.ends[:, -1], run.u[:, -1], run.p)
         else:
-            last = done[-1][1]
-            w = np.clip(_extrapolate(done[-2:], q), low, up)
-            solution, raw = _run_solver(warm, w, q, {"lam_x0": last["lam_x"], "lam_g0": last["lam_g"]})
-        done += [(q, raw)] if solution.status.converged else []
-        found.append(solution)
+            nodes = run.phase.nodes.tolist() if term.where is Where.NODES else [0]
+            n = len(nodes)
+            value = term.function.map(n)(run.t[nodes], run.nodes[:, :n], run.u[:, nodes], ca.repmat(run.p, 1, n))
+        found.append((run.phase.name, value))
     return found
 
 
-def _extrapolate(done: Sequence[tuple[Array, Mapping[str, Array]]], q: Array) -> Array:
-    """The unknowns at q, extrapolated from the last two solutions along the difference of their parameters."""
-    (before, x), (last, y) = ((known, raw["x"]) for known, raw in (done[0], done[-1]))
-    step = last - before
-    length = float(step @ step)
-    share = min(max(float(step @ (q - last)) / length, 0.0), MAX_EXTRAPOLATION) if length else 0.0
-    return np.asarray(y + share * (y - x))
+def parameter_scale(parameter: Parameter) -> float:
+    """The unit in which the solver measures a parameter: its range, or its size."""
+    span = parameter.upper - parameter.lower
+    return span if 0 < span < math.inf else abs(parameter.value) or 1.0
 
 
-def _run_solver(
-    problem: FullSpaceProblem, w: Array, q: Array, multipliers: Mapping[str, Array] | None = None
-) -> tuple[Solution, dict[str, Array]]:
-    """Run the solver: the solution, and the solver's raw output."""
-    begun, (low, up) = time.perf_counter(), variable_bounds(problem.graph.transcription)
-    low_g, up_g = (
-        np.concatenate([np.zeros(0), *(getattr(r, s) for r in problem.graph.constraint_rows)])
-        for s in ("lower", "upper")
-    )
-    raw = problem.solver(x0=w, p=q, lbx=low, ubx=up, lbg=low_g, ubg=up_g, **(multipliers or {}))
-    found = {k: np.array(v).ravel() for k, v in raw.items()}
-    stats = problem.solver.stats()
-    figures = {
-        "iterations": float(stats.get("iter_count", 0)),
-        "seconds": time.perf_counter() - begun,
-        "cost": float(found["f"][0]),
-        "largest_gap": _largest_violation(problem, found["g"], continuity=True),
-        "largest_violation": _largest_violation(problem, found["g"], continuity=False),
-    }
-    status = _solver_status(problem, str(stats["return_status"]), found, q, figures)
-    return _solution(problem, found["x"], q, status, figures, _multipliers(problem, found, low, up)), found
+def to_unknowns(transcription: Transcription, q: Array) -> Array:
+    """The free parameters in the solver's units."""
+    parameters = list(transcription.parameters.values())
+    return np.array([_to_unknown(parameters[i], q[i]) for i in transcription.free])
 
 
-def _operation_count(transcription: Transcription) -> int:
-    """Estimated scalar operations of one evaluation."""
-    samples = sum(phase.n for phase in transcription.phases)
-    return int(samples * transcription.system.substeps * transcription.system.step.n_instructions())
+def to_values(transcription: Transcription, w: Array) -> dict[str, float]:
+    """The free parameters' values, by name, inside their bounds."""
+    found = {}
+    for k, name in enumerate(transcription.parameters.free_names):
+        parameter = transcription.parameters[name]
+        value = math.exp(w[k]) if parameter.log else w[k] * parameter_scale(parameter)
+        found[name] = min(max(value, parameter.lower), parameter.upper)
+    return found
 
 
-# The solver's outcome as a status.
+def _to_unknown(parameter: Parameter, value: float) -> float:
+    if not parameter.log:
+        return value / parameter_scale(parameter)
+    return math.log(value) if value > 0 else -math.inf
+
+
+def variable_bounds(transcription: Transcription) -> tuple[Array, Array]:
+    """Bounds of the unknowns; a known start state is pinned."""
+    free = [list(transcription.parameters.values())[i] for i in transcription.free]
+    bounds = [np.array([[_to_unknown(p, p.lower), _to_unknown(p, p.upper)] for p in free]).reshape(-1, 2)]
+    states = transcription.system.states
+    for phase in transcription.phases:
+        nodes = np.tile([[s.lower / s.nominal, s.upper / s.nominal] for s in states], (len(phase.nodes), 1))
+        if phase.start is not None:
+            nodes[: len(states)] = np.array([[x / s.nominal] for x, s in zip(phase.start, states, strict=True)])
+        bounds.append(nodes)
+    low, up = np.concatenate(bounds).T
+    return low, up
+
+
+def node_guesses(transcription: Transcription, q: Array, guesses: Sequence[Array | None] = ()) -> list[Array]:
+    """The nodes' scaled states to start from: `guesses`, the phases' own, or a simulation."""
+    nominal = np.array([s.nominal for s in transcription.system.states])
+    x, found = np.zeros(len(nominal)), []
+    for i, phase in enumerate(transcription.phases):
+        guess = guesses[i] if i < len(guesses) else phase.guess
+        x = x if phase.follows else np.zeros(len(nominal)) if phase.start is None else phase.start
+        if guess is None:
+            guess, x = _simulate_guess(transcription, phase, q, x, 1e3 * nominal)
+        else:
+            x = guess[-1]
+        found.append((guess[phase.nodes] / nominal).ravel())
+    return found
+
+
+def _simulate_guess(transcription: Transcription, phase: Phase, q: Array, x: Array, most: Array) -> tuple[Array, Array]:
+    """States at the samples, and after the last; a state that runs away is held where it is."""
+    sample = _sample_function(transcription)
+    length = _duration(transcription, phase, q)
+    p, states = q[transcription.parameter_positions(phase)], np.empty((phase.n, len(x)))
+    for k in range(phase.n):
+        states[k] = x
+        x_next = np.array(sample(phase.t[k] * length, phase.h[k] * length, x, phase.inputs[k], p)[0]).ravel()
+        x = x_next if bool(np.all(np.abs(x_next) < most)) else x
+    return states, x
 
 
 def _solver_status(
@@ -552,22 +474,17 @@ def _describe_worst_row(problem: FullSpaceProblem, g: Array) -> str:
     table = [r for r in problem.graph.constraint_rows if r.rows.stop > r.rows.start]
     if not table:
         return "there are no limits"
-    relative = [float(np.max(_row_violation(r, g) / _limit_size(r))) for r in table]
+    finite = ([np.where(np.isfinite(side), np.abs(side), 0.0) for side in (r.lower, r.upper)] for r in table)
+    relative = [
+        float(np.max(_row_violation(r, g) / (np.maximum(*f) + 1e-3))) for r, f in zip(table, finite, strict=True)
+    ]
     rows = table[int(np.argmax(relative))]
     if max(relative) < 1e-6:
         return "no limit is violated"
     k = int(np.argmax(_row_violation(rows, g)))
-    allowed = _format_range(rows.lower[k], rows.upper[k])
+    lower, upper = rows.lower[k], rows.upper[k]
+    allowed = f"{lower:.6g}" if lower == upper else f"{lower:.6g} to {upper:.6g}"
     return f"worst is {_row_title(problem, rows, k)}: {g[rows.rows][k]:.6g}, allowed {allowed}"
-
-
-def _limit_size(rows: ConstraintRows) -> Array:
-    finite = [np.where(np.isfinite(side), np.abs(side), 0.0) for side in (rows.lower, rows.upper)]
-    return np.maximum(*finite) + 1e-3
-
-
-def _format_range(lower: float, upper: float) -> str:
-    return f"{lower:.6g}" if lower == upper else f"{lower:.6g} to {upper:.6g}"
 
 
 def _row_title(problem: FullSpaceProblem, rows: ConstraintRows, k: int) -> str:

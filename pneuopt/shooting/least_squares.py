@@ -1,8 +1,36 @@
-"""Soft-continuity multiple shooting: the gaps between segments are weighted residuals, solved by Levenberg-Marquardt.
+"""`LeastSquares`: soft-continuity multiple shooting, one nonlinear least squares in all nodes and parameters.
 
-One nonlinear least squares in all nodes and parameters; each step is a banded Cholesky with an arrow, linear in the
-record's length. The gaps are tightened in stages, so that a bad start is never integrated over the whole record,
-as single shooting does, which fails there (problems/speed/benchmark_identification.py).
+The gaps between segments are weighted residuals, and are tightened in stages: a bad start is never integrated over the
+whole record, as single shooting does, which fails there (problems/speed/benchmark_identification.py). Each step is a
+banded Cholesky with an arrow, linear in the record's length.
+
+A search is a frozen `SearchState`; each move takes one and returns the next. Only `LevenbergMarquardt`, which takes the
+steps of one stage, changes itself. The moves, in the order of the search and of this file:
+
+    start_search           guesses become nodes; the stiffness there gives the integration steps
+    run_stages             the schedule, its gaps ever tighter
+      run_stage              weigh the gaps, choose integration steps, iterate; in the last stage again by finer steps
+      shorten                after a first stage at the noise: one of `Shortcut` in place of the stages between
+      repeat_last_stage      one of `Repeat`, until the last stage converges or creeps
+      allow_state_noise      where gaps absorb the misfit of the model: they are estimated as noise of its states
+        loosen, tighten        that optimum, and the one with tight gaps if it leads there
+    refine_steps           finer integration steps at an optimum, until they move no estimate
+    end_search             the fit with its covariance, and the parameters that are not determined
+
+    stage    gap [nominal sizes]   iterations   what is particular to it
+    first    1e-2                  12           log parameters are drawn to their start, as by all gaps above `WIDE_GAP`
+    next     3e-3, 1e-3, 3e-4      8            the same
+    next     1e-4                  8            the data alone count
+    last     1e-5                  30           finer integration steps; it decides on convergence
+
+    end            at                           because
+    TOO_STIFF      the start                    a sample takes more integration steps than a search can afford
+    DIVERGED       a stage's end                the model was not finite where the stage began
+    DUPLICATE      a stage's end                the cost is that of a known search after the same stage
+    ABANDONED      the first's end, the last    the misfit exceeds `LeastSquares.max_misfit`
+    OPTIMUM        a shortcut, the last stage   a full undamped step would move no parameter noticeably
+    UNSETTLED      the last stage               one would still move, or is not determined, and no repeat helps
+    INTERRUPTED    any move                     of Ctrl-C or a spent CPU budget: the last iterate before it
 """
 
 import math
@@ -49,9 +77,7 @@ from pneuopt.shooting.tolerances import (
     FINE_TOLERANCE,
     FIRST_JOINING_STAGE,
     INITIAL_DAMPING,
-    JOINED_COST_TOLERANCE,
     JUMP_COST_TOLERANCE,
-    JUMP_ITERATIONS,
     MAX_CHI_SQUARE_RATIO,
     MAX_CREEPING_STEPS,
     MAX_GAP_SHARE,
@@ -67,7 +93,6 @@ from pneuopt.shooting.tolerances import (
     MAX_SHIFT,
     MAX_STAGE_REFINEMENT,
     MAX_STEP_HALVINGS,
-    MAX_STEPS,
     MAX_TRIES,
     MAX_UNDAMPED_STEPS,
     MIN_DAMPING,
@@ -75,13 +100,13 @@ from pneuopt.shooting.tolerances import (
     MIN_IMPLICIT_SUBSTEPS,
     MISFIT_TOLERANCE,
     PATIENT_ITERATIONS,
-    REPEAT_ITERATIONS,
     SETTLED_COST_DECREASE,
     STAGE_COST_TOLERANCE,
     STALL_COST_DECREASE,
     STEEP_DECREASE,
     STIFFNESS_UPDATE_CHANGE,
     TRAPPING_DAMPING,
+    TRIAL_ITERATIONS,
     UNIDENTIFIABLE_PRIOR_RATIO,
     WIDE_GAP,
 )
@@ -93,18 +118,7 @@ class BudgetSpentError(KeyboardInterrupt):
 
 
 class CpuBudget:
-    """CPU time that may be spent, from now on.
-
-    Parameters
-    ----------
-    seconds : float
-        Of this process, all its threads together [s]; infinite: no budget.
-
-    Raises
-    ------
-    InputError
-        If it is not positive.
-    """
+    """CPU seconds of this process, all its threads together, that may be spent from now on; infinite: no budget."""
 
     def __init__(self, seconds: float) -> None:
         require(seconds > 0, f"cpu_seconds must be positive, got {seconds:g}; leave it out for a search to its end")
@@ -133,138 +147,14 @@ class CpuBudget:
         return Status(Code.BUDGET, (verdict, *details, "give more, or begin with these values: start="))
 
 
-@dataclass(frozen=True, eq=False)
-class Optimum:
-    """The equations and the run at the end of a search, from which the residuals are diagnosed.
-
-    Attributes
-    ----------
-    equations : NormalEquations
-    run : RolloutResult
-        With states, by the finest steps.
-    nodes : ndarray, shape (m, n_states)
-    values : ndarray
-        All the problem's parameter values.
-    keep : ndarray of bool, shape (k,)
-        The free parameters that have a covariance.
-    gap_deviations : ndarray, shape (n_states,)
-        Standard deviations of the gaps, in nominal sizes.
-    substeps : int
-        Integration steps a sample of the sensitivities.
-    """
-
-    equations: NormalEquations
-    run: RolloutResult
-    nodes: Array
-    values: Array
-    keep: Mask
-    gap_deviations: Array
-    substeps: int
-
-
-class SearchEnd(Enum):
-    """Why a search ended, with the status that says so where nothing else is known."""
-
-    OPTIMUM = Status(Code.CONVERGED)
-    UNSETTLED = Status(Code.NOT_CONVERGED)
-    ABANDONED = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
-    DUPLICATE = Status(Code.NOT_CONVERGED, ("a start has led to where another one was",))
-    TOO_STIFF = Status(Code.NOT_CONVERGED, ("the model is too stiff",))
-    DIVERGED = Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
-    INTERRUPTED = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
-
-    @property
-    def status(self) -> Status:
-        """The status of a search that ended so."""
-        return self.value
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """The result of a least squares: states over time, parameters, and how well the data determine them.
-
-    Attributes
-    ----------
-    trajectories : tuple of Trajectory
-        States and outputs, one a phase.
-    parameters : ParameterSet
-        The problem's parameters with the free ones solved for.
-    status : Status
-        As it is reported; a caller may say more of it.
-    end : SearchEnd
-        Why the search ended.
-    stats : mapping of str to float
-        Iterations, seconds, final cost, largest gap, ...
-    covariance : ndarray, shape (k, k), or None
-        Of the free parameters in their own units, at unit noise scale; None where the data do not determine them.
-    chi_square : float
-        Sum of squared data residuals, in noise standard deviations.
-    count : int
-        Number of data residuals.
-    at_bound : ndarray of bool, shape (k,)
-        Which parameters are at a bound, without those fixed by equal bounds.
-    jumps : ndarray, shape (m, n_states), or None
-        The gap behind each linked segment, in nominal sizes, if the gaps stand for noise of the states.
-    unidentifiable : tuple of str
-        The parameters that the data do not determine here; a caller holds them, and fits again.
-    unsettled : tuple of str
-        The parameter along which the search was still moving when it gave up; empty where it ended otherwise.
-    prior_covariance : ndarray, shape (k, k), or None
-        The covariance due to a weak prior of fixed parameters (`NormalEquations.prior_covariance`); None where nothing
-        is fixed.
-    variance_inflation : float
-        Factor on the estimates' variance by weighted squares (robust losses).
-    optimum : Optimum or None
-        None where there is no covariance.
-    stage_costs : tuple of (float, float)
-        The gap and the cost at the end of the stages from the third, and of the search.
-    """
-
-    trajectories: tuple[Trajectory, ...]
-    parameters: ParameterSet
-    status: Status
-    end: SearchEnd
-    stats: Mapping[str, float]
-    covariance: Array | None
-    chi_square: float
-    count: int
-    at_bound: Mask
-    jumps: Array | None = None
-    unidentifiable: tuple[str, ...] = ()
-    unsettled: tuple[str, ...] = ()
-    prior_covariance: Array | None = None
-    variance_inflation: float = 1.0
-    optimum: Optimum | None = None
-    stage_costs: tuple[tuple[float, float], ...] = ()
-
-    def with_effort_of(self, *earlier: "Fit") -> "Fit":
-        """The fit with the iterations and seconds of earlier ones added to its own."""
-        total = {n: sum(fit.stats[n] for fit in (*earlier, self)) for n in ("iterations", "seconds")}
-        return replace(self, stats={**self.stats, **total})
-
-
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the search: how tight the gaps are, and how long it runs.
+    """A stage of the search: how tight the gaps are, and how long it runs."""
 
-    Parameters
-    ----------
-    gap : float
-        Standard deviation of a gap, as a fraction of the state's nominal size.
-    iterations : int
-        Largest number of iterations.
-    refine : int
-        Integration steps at the end of the stage, as a multiple of those before. Let the last stage have more than 1:
-        with 1 and a gap above `WIDE_GAP` a stage draws log parameters to their start (`has_prior`).
-
-    Raises
-    ------
-    InputError
-        If an option is not in its range.
-    """
-
-    gap: float
-    iterations: int
+    gap: float  # standard deviation of a gap, as a fraction of the state's nominal size
+    iterations: int  # largest number of iterations
+    # integration steps at the end of the stage, as a multiple of those before. Let the last stage have more than 1:
+    # with 1 and a gap above `WIDE_GAP` a stage draws log parameters to their start (`has_prior`).
     refine: int = 1
 
     def __post_init__(self) -> None:
@@ -350,139 +240,79 @@ class LeastSquares:
             require(0 < value < math.inf, f"{lead}({name}={value}): give a positive number")
 
 
+class SearchEnd(Enum):
+    """Why a search ended, with the status that says so where nothing else is known."""
+
+    OPTIMUM = Status(Code.CONVERGED)
+    UNSETTLED = Status(Code.NOT_CONVERGED)
+    ABANDONED = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
+    DUPLICATE = Status(Code.NOT_CONVERGED, ("a start has led to where another one was",))
+    TOO_STIFF = Status(Code.NOT_CONVERGED, ("the model is too stiff",))
+    DIVERGED = Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
+    INTERRUPTED = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
+
+    @property
+    def status(self) -> Status:
+        """The status of a search that ended so."""
+        return self.value
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """The equations and the run at the end of a search, from which the residuals are diagnosed."""
+
+    equations: NormalEquations
+    run: RolloutResult  # with states, by the finest steps
+    nodes: Array  # (m, n_states)
+    values: Array  # all the problem's parameter values
+    keep: Mask  # (k,): the free parameters that have a covariance
+    gap_deviations: Array  # (n_states,): standard deviations of the gaps, in nominal sizes
+    substeps: int  # integration steps a sample of the sensitivities
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The result of a least squares: states over time, parameters, and how well the data determine them."""
+
+    trajectories: tuple[Trajectory, ...]  # states and outputs, one a phase
+    parameters: ParameterSet  # the problem's parameters with the free ones solved for
+    status: Status  # as it is reported; a caller may say more of it
+    end: SearchEnd  # why the search ended
+    stats: Mapping[str, float]  # iterations, seconds, final cost, largest gap
+    # (k, k): of the free parameters in their own units, at unit noise scale; None where the data do not determine them
+    covariance: Array | None
+    chi_square: float  # sum of squared data residuals, in noise standard deviations
+    count: int  # number of data residuals
+    at_bound: Mask  # (k,): which parameters are at a bound, without those fixed by equal bounds
+    # (m, n_states): the gap behind each linked segment, in nominal sizes, if the gaps stand for noise of the
+    # states
+    jumps: Array | None = None
+    # the parameters that the data do not determine here; a caller holds them, and fits again
+    unidentifiable: tuple[str, ...] = ()
+    # the parameter along which the search was still moving when it gave up; empty where it ended otherwise
+    unsettled: tuple[str, ...] = ()
+    # (k, k): the covariance due to a weak prior of fixed parameters (`NormalEquations.prior_covariance`);
+    # None where nothing is fixed
+    prior_covariance: Array | None = None
+    variance_inflation: float = 1.0  # factor on the estimates' variance by weighted squares (robust losses)
+    optimum: Optimum | None = None  # None where there is no covariance
+    # the gap and the cost at the end of the stages from the third, and of the search
+    stage_costs: tuple[tuple[float, float], ...] = ()
+
+    def with_effort_of(self, *earlier: "Fit") -> "Fit":
+        """The fit with the iterations and seconds of earlier ones added to its own."""
+        total = {n: sum(fit.stats[n] for fit in (*earlier, self)) for n in ("iterations", "seconds")}
+        return replace(self, stats={**self.stats, **total})
+
+
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:
-    """Solve a transcription that has residuals and bounds, but neither costs nor limits.
+    """Solve a transcription that has residuals and bounds, but neither costs nor limits, from its guesses and values.
 
-    Parameters
-    ----------
-    transcription : Transcription
-        Its phases' guesses and its parameters' values are the start.
-    method : LeastSquares, optional
-
-    Returns
-    -------
-    Fit
-        Whatever its status; an interruption (Ctrl-C) returns the best iterate so far, marked.
+    Whatever its status, a fit is returned; that of an interruption (Ctrl-C) is the best iterate so far, marked.
     """
     began, state = time.perf_counter(), start_search(segment(transcription), method or LeastSquares())
     state = run_search(state)
     return end_search(state, time.perf_counter() - began)
-
-
-NO_POSITIONS = np.zeros(0, dtype=np.intp)
-
-
-class ConvergenceTest(NamedTuple):
-    """The status of an iterate, and the positions of free parameters that the data do not determine there.
-
-    `unsettled` is the one that would still move most where nothing else is wrong; `largest_step` is that of a converged
-    iterate, in standard deviations.
-    """
-
-    status: Status
-    unidentifiable: Indices = NO_POSITIONS
-    unsettled: Indices = NO_POSITIONS
-    largest_step: float = 0.0
-
-
-def assess_convergence(
-    equations: NormalEquations, space: ParameterScaling, z: Array, tolerance: float, message: str, *, noisy_gaps: bool
-) -> ConvergenceTest:
-    """Test an iterate: converged means that a full undamped step would move no parameter noticeably.
-
-    Parameters
-    ----------
-    equations : NormalEquations
-    space : ParameterScaling
-    z : ndarray, shape (k,)
-        The free parameters as searched.
-    tolerance : float
-        Largest step of a converged iterate, in standard deviations.
-    message : str
-        The first sentence of a converged status.
-    noisy_gaps : bool
-        Whether the gaps stand for noise of the states.
-
-    Returns
-    -------
-    ConvergenceTest
-    """
-    names = np.array(equations.segments.transcription.parameters.free_names, dtype=object)
-    no_sensitivity = np.diag(equations.arrow.corner) == 0  # even at a bound
-    idle = ~space.fixed & ~space.has_effect(equations) & (no_sensitivity | ~space.at_bound(z))
-    if idle.any():
-        sentences = f"the data do not depend on {' and '.join(names[idle])}", "fix it, or log a run that does"
-        return ConvergenceTest(Status(Code.NOT_CONVERGED, sentences), np.flatnonzero(idle))
-    reduced = equations.arrow.eliminate(0.0)
-    if reduced is None:
-        return ConvergenceTest(
-            Status(Code.NOT_CONVERGED, ("the data do not determine the states", "log another output"))
-        )
-    keep = space.movable(z, equations, reduced)
-    own = np.flatnonzero(keep)
-    alike, solved = own[equations.unidentifiable_parameters(reduced, keep)], reduced.step(keep)
-    noise = max(1.0, math.sqrt(equations.chi_square / max(1, equations.count)))
-    if alike.size or solved is None:
-        verdict = f"the data do not determine {' and '.join(names[np.sort(alike)])}"
-        status = Status(Code.NOT_CONVERGED, (verdict, "fix one, or log a run that separates them"))
-        weakest = _least_sensitive(own, space, reduced, noise, z)
-        return ConvergenceTest(status, weakest if weakest.size else alike[-1:])
-    spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
-    step = np.abs(solved.parameters[keep]) / (noise * spread)
-    if np.max(step, initial=0.0) > tolerance:
-        worst = int(np.argmax(step))
-        verdict = f"{names[keep][worst]} would still move by {step[worst]:.2g} standard deviations"
-        remedy = "try more iterations, other start values, or fix a parameter"
-        status = Status(Code.NOT_CONVERGED, (verdict, remedy))
-        return ConvergenceTest(status, _least_certain(own, noise * spread, space, z), own[[worst]])
-    bounded = np.flatnonzero(space.at_bound(z) & ~space.fixed)
-    return ConvergenceTest(
-        _optimum_status(equations, message, noisy_gaps=noisy_gaps),
-        _least_sensitive(bounded, space, reduced, noise, z),
-        largest_step=float(np.max(step, initial=0.0)),
-    )
-
-
-def largest_parameter_step(equations: NormalEquations, keep: Mask, reduced: ReducedEquations, step: Array) -> float:
-    """The largest step of a kept parameter, of shape (k,) in all, in its standard deviations.
-
-    It is infinite where the data do not determine all of them.
-    """
-    if equations.unidentifiable_parameters(reduced, keep).size:
-        return math.inf
-    spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
-    return float(np.max(np.abs(step[keep]) / spread, initial=0.0))
-
-
-def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: bool) -> Status:
-    """The status of an optimum: converged, unless its gaps absorb the misfit of the model."""
-    gap, misfit = equations.largest_gap, 2 * equations.cost / max(1, equations.count)
-    if equations.gap_share > MAX_GAP_SHARE and not (noisy_gaps and misfit <= MAX_CHI_SQUARE_RATIO):
-        verdict = f"the gaps between segments carry {equations.gap_share:.0%} of the cost"
-        detail = f"the largest is {gap:.1g} of a state's nominal size: the model cannot follow the log"
-        return Status(Code.NOT_CONVERGED, (verdict, detail, "check its terms, inputs and units"))
-    verdict = f"{message}, largest gap {gap:.1g} of a state's nominal size"
-    misfit_sentences = describe_misfit(equations, MAX_CHI_SQUARE_RATIO, noisy_gaps=noisy_gaps)
-    return Status(Code.CONVERGED, (verdict, *misfit_sentences))
-
-
-def _least_sensitive(
-    positions: Indices, space: ParameterScaling, reduced: ReducedEquations, noise: float, z: Array
-) -> Indices:
-    """The position of the parameter with the least effect on the data, the others known; none if a prior is vaguer."""
-    return _least_certain(positions, noise / np.sqrt(np.maximum(np.diag(reduced.schur)[positions], 1e-300)), space, z)
-
-
-def _least_certain(positions: Indices, spread: Array, space: ParameterScaling, z: Array) -> Indices:
-    """The position of the least certain parameter, if a weak prior would be more certain; or none.
-
-    A linear parameter is as large as the larger of its start and its value here: a start near zero tells no size.
-    """
-    larger = np.where(np.abs(z) > np.abs(space.start), z, space.start)
-    share = spread / space.weak_prior(larger)[positions]
-    if not share.size or not share.max() > UNIDENTIFIABLE_PRIOR_RATIO:
-        return NO_POSITIONS
-    return positions[[int(np.argmax(share))]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -501,28 +331,14 @@ class Iterate:
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The lifted least squares with given gaps' weights and integration steps.
-
-    Attributes
-    ----------
-    segments : Segments
-    scaling : ParameterScaling
-    sigma : ndarray, shape (n_states,)
-        Standard deviation of a gap, in nominal sizes.
-    substeps : int
-        Integration steps a sample.
-    correction : IntegrationCorrection or None
-        The change of outputs and ends by finer steps.
-    has_prior : bool
-        Whether log parameters are drawn to their start (`ParameterScaling.add_start_prior`).
-    """
+    """The lifted least squares with given gaps' weights and integration steps."""
 
     segments: Segments
     scaling: ParameterScaling
-    sigma: Array
-    substeps: int
-    correction: IntegrationCorrection | None = None
-    has_prior: bool = False
+    sigma: Array  # (n_states,): standard deviation of a gap, in nominal sizes
+    substeps: int  # integration steps a sample
+    correction: IntegrationCorrection | None = None  # the change of outputs and ends by finer steps
+    has_prior: bool = False  # whether log parameters are drawn to their start (`ParameterScaling.add_start_prior`)
 
     def evaluate(self, nodes: Array, z: Array) -> Iterate:
         """The iterate at these nodes, shape (m, n_states), and searched parameters."""
@@ -536,144 +352,31 @@ class Objective:
         return Iterate(nodes, z, self.scaling.add_start_prior(equations, z) if self.has_prior else equations)
 
 
-IsNegligible = Callable[[Iterate, ReducedEquations, GaussNewtonStep], bool]
+NO_POSITIONS = np.zeros(0, dtype=np.intp)
 
 
-class Descent:
-    """Levenberg-Marquardt steps on one objective.
+class ConvergenceTest(NamedTuple):
+    """The status of an iterate, and the positions of free parameters that the data do not determine there.
 
-    Parameters
-    ----------
-    objective : Objective
-    damping : float
-        Of the first step.
-    is_negligible : callable
-        Whether a step that is hardly damped is not worth a try.
-
-    Attributes
-    ----------
-    damps_nodes : bool
-        Whether nodes that overshoot are damped alone. Near an optimum this saves the rest of the log many short steps;
-        far from it, nodes are left behind that tighter gaps then cannot free.
-    node_damping : ndarray, shape (m,)
-        Of each node alone, over its diagonal.
+    `unsettled` is the one that would still move most where nothing else is wrong; `largest_step` is that of a converged
+    iterate, in standard deviations.
     """
 
-    def __init__(self, objective: Objective, damping: float, is_negligible: IsNegligible) -> None:
-        self.damps_nodes, self.promised = False, math.inf
-        self.objective, self.damping, self._is_negligible = objective, damping, is_negligible
-        self.node_damping = np.zeros(objective.segments.count)
-
-    def step(self, current: Iterate) -> Iterate | None:
-        """The next iterate; None if no damping lowers the cost, or the step would be negligible.
-
-        After the first try the damping rises only at the nodes that have overshot, if there are any.
-        """
-        raise_by, scaling = 10.0, self.objective.scaling
-        for k in range(MAX_TRIES):
-            reduced = current.equations.arrow.eliminate(self.damping, self.node_damping)
-            step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
-            if k == 0 and step:
-                self.promised = 0.5 * current.equations.arrow.descent_rate(step)
-            if reduced and step and np.max(np.abs(step.parameters[scaling.log]), initial=0.0) <= MAX_LOG_CHANGE:
-                is_hardly_damped = self.damping <= INITIAL_DAMPING and (k == 0 or (k == 1 and self.node_damping.any()))
-                if is_hardly_damped and self._is_negligible(current, reduced, step):
-                    break
-                trial = self._trial(current, reduced, step)
-                is_lower = trial.cost < current.cost
-                if self.damps_nodes and (not is_lower or self.node_damping.any()):
-                    self.node_damping = self._missed_curvature(current, trial)
-                if is_lower:
-                    self.damping = self.damping * 0.1 if self.damping > MIN_DAMPING else 0.0
-                    return trial
-                if k == 0 and self.node_damping.any():
-                    continue
-            self.damping, raise_by = max(self.damping, MIN_DAMPING) * raise_by, 3 * raise_by
-        return None
-
-    def undamped_steps(self, current: Iterate) -> tuple[Iterate, int]:
-        """Take undamped steps, which may raise the cost for a while: the best iterate among them, and their number.
-
-        Over a kink of the model, at which a descent creeps, this is the way (the watchdog technique: Chamberlain et
-        al., Mathematical Programming Study 16, 1982).
-        """
-        trial: Iterate | None = current
-        best, taken = current, 0
-        while trial is not None and math.isfinite(trial.cost) and taken < MAX_UNDAMPED_STEPS:
-            best, trial = min(best, trial, key=lambda each: each.cost), self._step_undamped(trial)
-            taken += trial is not None
-        return best if trial is None else min(best, trial, key=lambda each: each.cost), taken
-
-    def _step_undamped(self, current: Iterate) -> Iterate | None:
-        """The iterate after an undamped step, whatever its cost; None without one, or where it would be negligible."""
-        reduced, scaling = current.equations.arrow.eliminate(0.0), self.objective.scaling
-        step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
-        if not reduced or not step or self._is_negligible(current, reduced, step):
-            return None
-        z = scaling.project_to_bounds(current.z + step.parameters)
-        shift = reduced.back_substitute(z - current.z)
-        return self.objective.evaluate(current.nodes + shift * self.objective.segments.nominal, z)
-
-    def _trial(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> Iterate:
-        """The iterate after a step; where its gaps let the cost fall too little, with the nodes settled.
-
-        Tight gaps make a narrow valley of what the parameters and the whole trajectory do together, and its bend turns
-        a long step into gaps. A Gauss-Newton step of the nodes alone, from the trial's own derivatives, closes them
-        again without the log being left, as shooting on from the first node would.
-        """
-        z = self.objective.scaling.project_to_bounds(current.z + step.parameters)
-        moved = z - current.z
-        shift = reduced.back_substitute(moved)  # a bound may have cut the parameters' step short
-        trial = self.objective.evaluate(current.nodes + shift * self.objective.segments.nominal, z)
-        promised = 0.5 * current.equations.arrow.descent_rate(GaussNewtonStep(shift, moved))
-        for _ in range(MAX_NODE_STEPS):
-            if current.cost - trial.cost >= MIN_GAIN_RATIO * promised or not _misses_by_gaps(current, trial):
-                break
-            settled = self._settle_nodes(trial, current.cost)
-            if settled is None or not settled.cost < trial.cost:
-                break
-            trial = settled
-        return trial
-
-    def _settle_nodes(self, trial: Iterate, cost: float) -> Iterate | None:
-        """A trial after a step of its nodes alone; None where that does not promise less than a cost."""
-        arrow = trial.equations.arrow
-        shift = arrow.node_step(self.damping + self.node_damping)
-        if shift is None or trial.cost - 0.5 * arrow.descent_rate(GaussNewtonStep(shift, 0.0 * trial.z)) >= cost:
-            return None
-        return self.objective.evaluate(trial.nodes + shift * self.objective.segments.nominal, trial.z)
-
-    def _missed_curvature(self, current: Iterate, trial: Iterate) -> Array:
-        """The curvature that a trial shows and the model has missed, by node; none of a trial that is not finite."""
-        if not math.isfinite(trial.cost):
-            return np.zeros(len(current.nodes))
-        step, moved = (trial.nodes - current.nodes) / self.objective.segments.nominal, trial.z - current.z
-        return missed_curvature(current.equations, step, moved, trial.equations, self.objective.sigma)
-
-
-def _misses_by_gaps(current: Iterate, trial: Iterate) -> bool:
-    """Whether the gaps of a trial, more than its data, make it cost more than where it comes from."""
-    by_data = 0.5 * (trial.equations.chi_square - current.equations.chi_square)
-    return math.isfinite(trial.cost) and trial.cost - current.cost > 2 * by_data
+    status: Status
+    unidentifiable: Indices = NO_POSITIONS
+    unsettled: Indices = NO_POSITIONS
+    largest_step: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class SearchSetup:
-    """What stays the same during a search.
-
-    Attributes
-    ----------
-    method : LeastSquares
-    scaling : ParameterScaling
-    gap_scales : ndarray, shape (n_states,)
-        Factor on each state's gaps (`segments.gap_scales`).
-    required_substeps, first_substeps : int
-        Integration steps a sample by the stiffness of the start, and those that the search begins with.
-    """
+    """What stays the same during a search."""
 
     method: LeastSquares
     scaling: ParameterScaling
-    gap_scales: Array
+    gap_scales: Array  # (n_states,): factor on each state's gaps (`segments.gap_scales`)
+    # required_substeps, first_substeps: integration steps a sample by the stiffness of the start, and those that the
+    # search begins with
     required_substeps: int
     first_substeps: int
 
@@ -693,68 +396,32 @@ class StageEnd(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SearchState:
-    """Where a search is: its iterate, the stage and the integration steps by which it got there, and what it has tried.
-
-    Attributes
-    ----------
-    setup : SearchSetup
-    iterate : Iterate
-        Nodes, parameters as searched, and the equations linearised there.
-    stage : Stage
-    substeps, output_substeps : int
-        Integration steps a sample of the sensitivities, and of the outputs.
-    stiffness_values : ndarray
-        All parameters' values at which the integration steps were chosen.
-    node_damping : ndarray, shape (m,)
-        Of each node alone, over its diagonal, where the stage has ended.
-    tolerance : float
-        The method's; wider where kinks hold up a search that has settled.
-    correction : IntegrationCorrection, optional
-        What finer steps change in the outputs.
-    is_coarse : bool
-        Whether finer steps are to follow in this stage.
-    noisy_gaps : bool
-        Whether the gaps stand for noise of the states.
-    iterations, stage_began : int
-        Iterations so far, and at the beginning of the stage.
-    has_stalled : bool
-        Whether the stage has converged, or hardly lowered the cost at its end.
-    last_decrease : float
-        Of the stage's cost by its last iteration, over itself.
-    integration_change : float
-        Largest change of an output by the last refinement [noise standard deviations]; NaN where there was none.
-    stage_ends : tuple of StageEnd
-    unsettled_gaps : frozenset of float
-        Gaps at which noise of the states has not settled.
-    tried_state_noise : bool
-        Whether noise of the states was tried before the last stage.
-    end : SearchEnd, optional
-        None while the search goes on.
-    status : Status
-        What is said of the end.
-    """
+    """Where a search is: its iterate, the stage and the steps by which it got there, and what it has tried."""
 
     setup: SearchSetup
-    iterate: Iterate
+    iterate: Iterate  # nodes, parameters as searched, and the equations linearised there
     stage: Stage
+    # substeps, output_substeps: integration steps a sample of the sensitivities, and of the outputs
     substeps: int
     output_substeps: int
-    stiffness_values: Array
-    node_damping: Array
-    tolerance: float
-    correction: IntegrationCorrection | None = None
-    is_coarse: bool = False
-    noisy_gaps: bool = False
+    stiffness_values: Array  # all parameters' values at which the integration steps were chosen
+    node_damping: Array  # (m,): of each node alone, over its diagonal, where the stage has ended
+    tolerance: float  # the method's; wider where kinks hold up a search that has settled
+    correction: IntegrationCorrection | None = None  # what finer steps change in the outputs
+    is_coarse: bool = False  # whether finer steps are to follow in this stage
+    noisy_gaps: bool = False  # whether the gaps stand for noise of the states
+    # iterations, stage_began: iterations so far, and at the beginning of the stage
     iterations: int = 0
     stage_began: int = 0
-    has_stalled: bool = False
-    last_decrease: float = 0.0
+    has_stalled: bool = False  # whether the stage has converged, or hardly lowered the cost at its end
+    last_decrease: float = 0.0  # of the stage's cost by its last iteration, over itself
+    # largest change of an output by the last refinement [noise standard deviations]; NaN where there was none
     integration_change: float = math.nan
     stage_ends: tuple[StageEnd, ...] = ()
-    unsettled_gaps: frozenset[float] = frozenset()
-    tried_state_noise: bool = False
-    end: SearchEnd | None = None
-    status: Status = SearchEnd.UNSETTLED.status
+    unsettled_gaps: frozenset[float] = frozenset()  # gaps at which noise of the states has not settled
+    tried_state_noise: bool = False  # whether noise of the states was tried before the last stage
+    end: SearchEnd | None = None  # None while the search goes on
+    status: Status = SearchEnd.UNSETTLED.status  # what is said of the end
 
     @property
     def method(self) -> LeastSquares:
@@ -864,11 +531,6 @@ class SearchState:
         return replace(self, iterations=trial.iterations, stiffness_values=trial.stiffness_values)
 
 
-def is_noise_cost(cost: float, count: int) -> bool:
-    """Whether this cost is that of the noise alone in so many residuals."""
-    return 2 * cost <= MAX_CHI_SQUARE_RATIO * count
-
-
 class InterruptedSearchError(KeyboardInterrupt):
     """An interruption, with the last state before it."""
 
@@ -965,6 +627,12 @@ def pass_stage(state: SearchState, stage: Stage) -> SearchState:
     return state.end_with(SearchEnd.ABANDONED) if state.is_hopeless else shorten(state)
 
 
+def joins_known_search(state: SearchState) -> bool:
+    """Whether a search has come to where a known one was after the same stage, and would go on as that one."""
+    known = [cost for gap, cost in state.method.known_costs if gap == state.stage.gap]
+    return any(abs(state.cost - cost) <= STAGE_COST_TOLERANCE * cost for cost in known)
+
+
 def run_stage(state: SearchState, stage: Stage) -> SearchState:
     """The state after a stage that begins where the search is; as it is entered where the model is not finite there."""
     state = enter_stage(state, stage, state.iterate.nodes, state.iterate.z)
@@ -1024,7 +692,7 @@ def iterate(state: SearchState, iterations: int) -> SearchState:
     """Iterate in a stage, until it converges, or its iterations are used up: then it may have stalled."""
     damping, before = min(INITIAL_DAMPING, 10 * state.stage.gap**2), math.inf  # as the diagonal grows
     state = replace(state, stage_began=state.iterations, last_decrease=0.0)
-    descent = Descent(
+    descent = LevenbergMarquardt(
         state.objective(), damping, lambda at, reduced, step: is_negligible_step(state, at, reduced, step)
     )
     descent.node_damping = np.zeros(len(state.node_damping)) if state.noisy_gaps else state.node_damping
@@ -1043,7 +711,8 @@ def iterate(state: SearchState, iterations: int) -> SearchState:
             state = replace(state, iterate=trial, iterations=state.iterations + 1)
             if state.method.progress is not None:
                 state.method.progress(describe_iteration(state))
-            creeping = creeping + 1 if creeps(state, before, descent.promised) else 0
+            short = min(CREEPING_SHARE * descent.promised, STAGE_COST_TOLERANCE * before)
+            creeping = creeping + 1 if state.noisy_gaps and before - trial.cost < short else 0
             if creeping == MAX_CREEPING_STEPS:
                 at, (best, taken) = state.iterate.cost, descent.undamped_steps(state.iterate)
                 state, creeping = replace(state, iterate=best, iterations=state.iterations + taken), 0
@@ -1053,6 +722,44 @@ def iterate(state: SearchState, iterations: int) -> SearchState:
         raise InterruptedSearchError(state) from stop
     decrease = 1 - state.iterate.cost / before
     return replace(state, last_decrease=decrease, has_stalled=decrease < STALL_COST_DECREASE)
+
+
+def describe_iteration(state: SearchState) -> str:
+    """A line of progress: the stage, the iteration, the cost and the largest gap."""
+    stages = state.method.stages
+    number = "loosened" if state.noisy_gaps else f"stage {stages.index(state.stage) + 1}/{len(stages)}"
+    return (
+        f"{number}  iteration {state.iterations}  cost {state.cost:.6g}  "
+        f"largest gap {state.iterate.equations.largest_gap:.1e}"
+    )
+
+
+def is_negligible_step(state: SearchState, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
+    """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
+
+    The states of noisy gaps estimate that noise, and settle long after the parameters, whose step then counts; so it
+    does where the model misses the logs and the search is slow: the deviations are then those of the residuals, near
+    such an optimum Gauss-Newton steps go to and fro for long, and what is far below a deviation is far below the bias,
+    too. Where no parameter is free, the states are what is asked for.
+    """
+    promised, equations = 0.5 * current.equations.arrow.descent_rate(step), current.equations
+    is_last, misfit = state.stage.gap <= state.method.stages[-1].gap, max(1.0, 2 * current.cost / equations.count)
+    if not (state.noisy_gaps or is_last):
+        is_first = state.stage is state.method.stages[0] and is_noise_cost(current.cost, equations.count)
+        return promised < (JUMP_COST_TOLERANCE if is_first else STAGE_COST_TOLERANCE) * current.cost
+    if is_last and promised < FINAL_COST_TOLERANCE * misfit:
+        return True
+    is_slow = state.iterations - state.stage_began >= PATIENT_ITERATIONS
+    is_wrong = is_last and is_slow and misfit > MAX_CHI_SQUARE_RATIO
+    asks_parameters = bool(state.segments.transcription.parameters.free_names)
+    is_settled = asks_parameters and (state.is_coarse or is_wrong or promised < SETTLED_COST_DECREASE * misfit)
+    if not ((is_settled or state.noisy_gaps) and promised < STAGE_COST_TOLERANCE * current.cost):
+        return False
+    keep = state.setup.scaling.movable(current.z, equations, reduced)
+    largest = largest_parameter_step(equations, keep, reduced, step.parameters) / state.method.tolerance
+    if is_wrong:
+        return largest < MISFIT_TOLERANCE * math.sqrt(max(1.0, equations.chi_square / max(1, equations.count)))
+    return largest < (COARSE_TOLERANCE if state.is_coarse else FINE_TOLERANCE)
 
 
 @keeps_state
@@ -1115,22 +822,86 @@ def jump_to_last_stage(state: SearchState) -> SearchState:
     """The optimum that the last stage soon reaches; where it does not, the state goes on from there."""
     trial = enter_stage(state, state.method.stages[-1], state.iterate.nodes, state.iterate.z)
     if math.isfinite(trial.iterate.cost):
-        trial = iterate(trial, JUMP_ITERATIONS)
+        trial = iterate(trial, TRIAL_ITERATIONS)
         if trial.is_at_noise:  # finer steps are lost on what has not come near the noise by then
-            trial = finish_stage(trial, JUMP_ITERATIONS).conclude()
+            trial = finish_stage(trial, TRIAL_ITERATIONS).conclude()
             if trial.end is SearchEnd.OPTIMUM and trial.is_at_noise:
                 return trial
     return state.resumed_after(trial)
 
 
-def stages_to_loosen(state: SearchState) -> tuple[tuple[Stage, StageEnd], ...]:
-    """The stages whose gaps may stand for noise of the states, tightest first, and where they ended.
+class Repeat(Enum):
+    """How a last stage goes on that has used up its iterations."""
 
-    They explained the logs to their noise; those that did not settle would, from another start, creep again.
+    STOP = "not at all"
+    FREE_NODES = "from where trapped nodes are put to the ends of the segments before them"
+    GO_ON = "from where it is"
+
+
+def choose_repeat(state: SearchState, found: ConvergenceTest) -> Repeat:
+    """How the last stage goes on: while it lowers the cost steeply, or at the noise at all, but has not converged.
+
+    Parameters that the data do not determine end it, for a caller holds them. Friction at rest has a kink in the speed,
+    over which Gauss-Newton steps overshoot; nodes that do so are damped alone, and one that ends where its equations
+    no longer move it is trapped, and keeps the rest of the log from its optimum. Gaps that stand for noise of the
+    states are what is estimated, and free no node.
     """
-    ended = zip(state.method.stages[:-1], state.stage_ends, strict=False)
-    explaining = [(s, e) for s, e in ended if is_noise_cost(e.cost, state.iterate.equations.count)]
-    return tuple((s, e) for s, e in reversed(explaining[-MAX_LOOSENED:]) if s.gap not in state.unsettled_gaps)
+    is_trial = state.stage.iterations <= TRIAL_ITERATIONS
+    falls = state.last_decrease > STEEP_DECREASE and not is_trial
+    goes_on = state.noisy_gaps or state.is_near_end or falls
+    if found.status.converged or found.unidentifiable.size or not goes_on:
+        return Repeat.STOP
+    return Repeat.FREE_NODES if trapped_nodes(state).size and not state.noisy_gaps else Repeat.GO_ON
+
+
+def trapped_nodes(state: SearchState) -> Indices:
+    """Positions of nodes that a kink of the model traps."""
+    return np.flatnonzero(state.node_damping > TRAPPING_DAMPING).astype(np.intp)
+
+
+@keeps_state
+def repeat_last_stage(state: SearchState) -> SearchState:
+    """Run the last stage again as `choose_repeat` says, and conclude.
+
+    Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
+    """
+    least_decrease = 0.5 * state.method.tolerance**2  # that of a step of so many deviations
+    count = min(TRIAL_ITERATIONS, state.stage.iterations)
+    for _ in range(MAX_REPEATS * state.stage.iterations // max(1, count)):
+        before, found = state, state.assess()
+        repeat = choose_repeat(state, found)
+        if repeat is Repeat.STOP:
+            return state.conclude(found)
+        state = free_nodes(state, trapped_nodes(state)) if repeat is Repeat.FREE_NODES else iterate(state, count)
+        has_settled = moved_deviations(state, before.iterate.z) <= state.method.tolerance
+        if has_settled:
+            settled = MAX_NOISY_STEP if state.noisy_gaps else MAX_SETTLED_STEP
+            state = replace(state, tolerance=max(state.tolerance, settled))
+        is_lost = state.noisy_gaps and not has_settled  # a kink that it creeps over would take hundreds of steps
+        if is_lost or before.iterate.cost - state.iterate.cost < least_decrease:
+            break
+    return state.conclude()
+
+
+@keeps_state
+def free_nodes(state: SearchState, trapped: Indices) -> SearchState:
+    """Run the last stage with trapped nodes put to the ends of the segments before them, if that lowers the cost."""
+    nodes, behind = state.iterate.nodes.copy(), trapped[trapped > 0]
+    nodes[behind] += state.iterate.equations.gaps[behind - 1] * state.segments.nominal
+    freed = iterate(
+        replace(state.at(nodes, state.iterate.z), node_damping=np.zeros(len(nodes))), state.stage.iterations
+    )
+    return freed if freed.iterate.cost < state.iterate.cost else state.resumed_after(freed)
+
+
+def moved_deviations(state: SearchState, z: Array) -> float:
+    """How far the parameters have moved from z, at most [standard deviations]; infinite where one has none."""
+    equations, current = state.iterate.equations, state.iterate.z
+    reduced = equations.arrow.eliminate(0.0)
+    if reduced is None:
+        return math.inf
+    keep = state.setup.scaling.movable(current, equations, reduced)
+    return largest_parameter_step(equations, keep, reduced, current - z)
 
 
 def allow_state_noise(state: SearchState) -> SearchState:
@@ -1143,6 +914,16 @@ def allow_state_noise(state: SearchState) -> SearchState:
         if state.end is SearchEnd.OPTIMUM:
             break
     return state
+
+
+def stages_to_loosen(state: SearchState) -> tuple[tuple[Stage, StageEnd], ...]:
+    """The stages whose gaps may stand for noise of the states, tightest first, and where they ended.
+
+    They explained the logs to their noise; those that did not settle would, from another start, creep again.
+    """
+    ended = zip(state.method.stages[:-1], state.stage_ends, strict=False)
+    explaining = [(s, e) for s, e in ended if is_noise_cost(e.cost, state.iterate.equations.count)]
+    return tuple((s, e) for s, e in reversed(explaining[-MAX_LOOSENED:]) if s.gap not in state.unsettled_gaps)
 
 
 @keeps_state
@@ -1179,98 +960,6 @@ def tighten(state: SearchState) -> SearchState:
     return state.resumed_after(trial)
 
 
-class Repeat(Enum):
-    """How a last stage goes on that has used up its iterations."""
-
-    STOP = "not at all"
-    FREE_NODES = "from where trapped nodes are put to the ends of the segments before them"
-    GO_ON = "from where it is"
-
-
-def choose_repeat(state: SearchState, found: ConvergenceTest) -> Repeat:
-    """How the last stage goes on: while it lowers the cost steeply, or at the noise at all, but has not converged.
-
-    Parameters that the data do not determine end it, for a caller holds them. Friction at rest has a kink in the speed,
-    over which Gauss-Newton steps overshoot; nodes that do so are damped alone, and one that ends where its equations
-    no longer move it is trapped, and keeps the rest of the log from its optimum. Gaps that stand for noise of the
-    states are what is estimated, and free no node.
-    """
-    is_trial = state.stage.iterations <= REPEAT_ITERATIONS
-    falls = state.last_decrease > STEEP_DECREASE and not is_trial
-    goes_on = state.noisy_gaps or state.is_near_end or falls
-    if found.status.converged or found.unidentifiable.size or not goes_on:
-        return Repeat.STOP
-    return Repeat.FREE_NODES if trapped_nodes(state).size and not state.noisy_gaps else Repeat.GO_ON
-
-
-def trapped_nodes(state: SearchState) -> Indices:
-    """Positions of nodes that a kink of the model traps."""
-    return np.flatnonzero(state.node_damping > TRAPPING_DAMPING).astype(np.intp)
-
-
-@keeps_state
-def repeat_last_stage(state: SearchState) -> SearchState:
-    """Run the last stage again as `choose_repeat` says, and conclude.
-
-    Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
-    """
-    least_decrease = 0.5 * state.method.tolerance**2  # that of a step of so many deviations
-    count = min(REPEAT_ITERATIONS, state.stage.iterations)
-    for _ in range(MAX_REPEATS * state.stage.iterations // max(1, count)):
-        before, found = state, state.assess()
-        repeat = choose_repeat(state, found)
-        if repeat is Repeat.STOP:
-            return state.conclude(found)
-        state = free_nodes(state, trapped_nodes(state)) if repeat is Repeat.FREE_NODES else iterate(state, count)
-        has_settled = moved_deviations(state, before.iterate.z) <= state.method.tolerance
-        if has_settled:
-            settled = MAX_NOISY_STEP if state.noisy_gaps else MAX_SETTLED_STEP
-            state = replace(state, tolerance=max(state.tolerance, settled))
-        is_lost = state.noisy_gaps and not has_settled  # a kink that it creeps over would take hundreds of steps
-        if is_lost or before.iterate.cost - state.iterate.cost < least_decrease:
-            break
-    return state.conclude()
-
-
-@keeps_state
-def free_nodes(state: SearchState, trapped: Indices) -> SearchState:
-    """Run the last stage from where trapped nodes are put to the ends of the segments before them, if that helps.
-
-    Parameters
-    ----------
-    state : SearchState
-    trapped : ndarray of int
-        Positions of nodes.
-
-    Returns
-    -------
-    SearchState
-        The given one, with the iterations of the trial, unless the cost falls.
-    """
-    nodes, behind = state.iterate.nodes.copy(), trapped[trapped > 0]
-    nodes[behind] += state.iterate.equations.gaps[behind - 1] * state.segments.nominal
-    freed = iterate(
-        replace(state.at(nodes, state.iterate.z), node_damping=np.zeros(len(nodes))), state.stage.iterations
-    )
-    return freed if freed.iterate.cost < state.iterate.cost else state.resumed_after(freed)
-
-
-def choose_finer_steps(state: SearchState) -> int:
-    """The steps a sample that show what the integration still changes at an optimum; 0 where none are to be tried.
-
-    They are half as long; as long as they are where those that the last stage has taken have moved no estimate, for
-    still finer ones would move it less, and where the user gave the steps.
-    """
-    if state.end is not SearchEnd.OPTIMUM or not state.method.checks_steps:
-        return 0
-    return (1 if state.method.substeps or steps_are_fine(state) else 2) * state.output_substeps
-
-
-def steps_are_fine(state: SearchState) -> bool:
-    """Whether the finer steps of the last stage have moved no estimate."""
-    return state.correction is not None and state.moves_no_estimate(state.correction.y)
-
-
 @keeps_state
 def refine_steps(state: SearchState) -> SearchState:
     """Halve the integration steps of an optimum until no estimate moves; steps that the user gave stay."""
@@ -1293,14 +982,248 @@ def refine_steps(state: SearchState) -> SearchState:
     return state
 
 
-def moved_deviations(state: SearchState, z: Array) -> float:
-    """How far the parameters have moved from z, at most [standard deviations]; infinite where one has none."""
-    equations, current = state.iterate.equations, state.iterate.z
+def choose_finer_steps(state: SearchState) -> int:
+    """The steps a sample that show what the integration still changes at an optimum; 0 where none are to be tried.
+
+    They are half as long; as long as they are where those that the last stage has taken have moved no estimate, for
+    still finer ones would move it less, and where the user gave the steps.
+    """
+    if state.end is not SearchEnd.OPTIMUM or not state.method.checks_steps:
+        return 0
+    return (1 if state.method.substeps or steps_are_fine(state) else 2) * state.output_substeps
+
+
+def steps_are_fine(state: SearchState) -> bool:
+    """Whether the finer steps of the last stage have moved no estimate."""
+    return state.correction is not None and state.moves_no_estimate(state.correction.y)
+
+
+IsNegligible = Callable[[Iterate, ReducedEquations, GaussNewtonStep], bool]
+
+
+class LevenbergMarquardt:
+    """Levenberg-Marquardt steps on one objective."""
+
+    def __init__(self, objective: Objective, damping: float, is_negligible: IsNegligible) -> None:
+        self.damps_nodes, self.promised = False, math.inf
+        self.objective, self.damping, self._is_negligible = objective, damping, is_negligible
+        self.node_damping = np.zeros(objective.segments.count)
+
+    def step(self, current: Iterate) -> Iterate | None:
+        """The next iterate; None if no damping lowers the cost, or the step would be negligible.
+
+        After the first try the damping rises only at the nodes that have overshot, if there are any.
+        """
+        raise_by, scaling = 10.0, self.objective.scaling
+        for k in range(MAX_TRIES):
+            reduced = current.equations.arrow.eliminate(self.damping, self.node_damping)
+            step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
+            if k == 0 and step:
+                self.promised = 0.5 * current.equations.arrow.descent_rate(step)
+            if reduced and step and np.max(np.abs(step.parameters[scaling.log]), initial=0.0) <= MAX_LOG_CHANGE:
+                is_hardly_damped = self.damping <= INITIAL_DAMPING and (k == 0 or (k == 1 and self.node_damping.any()))
+                if is_hardly_damped and self._is_negligible(current, reduced, step):
+                    break
+                trial = self._trial(current, reduced, step)
+                is_lower = trial.cost < current.cost
+                if self.damps_nodes and (not is_lower or self.node_damping.any()):
+                    self.node_damping = self._missed_curvature(current, trial)
+                if is_lower:
+                    self.damping = self.damping * 0.1 if self.damping > MIN_DAMPING else 0.0
+                    return trial
+                if k == 0 and self.node_damping.any():
+                    continue
+            self.damping, raise_by = max(self.damping, MIN_DAMPING) * raise_by, 3 * raise_by
+        return None
+
+    def undamped_steps(self, current: Iterate) -> tuple[Iterate, int]:
+        """Take undamped steps, which may raise the cost for a while: the best iterate among them, and their number.
+
+        Over a kink of the model, at which a descent creeps, this is the way (the watchdog technique: Chamberlain et
+        al., Mathematical Programming Study 16, 1982).
+        """
+        trial: Iterate | None = current
+        best, taken = current, 0
+        while trial is not None and math.isfinite(trial.cost) and taken < MAX_UNDAMPED_STEPS:
+            best, trial = min(best, trial, key=lambda each: each.cost), self._step_undamped(trial)
+            taken += trial is not None
+        return best if trial is None else min(best, trial, key=lambda each: each.cost), taken
+
+    def _step_undamped(self, current: Iterate) -> Iterate | None:
+        """The iterate after an undamped step, whatever its cost; None without one, or where it would be negligible."""
+        reduced, scaling = current.equations.arrow.eliminate(0.0), self.objective.scaling
+        step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
+        if not reduced or not step or self._is_negligible(current, reduced, step):
+            return None
+        z = scaling.project_to_bounds(current.z + step.parameters)
+        shift = reduced.back_substitute(z - current.z)
+        return self.objective.evaluate(current.nodes + shift * self.objective.segments.nominal, z)
+
+    def _trial(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> Iterate:
+        """The iterate after a step; where its gaps let the cost fall too little, with the nodes settled.
+
+        Tight gaps make a narrow valley of what the parameters and the whole trajectory do together, and its bend turns
+        a long step into gaps. A Gauss-Newton step of the nodes alone, from the trial's own derivatives, closes them
+        again without the log being left, as shooting on from the first node would.
+        """
+        z = self.objective.scaling.project_to_bounds(current.z + step.parameters)
+        moved = z - current.z
+        shift = reduced.back_substitute(moved)  # a bound may have cut the parameters' step short
+        trial = self.objective.evaluate(current.nodes + shift * self.objective.segments.nominal, z)
+        promised = 0.5 * current.equations.arrow.descent_rate(GaussNewtonStep(shift, moved))
+        for _ in range(MAX_NODE_STEPS):
+            by_data = 0.5 * (trial.equations.chi_square - current.equations.chi_square)
+            misses_by_gaps = math.isfinite(trial.cost) and trial.cost - current.cost > 2 * by_data
+            if current.cost - trial.cost >= MIN_GAIN_RATIO * promised or not misses_by_gaps:
+                break
+            settled = self._settle_nodes(trial, current.cost)
+            if settled is None or not settled.cost < trial.cost:
+                break
+            trial = settled
+        return trial
+
+    def _settle_nodes(self, trial: Iterate, cost: float) -> Iterate | None:
+        """A trial after a step of its nodes alone; None where that does not promise less than a cost."""
+        arrow = trial.equations.arrow
+        shift = arrow.node_step(self.damping + self.node_damping)
+        if shift is None or trial.cost - 0.5 * arrow.descent_rate(GaussNewtonStep(shift, 0.0 * trial.z)) >= cost:
+            return None
+        return self.objective.evaluate(trial.nodes + shift * self.objective.segments.nominal, trial.z)
+
+    def _missed_curvature(self, current: Iterate, trial: Iterate) -> Array:
+        """The curvature that a trial shows and the model has missed, by node; none of a trial that is not finite."""
+        if not math.isfinite(trial.cost):
+            return np.zeros(len(current.nodes))
+        step, moved = (trial.nodes - current.nodes) / self.objective.segments.nominal, trial.z - current.z
+        return missed_curvature(current.equations, step, moved, trial.equations, self.objective.sigma)
+
+
+def assess_convergence(
+    equations: NormalEquations, space: ParameterScaling, z: Array, tolerance: float, message: str, *, noisy_gaps: bool
+) -> ConvergenceTest:
+    """Test an iterate: converged means that a full undamped step would move no parameter noticeably.
+
+    `tolerance` is the largest step of a converged iterate [standard deviations], `message` its status's first sentence.
+    """
+    names = np.array(equations.segments.transcription.parameters.free_names, dtype=object)
+    no_sensitivity = np.diag(equations.arrow.corner) == 0  # even at a bound
+    idle = ~space.fixed & ~space.has_effect(equations) & (no_sensitivity | ~space.at_bound(z))
+    if idle.any():
+        sentences = f"the data do not depend on {' and '.join(names[idle])}", "fix it, or log a run that does"
+        return ConvergenceTest(Status(Code.NOT_CONVERGED, sentences), np.flatnonzero(idle))
     reduced = equations.arrow.eliminate(0.0)
     if reduced is None:
+        return ConvergenceTest(
+            Status(Code.NOT_CONVERGED, ("the data do not determine the states", "log another output"))
+        )
+    keep = space.movable(z, equations, reduced)
+    own = np.flatnonzero(keep)
+    alike, solved = own[equations.unidentifiable_parameters(reduced, keep)], reduced.step(keep)
+    noise = max(1.0, math.sqrt(equations.chi_square / max(1, equations.count)))
+    if alike.size or solved is None:
+        verdict = f"the data do not determine {' and '.join(names[np.sort(alike)])}"
+        status = Status(Code.NOT_CONVERGED, (verdict, "fix one, or log a run that separates them"))
+        weakest = _least_sensitive(own, space, reduced, noise, z)
+        return ConvergenceTest(status, weakest if weakest.size else alike[-1:])
+    spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
+    step = np.abs(solved.parameters[keep]) / (noise * spread)
+    if np.max(step, initial=0.0) > tolerance:
+        worst = int(np.argmax(step))
+        verdict = f"{names[keep][worst]} would still move by {step[worst]:.2g} standard deviations"
+        remedy = "try more iterations, other start values, or fix a parameter"
+        status = Status(Code.NOT_CONVERGED, (verdict, remedy))
+        return ConvergenceTest(status, _least_certain(own, noise * spread, space, z), own[[worst]])
+    bounded = np.flatnonzero(space.at_bound(z) & ~space.fixed)
+    return ConvergenceTest(
+        _optimum_status(equations, message, noisy_gaps=noisy_gaps),
+        _least_sensitive(bounded, space, reduced, noise, z),
+        largest_step=float(np.max(step, initial=0.0)),
+    )
+
+
+def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: bool) -> Status:
+    """The status of an optimum: converged, unless its gaps absorb the misfit of the model."""
+    gap, misfit = equations.largest_gap, 2 * equations.cost / max(1, equations.count)
+    if equations.gap_share > MAX_GAP_SHARE and not (noisy_gaps and misfit <= MAX_CHI_SQUARE_RATIO):
+        verdict = f"the gaps between segments carry {equations.gap_share:.0%} of the cost"
+        detail = f"the largest is {gap:.1g} of a state's nominal size: the model cannot follow the log"
+        return Status(Code.NOT_CONVERGED, (verdict, detail, "check its terms, inputs and units"))
+    verdict = f"{message}, largest gap {gap:.1g} of a state's nominal size"
+    misfit_sentences = describe_misfit(equations, MAX_CHI_SQUARE_RATIO, noisy_gaps=noisy_gaps)
+    return Status(Code.CONVERGED, (verdict, *misfit_sentences))
+
+
+def _least_sensitive(
+    positions: Indices, space: ParameterScaling, reduced: ReducedEquations, noise: float, z: Array
+) -> Indices:
+    """The position of the parameter with the least effect on the data, the others known; none if a prior is vaguer."""
+    return _least_certain(positions, noise / np.sqrt(np.maximum(np.diag(reduced.schur)[positions], 1e-300)), space, z)
+
+
+def _least_certain(positions: Indices, spread: Array, space: ParameterScaling, z: Array) -> Indices:
+    """The position of the least certain parameter, if a weak prior would be more certain; or none.
+
+    A linear parameter is as large as the larger of its start and its value here: a start near zero tells no size.
+    """
+    larger = np.where(np.abs(z) > np.abs(space.start), z, space.start)
+    share = spread / space.weak_prior(larger)[positions]
+    if not share.size or not share.max() > UNIDENTIFIABLE_PRIOR_RATIO:
+        return NO_POSITIONS
+    return positions[[int(np.argmax(share))]]
+
+
+def largest_parameter_step(equations: NormalEquations, keep: Mask, reduced: ReducedEquations, step: Array) -> float:
+    """The largest step of a kept parameter, of shape (k,) in all, in its standard deviations.
+
+    It is infinite where the data do not determine all of them.
+    """
+    if equations.unidentifiable_parameters(reduced, keep).size:
         return math.inf
-    keep = state.setup.scaling.movable(current, equations, reduced)
-    return largest_parameter_step(equations, keep, reduced, current - z)
+    spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
+    return float(np.max(np.abs(step[keep]) / spread, initial=0.0))
+
+
+def is_noise_cost(cost: float, count: int) -> bool:
+    """Whether this cost is that of the noise alone in so many residuals."""
+    return 2 * cost <= MAX_CHI_SQUARE_RATIO * count
+
+
+def end_search(state: SearchState, seconds: float) -> Fit:
+    """The fit where a search has ended, after so many seconds."""
+    transcription, scaling = state.segments.transcription, state.setup.scaling
+    current, equations, free = state.iterate, state.iterate.equations, transcription.parameters.free_names
+    q, run, fixed = scaling.values(current.z), _final_run(state), scaling.fixed
+    at_bound = scaling.at_bound(current.z) & ~fixed
+    keep = scaling.has_effect(equations) & ~at_bound & ~fixed
+    covariance, prior, optimum, found = None, None, None, ConvergenceTest(state.status)
+    if math.isfinite(equations.cost):
+        covariance = equations.covariance(keep, noisy_gaps=state.noisy_gaps)
+        if covariance is not None and state.tolerance > state.method.tolerance:
+            covariance = covariance + unsettled_covariance(state)
+        if fixed.any():
+            prior = equations.prior_covariance(keep, fixed, scaling.weak_prior(current.z))
+        if not (state.setup.is_too_stiff or state.end in (SearchEnd.ABANDONED, SearchEnd.DUPLICATE)):
+            found = state.assess()
+    if covariance is not None:
+        optimum = Optimum(equations, run, current.nodes, q, keep, state.gap_deviations, state.substeps)
+    ended = [(stage.gap, end.cost) for stage, end in zip(state.method.stages, state.stage_ends, strict=False)]
+    return Fit(
+        state.segments.trajectories(run),
+        transcription.parameters.with_values(dict(zip(free, q[transcription.free].tolist(), strict=True))),
+        state.status,
+        state.end or SearchEnd.UNSETTLED,
+        _stats(state, run, seconds),
+        covariance,
+        equations.chi_square,
+        equations.count,
+        at_bound,
+        equations.gaps[state.segments.linked] if state.noisy_gaps else None,
+        tuple(free[i] for i in found.unidentifiable),
+        tuple(free[i] for i in found.unsettled),
+        prior,
+        optimum=optimum,
+        stage_costs=(*ended[FIRST_JOINING_STAGE:], (state.stage.gap, state.cost)),
+    )
 
 
 def unsettled_covariance(state: SearchState) -> Array:
@@ -1311,133 +1234,6 @@ def unsettled_covariance(state: SearchState) -> Array:
     if solved is not None:
         asked = equations.linearisation.chain * solved.parameters
     return np.outer(asked, asked)
-
-
-def is_negligible_step(state: SearchState, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
-    """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
-
-    The states of noisy gaps estimate that noise, and settle long after the parameters, whose step then counts; so it
-    does where the model misses the logs and the search is slow: the deviations are then those of the residuals, near
-    such an optimum Gauss-Newton steps go to and fro for long, and what is far below a deviation is far below the bias,
-    too. Where no parameter is free, the states are what is asked for.
-
-    Parameters
-    ----------
-    state : SearchState
-    current : Iterate
-    reduced : ReducedEquations
-    step : GaussNewtonStep
-
-    Returns
-    -------
-    bool
-    """
-    promised, equations = 0.5 * current.equations.arrow.descent_rate(step), current.equations
-    is_last, misfit = state.stage.gap <= state.method.stages[-1].gap, max(1.0, 2 * current.cost / equations.count)
-    if not (state.noisy_gaps or is_last):
-        is_first = state.stage is state.method.stages[0] and is_noise_cost(current.cost, equations.count)
-        return promised < (JUMP_COST_TOLERANCE if is_first else STAGE_COST_TOLERANCE) * current.cost
-    if is_last and promised < FINAL_COST_TOLERANCE * misfit:
-        return True
-    is_slow = state.iterations - state.stage_began >= PATIENT_ITERATIONS
-    is_wrong = is_last and is_slow and misfit > MAX_CHI_SQUARE_RATIO
-    asks_parameters = bool(state.segments.transcription.parameters.free_names)
-    is_settled = asks_parameters and (state.is_coarse or is_wrong or promised < SETTLED_COST_DECREASE * misfit)
-    if not ((is_settled or state.noisy_gaps) and promised < STAGE_COST_TOLERANCE * current.cost):
-        return False
-    keep = state.setup.scaling.movable(current.z, equations, reduced)
-    largest = largest_parameter_step(equations, keep, reduced, step.parameters) / state.method.tolerance
-    if is_wrong:
-        return largest < MISFIT_TOLERANCE * math.sqrt(max(1.0, equations.chi_square / max(1, equations.count)))
-    return largest < (COARSE_TOLERANCE if state.is_coarse else FINE_TOLERANCE)
-
-
-def creeps(state: SearchState, before: float, promised: float) -> bool:
-    """Whether a step of a search with noise of the states has fallen far short of its promise, and changed little.
-
-    Parameters
-    ----------
-    state : SearchState
-        After the step.
-    before : float
-        Cost before it.
-    promised : float
-        Decrease of the cost that it has promised.
-
-    Returns
-    -------
-    bool
-    """
-    return state.noisy_gaps and before - state.iterate.cost < min(
-        CREEPING_SHARE * promised, STAGE_COST_TOLERANCE * before
-    )
-
-
-def describe_iteration(state: SearchState) -> str:
-    """A line of progress: the stage, the iteration, the cost and the largest gap."""
-    stages = state.method.stages
-    number = "loosened" if state.noisy_gaps else f"stage {stages.index(state.stage) + 1}/{len(stages)}"
-    return (
-        f"{number}  iteration {state.iterations}  cost {state.cost:.6g}  "
-        f"largest gap {state.iterate.equations.largest_gap:.1e}"
-    )
-
-
-def joins_known_search(state: SearchState) -> bool:
-    """Whether a search has come to where a known one was after the same stage, and would go on as that one."""
-    known = [cost for gap, cost in state.method.known_costs if gap == state.stage.gap]
-    return any(abs(state.cost - cost) <= JOINED_COST_TOLERANCE * cost for cost in known)
-
-
-def end_search(state: SearchState, seconds: float) -> Fit:
-    """The fit where a search has ended.
-
-    Parameters
-    ----------
-    state : SearchState
-        With an end.
-    seconds : float
-        That it has taken.
-
-    Returns
-    -------
-    Fit
-    """
-    transcription, current, equations = state.segments.transcription, state.iterate, state.iterate.equations
-    q = state.setup.scaling.values(current.z)
-    free = transcription.parameters.free_names
-    values = dict(zip(free, q[transcription.free].tolist(), strict=True))
-    run = _final_run(state)
-    at_bound, fixed = state.setup.scaling.at_bound(current.z) & ~state.setup.scaling.fixed, state.setup.scaling.fixed
-    keep = state.setup.scaling.has_effect(equations) & ~at_bound & ~fixed
-    covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
-    if math.isfinite(equations.cost):
-        covariance = equations.covariance(keep, noisy_gaps=state.noisy_gaps)
-        if covariance is not None and state.tolerance > state.method.tolerance:
-            covariance = covariance + unsettled_covariance(state)
-        prior = (
-            equations.prior_covariance(keep, fixed, state.setup.scaling.weak_prior(current.z)) if fixed.any() else None
-        )
-        names = names if state.end in (SearchEnd.ABANDONED, SearchEnd.DUPLICATE) else _doubtful_parameters(state)
-    if covariance is not None:
-        gaps = state.stage.gap * state.setup.gap_scales
-        optimum = Optimum(equations, run, current.nodes, q, keep, gaps, state.substeps)
-    return Fit(
-        state.segments.trajectories(run),
-        transcription.parameters.with_values(values),
-        state.status,
-        state.end or SearchEnd.UNSETTLED,
-        _stats(state, run, seconds),
-        covariance,
-        equations.chi_square,
-        equations.count,
-        at_bound,
-        equations.gaps[state.segments.linked] if state.noisy_gaps else None,
-        *names,
-        prior,
-        optimum=optimum,
-        stage_costs=_stage_costs(state),
-    )
 
 
 def _final_run(state: SearchState) -> RolloutResult:
@@ -1464,20 +1260,6 @@ def _stats(state: SearchState, run: RolloutResult, seconds: float) -> dict[str, 
     }
 
 
-def _stage_costs(state: SearchState) -> tuple[tuple[float, float], ...]:
-    """The gap and the cost of stages at their ends, and those of the search's end."""
-    ended = [(stage.gap, end.cost) for stage, end in zip(state.method.stages, state.stage_ends, strict=False)]
-    return (*ended[FIRST_JOINING_STAGE:], (state.stage.gap, state.cost))
-
-
-def _doubtful_parameters(state: SearchState) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The parameters that the data do not determine, and the one that has not settled; none of a refused start."""
-    if state.setup.is_too_stiff:
-        return (), ()
-    free, found = state.segments.transcription.parameters.free_names, state.assess()
-    return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)
-
-
 def _integration_error(state: SearchState, run: RolloutResult) -> float:
     """Largest change of an output when the steps are halved [noise standard deviations].
 
@@ -1493,21 +1275,14 @@ def _integration_error(state: SearchState, run: RolloutResult) -> float:
 
 
 def close_gaps(optimum: Optimum) -> Array | None:
-    """The outputs of a fit's run without gaps between linked segments, shape (m, n, n_outputs).
+    """The outputs (m, n, n_outputs) of a fit's run without gaps between linked segments.
 
-    Parameters
-    ----------
-    optimum : Optimum
-
-    Returns
-    -------
-    ndarray or None
-        None where the gaps do not close in a few steps, as those of a model that runs away from its log.
+    None where the gaps do not close in a few steps, as those of a model that runs away from its log.
     """
     segments, linear = optimum.equations.segments, optimum.equations.linearisation
     slopes = np.where(segments.linked[:, None, None], linear.end_sensitivities[:, :, : optimum.nodes.shape[1]], 0.0)
     nodes, y, x_end = optimum.nodes, optimum.run.y, optimum.run.x_end
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_NODE_STEPS):
         with np.errstate(all="ignore"):  # a run that leaves the model's range has no number, and is not taken
             shift = propagate_shifts(slopes, segment_gaps(segments, nodes, x_end))
             if not np.abs(shift).max(initial=0.0) > MAX_SHIFT:

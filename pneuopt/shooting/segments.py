@@ -1,4 +1,7 @@
-"""`Segments`: a transcription as one batch of compiled segments of all phases, with sensitivities."""
+"""`Segments`: a transcription as one batch of compiled segments of all phases, with sensitivities.
+
+`segment` cuts it, `start_nodes` and `gap_scales` are what a search begins with, `choose_integration` names its steps.
+"""
 
 import functools
 import itertools
@@ -31,7 +34,7 @@ from pneuopt.shooting.tolerances import (
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription
 
 
-class Block(NamedTuple):
+class SegmentBlock(NamedTuple):
     """Segments in a row that share their unknowns: sensitivity column `columns[i]` is free parameter `unknowns[i]`."""
 
     rows: slice
@@ -41,56 +44,34 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class IntegrationCorrection:
-    """The change of a run by finer integration steps.
+    """The change of a run by finer integration steps."""
 
-    Attributes
-    ----------
-    y : ndarray, shape (m, n, n_outputs)
-    x_end : ndarray, shape (m, n_states)
-    fine_run : RolloutResult
-        The run with the finer steps.
-    """
-
-    y: Array
-    x_end: Array
-    fine_run: RolloutResult
+    y: Array  # (m, n, n_outputs)
+    x_end: Array  # (m, n_states)
+    fine_run: RolloutResult  # the run with the finer steps
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """All segments of a transcription, padded to one length of n samples (a padded sample has h = 0 and no data).
-
-    Attributes
-    ----------
-    transcription : Transcription
-    t, h : ndarray, shape (m, n)
-    inputs : ndarray, shape (m, n, n_inputs)
-    measured, noise : ndarray, shape (m, n, n_outputs)
-        NaN where nothing was measured.
-    parameter_positions : ndarray of int, shape (m, n_system_parameters)
-        Positions of each segment's parameter vector among the problem's parameters.
-    linked : ndarray of bool, shape (m,)
-        Whether the next segment continues this one.
-    fixed_start : ndarray, shape (m, n_states)
-        The known start state; NaN where the node is an unknown. A state on which no measured output depends (the
-        position under a logged speed) is held at its guess there.
-    phase, lengths : ndarray of int, shape (m,)
-        The phase of each segment, and its samples without padding.
-    implicit_state : int, optional
-        Position of the state in which the integration is implicit; None: all is explicit (RK4).
-    """
+    """All segments of a transcription, padded to one length of n samples (a padded sample has h = 0 and no data)."""
 
     transcription: Transcription
-    t: Array
-    h: Array
-    inputs: Array
+    t: Array  # (m, n)
+    h: Array  # (m, n)
+    inputs: Array  # (m, n, n_inputs)
+    # measured, noise (m, n, n_outputs): NaN where nothing was measured
     measured: Array
     noise: Array
+    # (m, n_system_parameters): positions of each segment's parameter vector among the problem's parameters
     parameter_positions: Indices
-    linked: Mask
+    linked: Mask  # (m,): whether the next segment continues this one
+    # (m, n_states): the known start state; NaN where the node is an unknown. A state on which no measured output
+    # depends (the position under a logged speed) is held at its guess there.
     fixed_start: Array
+    # phase, lengths (m,): the phase of each segment, and its samples without padding
     phase: Indices
     lengths: Indices
+    # position of the state in which the integration is implicit; None: all is explicit (RK4)
     implicit_state: int | None = None
 
     @property
@@ -122,13 +103,13 @@ class Segments:
         return np.asarray(index[self.parameter_positions[:, self.columns]])
 
     @cached_property
-    def blocks(self) -> tuple[Block, ...]:
+    def blocks(self) -> tuple[SegmentBlock, ...]:
         """All segments, in their order, by what is unknown in them."""
         changes = np.flatnonzero(np.diff(self.unknowns, axis=0).any(axis=1)) + 1
         edges, out = [0, *changes.tolist(), self.count], []
         for a, b in itertools.pairwise(edges):
             columns = np.flatnonzero(self.unknowns[a] >= 0)
-            out.append(Block(slice(a, b), columns, self.unknowns[a, columns]))
+            out.append(SegmentBlock(slice(a, b), columns, self.unknowns[a, columns]))
         return tuple(out)
 
     @cached_property
@@ -198,13 +179,7 @@ class Segments:
 
 
 def segment(transcription: Transcription) -> Segments:
-    """Cut a transcription into its segments.
-
-    Raises
-    ------
-    ModelError
-        For a free duration, which the compiled segments do not take.
-    """
+    """Cut a transcription into its segments; `ModelError` for a free duration, which compiled segments do not take."""
     system = transcription.system
     length = max(int(np.diff(np.append(p.nodes, p.n)).max()) for p in transcription.phases)
     measured = {r.phase: _measurements(r, system, transcription.phases[r.phase]) for r in transcription.residuals}
@@ -219,118 +194,13 @@ def segment(transcription: Transcription) -> Segments:
     for i, phase in enumerate(transcription.phases[1:], 1):
         linked[np.flatnonzero(index == i)[0] - 1] = phase.follows
     nodes = np.concatenate([phase.nodes for phase in transcription.phases])
-    _fix_unobservable_states(transcription, start, np.flatnonzero(np.append(True, ~linked[:-1])), index, nodes)
-    return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
-
-
-def start_nodes(segments: Segments) -> Array:
-    """States at the nodes from the phases' guesses (zero without one), shape (m, n_states)."""
-    states = len(segments.system.states)
-    parts = []
-    for phase in segments.transcription.phases:
-        guess = np.zeros((phase.n, states)) if phase.guess is None else phase.guess
-        parts.append(guess[phase.nodes])
-    nodes = np.concatenate(parts)
-    return np.where(np.isfinite(segments.fixed_start), segments.fixed_start, nodes)
-
-
-def gap_scales(segments: Segments, kinematic: float) -> Array:
-    """Factor on each state's gaps: `kinematic` where its rate holds no free parameter, else 1."""
-    slope, symbols = _state_rate(segments.system)
-    free = symbols["p"][segments.columns.tolist()]
-    depends = [any(ca.which_depends(slope[i], free, 1, True)) for i in range(slope.numel())]
-    return np.where(depends, 1.0, kinematic)
-
-
-def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
-    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78.
-
-    The stiffness is taken at nodes all along the start and at the extremes of every state and input; the result is
-    `SUBSTEPS_CAP` at most, for a start may be absurd.
-    """
-    return substeps_for(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
-
-
-def substeps_for(segments: Segments, rate: float, step: float) -> int:
-    """Integration steps a sample that keep h times a rate [1/s] within `step`, `SUBSTEPS_CAP` at most."""
-    return min(max(1, math.ceil(float(segments.h.max()) * rate / step)), SUBSTEPS_CAP)
-
-
-def largest_rate(jacobians: Array) -> float:
-    """The largest eigenvalue of matrices of shape (k, n, n), by its absolute value [1/s]."""
-    return float(np.abs(np.linalg.eigvals(jacobians)).max(initial=0.0))
-
-
-def stiffness_jacobians(segments: Segments, nodes: Array, q: Array, speeds: tuple[int, Array] | None = None) -> Array:
-    """d(xdot)/dx at nodes all along, at the extremes of every state and input, and at rest there, where it is finite.
-
-    Parameters
-    ----------
-    segments : Segments
-    nodes : ndarray, shape (m, n)
-    q : ndarray
-        The problem's parameter values.
-    speeds : tuple of int and ndarray, optional
-        A state and values that it takes at each of these points, in place of its own and of rest.
-
-    Returns
-    -------
-    ndarray, shape (k, n, n)
-    """
-    m, n = nodes.shape
-    given = np.concatenate([nodes, segments.inputs[:, 0]], axis=1)
-    even = np.linspace(0, m - 1, min(m, MAX_STIFFNESS_NODES)).astype(int)
-    rows = np.unique(np.concatenate([even, given.argmin(axis=0), given.argmax(axis=0)]))
-    # the regularised friction is stiffest at rest, which a node may just miss
-    points = np.concatenate([nodes[rows], nodes[rows] * 0])
-    if speeds is not None:
-        points = np.tile(nodes[rows], (len(speeds[1]), 1))
-        points[:, speeds[0]] = np.repeat(speeds[1], len(rows))
-    p, u, t = (
-        np.concatenate([a] * (len(points) // len(rows)))
-        for a in (q[segments.parameter_positions[rows]], segments.inputs[rows, 0], segments.t[rows, 0])
-    )
-    J = np.array(segments.jacobian.map(len(t))(t[None], points.T, u.T, p.T)).reshape(n, -1, n).transpose(1, 0, 2)
-    return np.asarray(J[np.isfinite(J).all(axis=(1, 2))])
-
-
-@functools.lru_cache(maxsize=64)
-def _rate_jacobian(system: DiscreteSystem) -> ca.Function:
-    slope, s = _state_rate(system)
-    return ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
-
-
-@functools.lru_cache(maxsize=64)
-def _state_rate(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
-    """The rate f(t, x, u, p) behind a step: d(x_next)/dh at h = 0, exact and with f's own sparsity; and its symbols."""
-    symbols = {n: ca.SX.sym(n, system.step.size1_in(i)) for i, n in enumerate(("t", "h", "x", "u", "p"))}
-    x_next = system.step(*symbols.values())[0]
-    return ca.substitute(ca.jacobian(x_next, symbols["h"]), symbols["h"], ca.SX(0)), symbols
-
-
-def _fix_unobservable_states(
-    transcription: Transcription, start: Array, heads: Indices, index: Indices, nodes: Indices
-) -> None:
-    """Hold unobservable states at their guess, at the head of each run of linked segments (changes `start`)."""
-    for head, stop in zip(heads, [*heads[1:], len(index)], strict=True):
+    heads = np.flatnonzero(np.append(True, ~linked[:-1]))
+    for head, stop in zip(heads, [*heads[1:], len(index)], strict=True):  # states that no log shows keep their guess
         guess = transcription.phases[index[head]].guess
-        measured = {o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs}
-        idle = ~_observable_states(transcription.system, measured) & np.isnan(start[head])
+        outputs = {o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs}
+        idle = ~_observable_states(system, outputs) & np.isnan(start[head])
         start[head, idle] = 0.0 if guess is None else guess[nodes[head], idle]
-
-
-def _observable_states(system: DiscreteSystem, outputs: set[str]) -> Mask:
-    """The states on which these outputs depend, directly or through other states' rates. Shape (n_states,)."""
-    if system.update is not None or not system.states:
-        return np.ones(len(system.states), dtype=bool)
-    slope, s = _state_rate(system)
-    rows = [i for i, name in enumerate(names(system.outputs)) if name in outputs]
-    measured = system.step(*s.values())[1][rows]
-    reads, affected = (np.array(ca.DM(ca.jacobian_sparsity(f, s["x"]), 1)) > 0 for f in (slope, measured))
-    affected = np.asarray(affected.any(axis=0))
-    for _ in system.states:
-        affected |= reads[affected].any(axis=0)
-    return np.asarray(affected)
+    return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
 
 
 def _measurements(residuals: Residuals, system: DiscreteSystem, phase: Phase) -> tuple[Array, Array]:
@@ -370,27 +240,43 @@ def _cut_phase(
     )
 
 
+def _observable_states(system: DiscreteSystem, outputs: set[str]) -> Mask:
+    """The states on which these outputs depend, directly or through other states' rates. Shape (n_states,)."""
+    if system.update is not None or not system.states:
+        return np.ones(len(system.states), dtype=bool)
+    slope, s = _state_rate(system)
+    rows = [i for i, name in enumerate(names(system.outputs)) if name in outputs]
+    measured = system.step(*s.values())[1][rows]
+    reads, affected = (np.array(ca.DM(ca.jacobian_sparsity(f, s["x"]), 1)) > 0 for f in (slope, measured))
+    affected = np.asarray(affected.any(axis=0))
+    for _ in system.states:
+        affected |= reads[affected].any(axis=0)
+    return np.asarray(affected)
+
+
+def start_nodes(segments: Segments) -> Array:
+    """States at the nodes from the phases' guesses (zero without one), shape (m, n_states)."""
+    states = len(segments.system.states)
+    parts = []
+    for phase in segments.transcription.phases:
+        guess = np.zeros((phase.n, states)) if phase.guess is None else phase.guess
+        parts.append(guess[phase.nodes])
+    nodes = np.concatenate(parts)
+    return np.where(np.isfinite(segments.fixed_start), segments.fixed_start, nodes)
+
+
+def gap_scales(segments: Segments, kinematic: float) -> Array:
+    """Factor on each state's gaps: `kinematic` where its rate holds no free parameter, else 1."""
+    slope, symbols = _state_rate(segments.system)
+    free = symbols["p"][segments.columns.tolist()]
+    depends = [any(ca.which_depends(slope[i], free, 1, True)) for i in range(slope.numel())]
+    return np.where(depends, 1.0, kinematic)
+
+
 def choose_integration(
     segments: Segments, nodes: Array, values: Array, given: int | None = None
 ) -> tuple[Segments, int]:
-    """Choose how segments are integrated: by RK4, or implicitly in the state that makes RK4 slow.
-
-    Parameters
-    ----------
-    segments : Segments
-    nodes : ndarray, shape (m, n_states)
-    values : ndarray
-        All the problem's parameters.
-    given : int, optional
-        The steps a sample, where they are known.
-
-    Returns
-    -------
-    segments : Segments
-        The same, or a copy with another `implicit_state`.
-    steps : int
-        Integration steps a sample.
-    """
+    """Segments integrated by RK4, or implicitly in the state that makes RK4 slow; with steps (`given`) a sample."""
     state, steps = None, 1
     if nodes.shape[1]:
         jacobians = stiffness_jacobians(segments, nodes, values)
@@ -428,3 +314,58 @@ def _choose_implicit_state(
 def fine_steps(segments: Segments, steps: int, refine: int) -> int:
     """The steps a sample that correct the residuals of coarse ones; those implicit in a state are of lower order."""
     return steps * refine * (1 if segments.implicit_state is None else IMPLICIT_REFINEMENT)
+
+
+def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
+    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78.
+
+    The stiffness is taken at nodes all along the start and at the extremes of every state and input; the result is
+    `SUBSTEPS_CAP` at most, for a start may be absurd.
+    """
+    return substeps_for(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
+
+
+def substeps_for(segments: Segments, rate: float, step: float) -> int:
+    """Integration steps a sample that keep h times a rate [1/s] within `step`, `SUBSTEPS_CAP` at most."""
+    return min(max(1, math.ceil(float(segments.h.max()) * rate / step)), SUBSTEPS_CAP)
+
+
+def largest_rate(jacobians: Array) -> float:
+    """The largest eigenvalue of matrices of shape (k, n, n), by its absolute value [1/s]."""
+    return float(np.abs(np.linalg.eigvals(jacobians)).max(initial=0.0))
+
+
+def stiffness_jacobians(segments: Segments, nodes: Array, q: Array, speeds: tuple[int, Array] | None = None) -> Array:
+    """d(xdot)/dx (k, n, n) at nodes all along, at the extremes of every state and input, and at rest, if finite.
+
+    With `speeds`, a state and values of it, that state has these values at each point in place of its own and of rest.
+    """
+    m, n = nodes.shape
+    given = np.concatenate([nodes, segments.inputs[:, 0]], axis=1)
+    even = np.linspace(0, m - 1, min(m, MAX_STIFFNESS_NODES)).astype(int)
+    rows = np.unique(np.concatenate([even, given.argmin(axis=0), given.argmax(axis=0)]))
+    # the regularised friction is stiffest at rest, which a node may just miss
+    points = np.concatenate([nodes[rows], nodes[rows] * 0])
+    if speeds is not None:
+        points = np.tile(nodes[rows], (len(speeds[1]), 1))
+        points[:, speeds[0]] = np.repeat(speeds[1], len(rows))
+    p, u, t = (
+        np.concatenate([a] * (len(points) // len(rows)))
+        for a in (q[segments.parameter_positions[rows]], segments.inputs[rows, 0], segments.t[rows, 0])
+    )
+    J = np.array(segments.jacobian.map(len(t))(t[None], points.T, u.T, p.T)).reshape(n, -1, n).transpose(1, 0, 2)
+    return np.asarray(J[np.isfinite(J).all(axis=(1, 2))])
+
+
+@functools.lru_cache(maxsize=64)
+def _rate_jacobian(system: DiscreteSystem) -> ca.Function:
+    slope, s = _state_rate(system)
+    return ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
+
+
+@functools.lru_cache(maxsize=64)
+def _state_rate(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
+    """The rate f(t, x, u, p) behind a step: d(x_next)/dh at h = 0, exact and with f's own sparsity; and its symbols."""
+    symbols = {n: ca.SX.sym(n, system.step.size1_in(i)) for i, n in enumerate(("t", "h", "x", "u", "p"))}
+    x_next = system.step(*symbols.values())[0]
+    return ca.substitute(ca.jacobian(x_next, symbols["h"]), symbols["h"], ca.SX(0)), symbols

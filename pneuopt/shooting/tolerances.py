@@ -1,5 +1,6 @@
 """The numbers that decide in `shooting`, each with its unit and what it decides."""
 
+import math
 
 # Arrow
 
@@ -33,6 +34,7 @@ UNIDENTIFIABLE_PRIOR_RATIO = 1 / 3
 # standard deviation of the prior about a start, in e-folds: lower holds wrong guesses, higher lets what wide gaps hide
 # drift to where tight ones cannot tell it any more
 START_PRIOR_DEVIATION = 1.0
+WEAK_PRIOR_DEVIATION = math.log(10)  # of a weak prior, in e-folds: a factor of ten either way
 # squared residuals that an e-fold change of a log parameter has to move, or it has no effect: smaller searches in
 # rounding, larger holds what good data would show
 MIN_LOG_INFORMATION = 1e-6
@@ -56,9 +58,6 @@ ROBUST_SQUARES = 4.0
 DAMPINGS = (1e-2, 10**-0.75, 10**0.5, 10**1.75, 1e3)  # over the last one, tried side by side: wider spreads overshoot
 FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-6  # over the diagonal [1]: lower takes wild first steps, higher small ones
 GIVEN_UP_DAMPING = 10.0  # where no damping helps beyond it, a descent has ended; higher takes time
-MAX_STEP = (
-    1.0  # of a parameter as searched, over its size where it is no log parameter: longer leaves the model's range
-)
 SETTLED_DECREASE = 1e-4  # of the cost [1] at which a descent has ended: lower takes time, higher ends too early
 MAX_BATCH_NUMBERS = 4_000_000  # numbers of 8 bytes in a batch: more take memory, fewer time
 
@@ -92,23 +91,22 @@ MIN_DAMPING = 1e-15
 # actual over promised decrease [1] below which the nodes settle after a step: higher costs evaluations, lower crawls in
 # valleys
 MIN_GAIN_RATIO = 0.5
-# steps of the nodes alone after a step whose gaps miss its promise: fewer creep along the bend of a valley (bristles at
-# 60 s: .05 % an iteration), more follow nodes that do not settle
+# steps of the nodes alone that close gaps, after a step that misses its promise or for a run from end to end: fewer
+# creep along the bend of a valley (bristles at 60 s: .05 % an iteration), more follow nodes that do not settle
 MAX_NODE_STEPS = 3
 MAX_TRIES = 10  # dampings tried for a step: fewer give up where a step exists, more try what no longer moves anything
 # undamped steps over a kink: fewer turn back before the cost has fallen again, more follow steps that diverge
 MAX_UNDAMPED_STEPS = 10
-MAX_LOG_CHANGE = (
-    2.0  # e-folds of a log parameter in a step: longer ones leave the model's range, shorter ones take more
-)
+# e-folds of a log parameter in a step: longer ones leave the model's range, shorter ones take more
+MAX_LOG_CHANGE = 2.0
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
 # error of the parameters [standard deviations] by derivatives from before the integration was refined: higher shifts
 # estimates, lower costs a run with sensitivities
 MAX_GRADIENT_ERROR = 0.01
-# iterations of the last stage right after the first: more are lost where stages between are needed, fewer may not
-# converge
-JUMP_ITERATIONS = 10
+# iterations of the last stage right after the first, and of each of its repeats, at most: more are lost where stages
+# between are needed, and go on after a search has settled; fewer do not converge, and take a slow search for settled
+TRIAL_ITERATIONS = 10
 # squares that the last stage promises by the linearised equations, in noise variances [1], above which it is not tried
 # right after the first: lower passes over it for a start that is only not yet near, higher iterates for wrong models
 MAX_JUMP_MISFIT = 10.0
@@ -122,7 +120,6 @@ MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewe
 # times that the iterations of the last stage are repeated near the noise [1]: fewer leave a search over kinks (bristles
 # at rest) before its end, for other starts that take longer; more follow one that does not end
 MAX_REPEATS = 3
-REPEAT_ITERATIONS = 10  # of a repeat, at most: fewer take a slow search for settled, more go on after it has
 # decrease of the cost by an iteration, over itself [1], with which a search goes on that is not near the noise yet:
 # lower follows one that creeps, higher ends one that is about to come there
 STEEP_DECREASE = 0.1
@@ -134,10 +131,8 @@ MAX_SETTLED_STEP, MAX_NOISY_STEP = 0.5, 1.0
 # its equations ask: lower moves nodes that are only slow, higher leaves some behind
 TRAPPING_DAMPING = 1.0
 FIRST_JOINING_STAGE = 2  # stage from which two searches may join: before it the gaps are so wide that all cost alike
-# difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
-# one
-JOINED_COST_TOLERANCE = 1e-3
-# promised decrease over the cost [1] at which a stage ends: lower wastes iterations, higher ends it too early
+# promised decrease over the cost [1] at which a stage ends, so that searches which have joined differ by no more: lower
+# wastes iterations and follows one optimum twice, higher ends stages too early and takes two optima for one
 STAGE_COST_TOLERANCE = 1e-3
 # promised decrease at which the last stage ends, in noise variances: half of (0.1 % of a standard deviation)^2
 FINAL_COST_TOLERANCE = 5e-7
@@ -158,8 +153,6 @@ JUMP_COST_TOLERANCE = 1e-2
 # actual over promised decrease [1] below which a search with noise of the states creeps: higher leaves a fit that
 # converges, lower follows a kink of the model for hundreds of steps (encoder steps: 50 of .13 each, of 35 promised)
 CREEPING_SHARE = 0.3
-# Newton steps: fewer leave gaps that another would close, more cost as much as a run from end to end
-MAX_STEPS = 3
 # shift of a node that open gaps still cause, in nominal sizes: higher shows in the errors of the run, lower is rounding
 MAX_SHIFT = 1e-6
 

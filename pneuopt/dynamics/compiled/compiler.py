@@ -1,11 +1,9 @@
 """`compile_library`: C source compiled and loaded as a library, from the cache where it was compiled before.
 
-Compiled libraries kept on the disk. A file is loaded only if it is whole and this user's own: it runs as our code.
-
-A library is named by what it was made of (source, flags, compiler, CPU) and by the hash of its bytes, so that one that
-is damaged, cut or exchanged does not fit its name. Loading such a file ends the process (SIGBUS, SIGSEGV), or worse.
-
-`find_compiler`: the C compiler that is used, as a command, and the flags that it gets.
+First the compiler (`find_compiler`) and its flags, then compiling, then the cache (`cache_directory`, `find_library`).
+A file is loaded only if it is whole and this user's own: it runs as our code. It is named by what it was made of
+(source, flags, compiler, CPU) and by the hash of its bytes, so that one that is damaged, cut or exchanged does not fit
+its name. Loading such a file ends the process (SIGBUS, SIGSEGV), or worse.
 """
 
 import atexit
@@ -50,15 +48,9 @@ NO_COMPILER = (
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler.
+    """A C compiler."""
 
-    Parameters
-    ----------
-    command : tuple of str
-        The program, and the arguments that stand before all others.
-    """
-
-    command: tuple[str, ...]
+    command: tuple[str, ...]  # the program, and the arguments that stand before all others
 
     def __str__(self) -> str:
         return shlex.join(self.command)
@@ -86,9 +78,11 @@ def find_compiler() -> Compiler | None:
     found = _parse_command(os.environ.get("CC", ""))
     if found is not None:
         return found
-    on_path = (path for path in map(shutil.which, COMPILERS) if path and not _is_placeholder(path))
-    path = next(on_path, None)
-    return _packaged_compiler() if path is None else Compiler((path,))
+    for path in filter(None, map(shutil.which, COMPILERS)):
+        # macOS has such a gcc, clang and cc where Apple's tools are not, which only ask to install them
+        if not (sys.platform == "darwin" and path.startswith("/usr/bin/")) or _has_apple_tools():
+            return Compiler((path,))
+    return _packaged_compiler()
 
 
 def explain_missing_compiler() -> str:
@@ -109,11 +103,6 @@ def _parse_command(text: str) -> Compiler | None:
         return None
     program = shutil.which(words[0]) if words else None
     return None if program is None else Compiler((program, *words[1:]))
-
-
-def _is_placeholder(path: str) -> bool:
-    """Whether a program only asks to install Apple's tools: macOS has such a gcc, clang and cc where they are not."""
-    return sys.platform == "darwin" and path.startswith("/usr/bin/") and not _has_apple_tools()
 
 
 @functools.cache
@@ -153,12 +142,8 @@ logger = logging.getLogger("pneuopt")
 def compile_library(source: str, *definitions: str) -> ctypes.CDLL | None:
     """Compile a source, or load its product from the cache; None where that cannot be done, which is said once.
 
-    Parameters
-    ----------
-    source : str
-        The same one, compiled or not, is answered from memory.
-    *definitions : str
-        Macros, each tried after the one before it failed (``"LANES=1"``); none: the source as it is.
+    The same source is answered from memory. Each definition, a macro as ``LANES=1``, is tried after the one before it
+    failed.
     """
     cc = find_compiler()
     if cc is None:
@@ -197,19 +182,16 @@ def _load_library(cc: Compiler, flags: tuple[str, ...], source: str) -> ctypes.C
             return ctypes.CDLL(str(binary))
         except OSError:  # whole, but of a system whose loader has changed
             discard_library(binary)
-    return ctypes.CDLL(str(_compile(cc, flags, source, folder, identity)))
-
-
-def _compile(cc: Compiler, flags: tuple[str, ...], source: str, cache: Path, identity: str) -> Path:
-    """Compile in a temporary folder, then move the binary: another process may do the same, or this one be killed."""
-    with tempfile.TemporaryDirectory(prefix=COMPILE_FOLDER_PREFIX, dir=cache) as folder:
-        text, product = Path(folder) / "model.c", Path(folder) / "model.so"
+    # compile apart, then move the binary: another process may do the same, or this one be killed
+    with tempfile.TemporaryDirectory(prefix=COMPILE_FOLDER_PREFIX, dir=folder) as apart:
+        text, product = Path(apart) / "model.c", Path(apart) / "model.so"
         text.write_text(source, encoding="utf-8")
         # what zig keeps for all libraries, its C runtime, has its place; what it makes for this one is not wanted
-        folders = {"ZIG_GLOBAL_CACHE_DIR": str(cache / "zig"), "ZIG_LOCAL_CACHE_DIR": folder}
+        folders = {"ZIG_GLOBAL_CACHE_DIR": str(folder / "zig"), "ZIG_LOCAL_CACHE_DIR": apart}
         command = [*cc.command, *flags, str(text), "-o", str(product), *LINKER_FLAGS]
         _run_compiler(command, {**folders, **os.environ})
-        return keep_library(cache, identity, product)
+        binary = keep_library(folder, identity, product)
+    return ctypes.CDLL(str(binary))
 
 
 def _run_compiler(command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
@@ -226,21 +208,17 @@ def _run_compiler(command: Sequence[str], environment: Mapping[str, str] | None 
         try:
             out, err = process.communicate(timeout=COMPILE_TIMEOUT)
         except BaseException:
-            _end_with_children(process)
+            # and those that it started: a compiler is a driver of others, which would go on
+            kill_group = getattr(os, "killpg", None)  # not on Windows
+            with contextlib.suppress(OSError):
+                if kill_group is None:
+                    process.kill()
+                else:
+                    kill_group(process.pid, signal.SIGKILL)
+            process.wait()
             raise
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command, out, err)
-
-
-def _end_with_children(process: "subprocess.Popen[str]") -> None:
-    """Kill a process and those that it started: a compiler is a driver of others, which would go on."""
-    kill_group = getattr(os, "killpg", None)  # not on Windows
-    with contextlib.suppress(OSError):
-        if kill_group is None:
-            process.kill()
-        else:
-            kill_group(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 @functools.cache
@@ -278,16 +256,12 @@ def cache_directory() -> Path:
 
 
 def find_library(folder: Path, identity: str) -> Path | None:
-    """The library that was made of this, if it is kept, whole and this user's own; others in its place are deleted.
-
-    Parameters
-    ----------
-    identity : str
-        All that the library was made of.
-    """
+    """The library that was made of this, if it is kept, whole and this user's own; others in its place are deleted."""
     for path in sorted(folder.glob(f"{_digest(identity)}-*.so")):
         if _is_own(path) and path.name == _library_name(identity, path.read_bytes()):
-            _note_use(path)
+            with contextlib.suppress(OSError):  # its time becomes now, once a day
+                if time.time() - path.stat().st_mtime > NOTICE_TIME:
+                    os.utime(path)
             return path
         logger.debug("%s is damaged, or another user's: it is built anew", path)
         discard_library(path)
@@ -317,13 +291,7 @@ def cached_libraries(folder: Path) -> dict[Path, os.stat_result]:
 
 
 def trim_cache(folder: Path, keep: Path | None = None) -> None:
-    """Delete libraries that were not used for long, or are too many, and what killed processes left behind.
-
-    Parameters
-    ----------
-    keep : Path, optional
-        A library that stays in any case.
-    """
+    """Delete libraries, but not `keep`, that are old or too many, and what killed processes left behind."""
     now, size = time.time(), 0
     for path, entry in cached_libraries(folder).items():
         size += entry.st_size
@@ -333,13 +301,6 @@ def trim_cache(folder: Path, keep: Path | None = None) -> None:
         with contextlib.suppress(OSError):
             if now - path.lstat().st_mtime > NOTICE_TIME:
                 shutil.rmtree(path, ignore_errors=True)
-
-
-def _note_use(path: Path) -> None:
-    """Set a library's time to now, once a day."""
-    with contextlib.suppress(OSError):
-        if time.time() - path.stat().st_mtime > NOTICE_TIME:
-            os.utime(path)
 
 
 def discard_library(path: Path) -> None:
@@ -362,13 +323,13 @@ def _temporary_folder(reason: str, process: int) -> Path:
     """One a reason and process: a forked child has its own, since its parent removes the other."""
     logger.warning("the cache of compiled models cannot be written (%s): compiling anew in each run", reason)
     folder = Path(tempfile.mkdtemp(prefix="pneuopt-"))
-    atexit.register(_remove_folder, folder, process)
+
+    def remove() -> None:
+        if os.getpid() == process:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
     return folder
-
-
-def _remove_folder(folder: Path, process: int) -> None:
-    if os.getpid() == process:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _library_name(identity: str, content: bytes) -> str:

@@ -32,17 +32,9 @@ CASADI_SYMBOL_EXPORT void system_rows(const casadi_real** arg, casadi_real** res
 
 
 def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
-    """Make an SX Function callable on arrays, as machine code where a compiler is found.
+    """Make an SX Function callable on arrays, as machine code where a compiler is found; not thread-safe.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Inputs and outputs dense vectors, scalars or matrices.
-
-    Returns
-    -------
-    callable
-        ``f(*inputs) -> tuple of ndarray``: vectors flat, matrices of shape (rows, columns). Not thread-safe.
+    Vectors are flat, matrices of shape (rows, columns).
     """
     code = _BoundCode.of(_with_dense_outputs(function, "system_function"))
     buffers, results, call, pointers = code.buffers, code.results, code.call, code.pointers
@@ -61,17 +53,9 @@ def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
 
 
 def compile_rate(ode: ca.Function) -> Callable[[float, Array, Array, Array], Array]:
-    """The first output of a right-hand side, in a fifth of the time of `compile_function`: an integrator's inner loop.
+    """``f(t, x, u, p) -> xdot``, a right-hand side's first output, in a fifth of the time of `compile_function`.
 
-    Parameters
-    ----------
-    ode : casadi.Function
-        ``(t, x, u, p) -> (xdot, ...)``.
-
-    Returns
-    -------
-    callable
-        ``f(t, x, u, p) -> xdot`` on arrays of these lengths, which are not checked. Not thread-safe.
+    For an integrator's inner loop: the arrays' lengths are not checked. Not thread-safe.
     """
     code = _BoundCode.of(_with_dense_outputs(ode, "system_function"), wanted=1)
     (at, states, inputs, parameters), (rate,), call, pointers = code.buffers, code.results, code.call, code.pointers
@@ -86,18 +70,10 @@ def compile_rate(ode: ca.Function) -> Callable[[float, Array, Array, Array], Arr
 
 
 def compile_held_rate(ode: ca.Function) -> Callable[[float, Array, Array], Callable[[float, Array], Array]]:
-    """`compile_rate` under inputs that are held, in two thirds of its time: LSODA asks for it 10,000 times a second.
+    """``hold(origin, u, p) -> f``, ``f(t, x) -> xdot`` at ``origin + t``: `compile_rate` under inputs that are held.
 
-    Parameters
-    ----------
-    ode : casadi.Function
-        ``(t, x, u, p) -> (xdot, ...)``.
-
-    Returns
-    -------
-    callable
-        ``hold(origin, u, p) -> f``, and ``f(t, x) -> xdot`` at ``origin + t``, in an array that the next call of any f
-        overwrites; the inputs are those of the last `hold`. Not thread-safe.
+    It takes two thirds of the time: LSODA asks for it 10,000 times a second. The next call of any f overwrites its
+    array; the inputs are those of the last `hold`. Not thread-safe.
     """
     code = _BoundCode.of(_with_dense_outputs(ode, "system_function"), wanted=1)
     (at, states, inputs, parameters), (rate,), call, pointers = code.buffers, code.results, code.call, code.pointers
@@ -119,16 +95,7 @@ def compile_held_rate(ode: ca.Function) -> Callable[[float, Array, Array], Calla
 def compile_rows(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     """Make an SX Function callable on many points at once: the code of `compile_function`, and its numbers to the bit.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Inputs and outputs dense vectors or scalars.
-
-    Returns
-    -------
-    callable
-        ``f(*inputs) -> tuple of ndarray``: an input has a row a point, shape (n, k), or, shape (k,), is the same for
-        all; at least one has rows. A result has a row a point, shape (n, r). Not thread-safe.
+    An input has a row a point, (n, k), or is the same for all, (k,); at least one has rows. Not thread-safe.
     """
     code = _BoundCode.of(_with_dense_outputs(function, "system_function"))
 
@@ -186,7 +153,9 @@ class _BoundCode:
         """Of a Function of which only the first `wanted` results are kept."""
         buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
         results = [_buffer(function.size_out(i)) for i in range(function.n_out())][:wanted]
-        library = compile_library(_casadi_source(function))
+        generator = ca.CodeGenerator("generated.c", {"with_header": False, "verbose": False})
+        generator.add(function)
+        library = compile_library(str(generator.dump()) + ROWS_SOURCE)
         if library is None:
             return cls(bind_function(function, buffers, results), (), buffers, results, ())
         work = np.zeros(max(1, function.sz_w()))
@@ -196,12 +165,6 @@ class _BoundCode:
         call.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int]
         pointers = (ctypes.addressof(arg), ctypes.addressof(res), None, work.ctypes.data, 0)
         return cls(call, pointers, buffers, results, (library, arg, res, work), library)
-
-
-def _casadi_source(function: ca.Function) -> str:
-    generator = ca.CodeGenerator("generated.c", {"with_header": False, "verbose": False})
-    generator.add(function)
-    return str(generator.dump()) + ROWS_SOURCE
 
 
 def _with_dense_outputs(function: ca.Function, name: str) -> ca.Function:

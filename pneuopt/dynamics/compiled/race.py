@@ -18,81 +18,49 @@ RACE_VALUES = ("SettlingTime", "Overshoot", "PeakControl", "IAE", "ISE", "ITAE")
 
 @dataclass(frozen=True, eq=False)
 class RaceCourse:
-    """The cases of a race and the grids on which they run.
+    """The cases of a race and the grids on which they run."""
 
-    Parameters
-    ----------
-    u : ndarray, shape (n_grids, n, n_inputs)
-    t, h : ndarray, shape (n_grids, n)
-        Instants and steps [s].
-    grid, length, first : ndarray of int, shape (n_cases,)
-        Each case's grid, the number of its samples, and the first one from the step on.
-    settings : ndarray, shape (n_cases, 7)
-        The reference after the step, the step's size, the signal before it, the spacing of the samples [s], the time of
-        `first` after the step [s], 1 for a step or 0 for a disturbance, and what fraction of the step a band of 1 is.
-    substeps : int
-        RK4 steps a sample.
-    every : int
-        Samples between two states that are kept.
-    """
-
-    u: Array
+    u: Array  # (n_grids, n, n_inputs)
+    # t, h (n_grids, n): instants and steps [s]
     t: Array
     h: Array
+    # grid, length, first (n_cases,): each case's grid, the number of its samples, and the first one from the step on
     grid: Indices
     length: Indices
     first: Indices
+    # (n_cases, 7): the reference after the step, the step's size, the signal before it, the spacing of the samples
+    # [s], the time of `first` after the step [s], 1 for a step or 0 for a disturbance, and what fraction of the step
+    # a band of 1 is
     settings: Array
-    substeps: int
-    every: int
+    substeps: int  # RK4 steps a sample
+    every: int  # samples between two states that are kept
 
 
 @dataclass(frozen=True, eq=False)
 class RaceMerit:
-    """What a bound of the merit is made of.
+    """What a bound of the merit is made of."""
 
-    Parameters
-    ----------
-    bands : ndarray
-        Half widths of settling bands, in what the settings say, over which the settling time is averaged.
-    weights, limits : ndarray, shape (6,)
-        Of `RACE_VALUES`: weights in the objective, 0 for none, and limits, inf for none.
-    worst, penalty : float
-        A merit beyond any objective, and the weight of a limit's relative excess in multiples of it.
-    runaway : float
-        Size of signal and command from which a candidate has lost.
-    """
-
-    bands: Array
+    bands: Array  # half widths of settling bands, in what the settings say, over which the settling time is averaged
+    # weights, limits (6,): of `RACE_VALUES`: weights in the objective, 0 for none, and limits, inf for none
     weights: Array
     limits: Array
+    # worst, penalty: a merit beyond any objective, and the weight of a limit's relative excess in multiples of it
     worst: float
     penalty: float
-    runaway: float
+    runaway: float  # size of signal and command from which a candidate has lost
 
 
 @dataclass(frozen=True, eq=False)
 class RaceOutcome:
-    """How a race ended.
+    """How a race ended."""
 
-    Attributes
-    ----------
-    loser : ndarray of int, shape (m,)
-        The case by which each candidate lost; -1: it came through.
-    y : ndarray, shape (m, n_cases, n, n_outputs)
-        The outputs of those that came through.
-    x : ndarray, shape (m, n_cases, k, n_states)
-        Their states at every `RaceCourse.every`-th sample.
-    x_end : ndarray, shape (m, n_cases, n_states)
-    """
-
-    loser: Indices
-    y: Array
-    x: Array
-    x_end: Array
+    loser: Indices  # (m,): the case by which each candidate lost; -1: it came through
+    y: Array  # (m, n_cases, n, n_outputs): the outputs of those that came through
+    x: Array  # (m, n_cases, k, n_states): their states at every `RaceCourse.every`-th sample
+    x_end: Array  # (m, n_cases, n_states)
 
 
-class _Race(ctypes.Structure):
+class _RaceStruct(ctypes.Structure):
     """The struct Race of race.c."""
 
     _fields_ = (
@@ -107,37 +75,17 @@ class _Race(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class RaceField:
-    """The candidates of a race.
+    """The candidates of a race."""
 
-    Parameters
-    ----------
-    p : ndarray, shape (m, n_cases, n_parameters)
-    x0 : ndarray, shape (m, n_cases, n_states)
-    period : ndarray, shape (m, n_cases)
-        The time over which a response is averaged [s]; 0: it is not.
-    order : ndarray of int, shape (m, n_cases)
-        Each candidate's cases in the order in which they run.
-    rivals : ndarray, shape (m,)
-        The merits to beat.
-    """
-
-    p: Array
-    x0: Array
-    period: Array
-    order: Indices
-    rivals: Array
+    p: Array  # (m, n_cases, n_parameters)
+    x0: Array  # (m, n_cases, n_states)
+    period: Array  # (m, n_cases): the time over which a response is averaged [s]; 0: it is not
+    order: Indices  # (m, n_cases): each candidate's cases in the order in which they run
+    rivals: Array  # (m,): the merits to beat
 
 
 def race(rollout: Rollout, course: RaceCourse, merit: RaceMerit, candidates: RaceField, y: Array) -> RaceOutcome:
-    """Run a race.
-
-    Parameters
-    ----------
-    rollout : Rollout
-        With machine code, and without sensitivities.
-    y : ndarray, shape (m, n_cases, n, n_outputs)
-        Where the outputs are put.
-    """
+    """Run a race on machine code without sensitivities; the outputs are put into `y` (m, n_cases, n, n_outputs)."""
     m, cases = candidates.order.shape
     kept_states = np.empty((m, cases, -(-course.t.shape[1] // course.every), rollout.n_states))
     outcome = RaceOutcome(np.full(m, -1, dtype=np.int64), y, kept_states, np.empty((m, cases, rollout.n_states)))
@@ -167,5 +115,5 @@ def race(rollout: Rollout, course: RaceCourse, merit: RaceMerit, candidates: Rac
         merit.runaway,
     )
     work = m * cases * course.t.shape[1] * course.substeps
-    rollout.race(_Race(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, work, list(kept.values()))
+    rollout.race(_RaceStruct(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, work, list(kept.values()))
     return outcome

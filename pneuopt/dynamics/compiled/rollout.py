@@ -2,9 +2,8 @@
 
 It is cached machine code, or runs in the CasADi VM where there is no compiler. Both give the same answers. Binaries
 are cached by content (source, flags, compiler, CPU); logs, values and step sizes are arguments, so one binary serves
-every log and every continuation step.
-
-The pieces of a sampled system with their sensitivities, symbolically and as the C of a run over segments.
+every log and every continuation step. Below `Rollout` stand the pieces of a system with their sensitivities,
+symbolically and as the C of a run (`prepare_rollout`).
 """
 
 import ctypes
@@ -12,7 +11,7 @@ import functools
 import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ from pneuopt.dynamics.compiled.c_writer import CFunction, write_c
 from pneuopt.dynamics.compiled.compiler import compile_library, warn_once
 from pneuopt.dynamics.compiled.vm import run_in_vm
 from pneuopt.dynamics.integrators import OwnRate, partitioned_step, rk4
-from pneuopt.dynamics.tolerances import BRIEF_STEPS, CHECK_SECONDS, MAX_SUBSTEPS, UNSHARED_STEPS, VM_BATCH
+from pneuopt.dynamics.tolerances import BLOCK_SEGMENTS, BRIEF_STEPS, CHECK_SECONDS, UNSHARED_STEPS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 
@@ -46,93 +45,47 @@ def check_during_runs(check: Callable[[], None]) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """The SX Functions of one sampled system, as `Rollout` runs them.
+    """The SX Functions of one sampled system, as `Rollout` runs them."""
 
-    Parameters
-    ----------
-    step : casadi.Function
-        ``(t, h, x, u, p) -> (x_next, y)``.
-    update : casadi.Function or None
-        ``(t, x, u, p) -> x``.
-    ode : casadi.Function or None
-        ``(t, x, u, p) -> (xdot, y)``, of which `step` is the RK4 step: its sensitivities are cheaper stage by stage.
-    implicit : int, optional
-        Position of the state in which the ODE is integrated implicitly (`partitioned_step`), in place of RK4.
-    """
-
-    step: ca.Function
-    update: ca.Function | None = None
+    step: ca.Function  # ``(t, h, x, u, p) -> (x_next, y)``
+    update: ca.Function | None = None  # ``(t, x, u, p) -> x``
+    # ``(t, x, u, p) -> (xdot, y)``, of which `step` is the RK4 step: its sensitivities are cheaper stage by stage
     ode: ca.Function | None = None
+    # position of the state in which the ODE is integrated implicitly (`partitioned_step`), in place of RK4
     implicit: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutResult:
-    """The outputs, end states and sensitivities of m segments of n samples.
+    """The outputs, end states and sensitivities of m segments of n samples."""
 
-    Attributes
-    ----------
-    y : ndarray, shape (m, n, n_outputs)
-    x_end : ndarray, shape (m, n_states)
-        State after the last sample's step.
-    x : ndarray, shape (m, ceil(n / states), n_states), or None
-        State at each so many samples, before the controller's update.
-    dy : ndarray, shape (m, n, n_outputs, n_columns), or None
-    dx_end : ndarray, shape (m, n_states, n_columns), or None
-        Sensitivities; the columns are the start state, then the chosen parameters.
-    """
-
-    y: Array
-    x_end: Array
+    y: Array  # (m, n, n_outputs)
+    x_end: Array  # (m, n_states): state after the last sample's step
+    # (m, ceil(n / states), n_states): state at each so many samples, before the controller's update
     x: Array | None = None
-    dy: Array | None = None
+    dy: Array | None = None  # (m, n, n_outputs, n_columns), or None
+    # (m, n_states, n_columns), or None: sensitivities; the columns are the start state, then the chosen parameters
     dx_end: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The normal equations of the residuals of m segments; s sensitivity columns, as for `RolloutResult`.
+    """The normal equations of the residuals of m segments; s sensitivity columns, as for `RolloutResult`."""
 
-    Attributes
-    ----------
-    grams : ndarray, shape (m, s + 1, s + 1)
-        Sum over samples and outputs of e e', with e = [dy | y - measured], weighted.
-    squares : ndarray, shape (m, n_outputs)
-        Sum over samples of each output's squared residuals, weighted.
-    sums : ndarray, shape (m, n_outputs, s)
-        Sum over samples of each output's weighted derivatives, of the residuals that count.
-    y : ndarray, shape (m, n, n_outputs)
-    x_end : ndarray, shape (m, n_states)
-    dx_end : ndarray, shape (m, n_states, s)
-    """
-
-    grams: Array
-    squares: Array
+    grams: Array  # (m, s + 1, s + 1): sum over samples and outputs of e e', with e = [dy | y - measured], weighted
+    squares: Array  # (m, n_outputs): sum over samples of each output's squared residuals, weighted
+    # (m, n_outputs, s): sum over samples of each output's weighted derivatives, of the residuals that count
     sums: Array
-    y: Array
-    x_end: Array
-    dx_end: Array
+    y: Array  # (m, n, n_outputs)
+    x_end: Array  # (m, n_states)
+    dx_end: Array  # (m, n_states, s)
 
 
 class Rollout:
-    """Run a sampled system over many segments at once.
+    """Run a sampled system over many segments at once, with sensitivities to parameters `wrt` and to the `start` state.
 
-    Parameters
-    ----------
-    wrt : sequence of int
-        Positions in the parameter vector of which sensitivities are wanted.
-    start : bool
-        Whether sensitivities to the start state are wanted.
-    threads : int, optional
-        Default: one a processor.
-    lanes : int, optional
-        Segments that one processor runs at once, a power of 2. Default: as many as pay on the CPU (4 with AVX), or one
-        where the compiler knows no vectors; 0: the CasADi VM.
-
-    Attributes
-    ----------
-    lanes : int
-        Lanes in use; 0 where the CasADi VM runs.
+    Defaults: as many threads as processors, and as many `lanes` (segments that one processor runs at once, a power of
+    2) as pay on the CPU: 4 with AVX, one where the compiler knows no vectors; 0 is the CasADi VM.
     """
 
     def __init__(
@@ -170,20 +123,10 @@ class Rollout:
         substeps: int = 1,
         states: int = 0,
     ) -> RolloutResult:
-        """Integrate m segments of n samples each.
+        """Integrate m segments from x0 (m, n_states) over n samples at t with steps h [s], (m, n) or (n,) for all.
 
-        Parameters
-        ----------
-        x0 : array_like, shape (m, n_states)
-        u : array_like, shape (m, n, n_inputs), or (n, n_inputs) for all segments
-            Held over each sample.
-        p : array_like, shape (n_parameters,) or (m, n_parameters)
-        t, h : array_like, shape (m, n), or (n,) for all segments
-            Instant of each sample and the step that follows it [s]; h = 0 pads a short segment.
-        substeps : int
-            Integration steps a sample.
-        states : int
-            Return the state at each so many samples, from the first one on: 1, or True, at each sample; 0: none.
+        Inputs u, (m, n, n_inputs) or (n, n_inputs) for all, are held over each sample; p is (m, n_parameters) or one
+        for all; h = 0 pads a short segment. The state is returned at each so many samples (`states`), or at none (0).
         """
         _check.get()()
         return self._run(*self._check_arrays(x0, u, p, t, h, substeps), substeps, states)
@@ -202,14 +145,7 @@ class Rollout:
     ) -> Gram:
         """Integrate as `run` does, and sum up the residuals' normal equations without storing their derivatives.
 
-        Parameters
-        ----------
-        x0, u, p, t, h, substeps
-            As for `run`.
-        measured : array_like, shape (m, n, n_outputs)
-            NaN: no residual.
-        weight : array_like, shape (m, n, n_outputs)
-            One over the standard deviation of the noise.
+        `measured` and `weight`, one over the noise, are (m, n, n_outputs); NaN: no residual.
         """
         _check.get()()
         given = self._check_arrays(x0, u, p, t, h, substeps)
@@ -220,7 +156,14 @@ class Rollout:
         shape = (*given[3].shape, self.n_outputs)
         for name, array in (("measured", y), ("weight", w)):
             require(array.shape == shape, f"{name}: {array.shape}, expected {shape}", ModelError)
-        return (self._gram_native if self._library is not None else self._gram_vm)(given, y, w, substeps)
+        if self._library is None:
+            return self._gram_vm(given, y, w, substeps)
+        m, nx, ns = len(given[0]), self.n_states, self.n_columns
+        grams, squares = np.empty((m, ns + 1, ns + 1)), np.empty((m, self.n_outputs))
+        sums = np.empty((m, ns, self.n_outputs))
+        outputs, x_end, dx_end = np.empty(shape), np.empty((m, nx)), np.empty((m, ns, nx))
+        self._call_library(given, substeps, 0, (y, w, outputs, None, None, x_end, dx_end, grams, squares, sums))
+        return Gram(grams, squares, np.swapaxes(sums, 1, 2), outputs, x_end, np.swapaxes(dx_end, 1, 2))
 
     def _check_arrays(
         self, x0: ArrayLike, u: ArrayLike, p: ArrayLike, t: ArrayLike, h: ArrayLike, substeps: int
@@ -234,39 +177,30 @@ class Rollout:
             require(array.shape == expected[name], f"{name}: {array.shape}, expected {expected[name]}", ModelError)
         require(p.shape in ((self.n_parameters,), (m, self.n_parameters)), f"p has shape {p.shape}", ModelError)
         require(substeps >= 1, f"substeps must be at least 1, got {substeps}", ModelError)
-        require(substeps <= MAX_SUBSTEPS, f"substeps may be {MAX_SUBSTEPS} at most, got {substeps}", ModelError)
+        most = int(np.iinfo(np.intc).max)  # a C int counts them
+        require(substeps <= most, f"substeps may be {most} at most, got {substeps}", ModelError)
         return x0, u, p, t, h
 
     def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
         m, n, ny, nx, ns = len(x0), t.shape[-1], self.n_outputs, self.n_states, self.n_columns
         if self._library is None:
             u, t, h = np.broadcast_to(u, (m, n, self.n_inputs)), np.broadcast_to(t, (m, n)), np.broadcast_to(h, (m, n))
-            return self._run_vm((x0, u, p, t, h), substeps, states)
+            given = (x0, u, p, t, h)
+            run = run_in_vm(self._functions, given, self._starts, substeps, states, self._threads)
+            if not self.n_columns:
+                return RolloutResult(run.y, run.x_end, run.x)
+            return RolloutResult(run.y, run.x_end, run.x, _swap_last_axes(run.dy), _swap_last_axes(run.dx_end))
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         x = np.empty((m, -(-n // states), nx)) if states else None
         self._call_library((x0, u, p, t, h), substeps, states, (None, None, y, dy, x, x_end, dx_end, None, None, None))
         return RolloutResult(y, x_end, x, _swap_last_axes(dy), _swap_last_axes(dx_end))
 
-    def _run_vm(self, given: tuple[Array, Array, Array, Array, Array], substeps: int, states: int) -> RolloutResult:
-        run = run_in_vm(self._functions, given, self._starts, substeps, states, self._threads)
-        if not self.n_columns:
-            return RolloutResult(run.y, run.x_end, run.x)
-        return RolloutResult(run.y, run.x_end, run.x, _swap_last_axes(run.dy), _swap_last_axes(run.dx_end))
-
-    def _gram_native(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
-        m, nx, ns = len(given[0]), self.n_states, self.n_columns
-        grams, squares = np.empty((m, ns + 1, ns + 1)), np.empty((m, self.n_outputs))
-        sums = np.empty((m, ns, self.n_outputs))
-        y, x_end, dx_end = np.empty(measured.shape), np.empty((m, nx)), np.empty((m, ns, nx))
-        self._call_library(given, substeps, 0, (measured, weight, y, None, None, x_end, dx_end, grams, squares, sums))
-        return Gram(grams, squares, np.swapaxes(sums, 1, 2), y, x_end, np.swapaxes(dx_end, 1, 2))
-
     def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         parts = []
-        for i in range(0, len(measured), VM_BATCH):
+        for i in range(0, len(measured), BLOCK_SEGMENTS):
             _check.get()()
-            x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + VM_BATCH] for a in (*given, measured, weight))
+            x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + BLOCK_SEGMENTS] for a in (*given, measured, weight))
             run = run_in_vm(self._functions, (x0, u, p, t, h), self._starts, substeps, 0, self._threads)
             dy, dx_end = (np.swapaxes(a, -1, -2) for a in (run.dy, run.dx_end))
             e = np.concatenate([dy, (run.y - y)[..., None]], axis=-1) * w[..., None]
@@ -332,20 +266,13 @@ class Rollout:
         running = [_pool(self._threads).submit(_call_part, function, call, (stop, *kept)) for call in calls]
         try:
             for each in running:
-                _await(each)
+                while not wait([each], CHECK_SECONDS).done:
+                    _check.get()()
+                each.result()
         except BaseException:
             stop.value = 1
             wait(running)
             raise
-
-
-def _await(part: Future[None]) -> None:
-    """Wait for a thread's part, with checks (`check_during_runs`)."""
-    while True:
-        try:
-            return part.result(CHECK_SECONDS)
-        except TimeoutError:
-            _check.get()()
 
 
 def _call_part(function: Callable[..., None], call: tuple[object, ...], kept: tuple[Any, ...]) -> None:  # noqa: ARG001
@@ -392,25 +319,11 @@ def prepare_rollout(
     start: bool,
     implicit: int | None = None,
 ) -> tuple[dict[str, ca.Function], str]:
-    """The pieces of a sampled system (see `rollout.Pieces`) with their sensitivities, and the C of a run of them.
+    """The pieces of a sampled system (see `Pieces`) with sensitivities to parameters `wrt` and `start`, and their C.
 
-    Parameters
-    ----------
-    update, ode : casadi.Function or None
-    wrt : sequence of int
-        Positions in the parameter vector of which sensitivities are wanted.
-    start : bool
-        Whether sensitivities to the start state are wanted.
-    implicit : int, optional
-        Position of the state in which the steps of an ODE are implicit (`partitioned_step`), in place of RK4's.
-
-    Returns
-    -------
-    functions : dict of str to casadi.Function
-        "step", "output" and, if there is one, "update": ``(..., x, u, p, S) -> (value, its sensitivity)``; of an ODE
-        in RK4 steps "rate", too: ``(t, x, u, p) -> (xdot, its Jacobians to x and to the chosen parameters)``.
-    source : str
-        Empty where an operation has no form in C, which is said once.
+    Each is ``(..., x, u, p, S) -> (value, its sensitivity)``; of an ODE in RK4 steps "rate", too: ``(t, x, u, p) ->
+    (xdot, its Jacobians to x and to the chosen parameters)``. The C is empty where an operation has none, which is said
+    once.
     """
     return prepare_by_content(str(step.serialize()), _serialize(update), _serialize(ode), tuple(wrt), start, implicit)
 

@@ -1,18 +1,10 @@
 """`run_in_vm`: a rollout without machine code, for where there is no compiler; the same answers, more slowly.
 
-Many segments run as operations on arrays (`ArrayProgram`), few in CasADi's virtual machine. There a Function is called
-on memory that stays in its place (`bind_function`): a call by CasADi's matrices takes fifty times as long as the
-arithmetic of a small model.
-
-`ArrayProgram`: an SX Function as calls of NumPy, each for one number of many segments at once.
-
-CasADi's virtual machine takes 3 to 6 ns for an operation of one segment. NumPy takes half a microsecond for a call, and
-then a tenth of that for a segment: some hundred segments at once run several times as fast.
-
-`bind_array_step`: an RK4 step of many segments with its sensitivities, all columns of these in one operation.
-
-Written out, a step takes an operation of NumPy for each column of the sensitivities, and half a microsecond for each:
-more than half of its time.
+Few segments run in CasADi's virtual machine, on memory that stays in its place (`bind_function`): a call by CasADi's
+matrices takes fifty times as long as the arithmetic of a small model. Many run as calls of NumPy, each for one number
+of all segments (`ArrayProgram`): the virtual machine takes 3 to 6 ns for an operation of one segment, NumPy half a
+microsecond for a call, and then a tenth of that for a segment. An RK4 step (`bind_array_step`) takes all columns of the
+sensitivities in one operation; an operation for each would be more than half of its time.
 """
 
 import functools
@@ -23,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.c_writer import Instruction, read_instructions
-from pneuopt.dynamics.tolerances import ARRAY_SEGMENTS, BLOCK_SEGMENTS, FOLDED_STEPS, LATER_STAGES, OPERATIONS_A_THREAD
+from pneuopt.dynamics.tolerances import ARRAY_SEGMENTS, BLOCK_SEGMENTS, FOLDED_STEPS, OPERATIONS_A_THREAD
 from pneuopt.quantities.arrays import Array
 
 Operation = Callable[..., Any]
@@ -32,10 +24,6 @@ Operation = Callable[..., Any]
 def _if_else_zero(condition: Array, value: Array, out: Array) -> None:
     """The value where the condition holds, 0 elsewhere, even where the value is not a number."""
     out[...] = np.where(condition != 0, value, 0.0)
-
-
-def _twice(value: Array, out: Array) -> None:
-    np.add(value, value, out)
 
 
 def _erf(value: Array, out: Array) -> None:
@@ -52,7 +40,7 @@ OPERATIONS: dict[int, Operation] = {
     ca.OP_DIV: np.divide,
     ca.OP_NEG: np.negative,
     ca.OP_SQ: np.square,
-    ca.OP_TWICE: _twice,
+    ca.OP_TWICE: lambda value, out: np.add(value, value, out),
     ca.OP_INV: np.reciprocal,
     ca.OP_CONSTPOW: np.power,
     ca.OP_POW: np.power,
@@ -110,22 +98,9 @@ class _Step(NamedTuple):
 
 
 class ArrayProgram:
-    """An SX Function as operations on arrays, each result in a row that a later one may take over.
+    """An SX Function with dense results as operations on arrays, each result in a row that a later one may take over.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        SX, with dense results.
-
-    Attributes
-    ----------
-    n_rows : int
-        Numbers of a segment that it holds at once, constants included.
-
-    Raises
-    ------
-    NotImplementedError
-        For an operation of CasADi that NumPy has not.
+    An operation of CasADi that NumPy has not is a `NotImplementedError`.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -165,7 +140,11 @@ class ArrayProgram:
             self._places[i.target[0]] = _Place("own", 0, self.n_rows - 1)
             return
         sources = tuple(self._places[s] for s in i.sources)
-        self._free += {self._places[s].row for s in i.sources if self._last_use[s] == k and self._is_reusable(s)}
+        self._free += {
+            self._places[s].row
+            for s in i.sources
+            if self._last_use[s] == k and self._places[s].owner == "own" and self._places[s].row not in self._constants
+        }
         if i.operation == ca.OP_OUTPUT:
             self._steps.append(_Step(np.positive, (*sources, _Place("result", *i.target))))
             return
@@ -177,39 +156,21 @@ class ArrayProgram:
         self._places[i.target[0]] = _Place("own", 0, self._free.pop())
         self._steps.append(_Step(OPERATIONS[i.operation], (*sources, self._places[i.target[0]])))
 
-    def _is_reusable(self, value: int) -> bool:
-        place = self._places[value]
-        return place.owner == "own" and place.row not in self._constants
-
 
 class VmRun(NamedTuple):
-    """The results of m segments of n samples, the sensitivity's columns before its rows, as machine code has them.
+    """The results of m segments of n samples, the sensitivity's columns before its rows, as machine code has them."""
 
-    Attributes
-    ----------
-    y : ndarray, shape (m, n, n_outputs)
-    dy : ndarray, shape (m, n, n_columns, n_outputs)
-    x : ndarray, shape (m, ceil(n / states), n_states), or None
-    x_end : ndarray, shape (m, n_states)
-    dx_end : ndarray, shape (m, n_columns, n_states)
-    """
-
-    y: Array
-    dy: Array
-    x: Array | None
-    x_end: Array
-    dx_end: Array
+    y: Array  # (m, n, n_outputs)
+    dy: Array  # (m, n, n_columns, n_outputs)
+    x: Array | None  # (m, ceil(n / states), n_states)
+    x_end: Array  # (m, n_states)
+    dx_end: Array  # (m, n_columns, n_states)
 
 
 def bind_function(function: ca.Function, inputs: Sequence[Array], results: Sequence[Array]) -> Callable[[], object]:
-    """A call without arguments that evaluates a Function from arrays into arrays.
+    """A call without arguments that evaluates a Function from arrays into arrays, which may be fewer than its results.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Its inputs and outputs are dense.
-    inputs, results : sequence of ndarray
-        Contiguous, in CasADi's column order; their memory is read and written at each call. Results may be fewer.
+    They are contiguous, in CasADi's column order; their memory is read and written at each call.
     """
     buffer, evaluate = function.buffer()
     for i, array in enumerate(inputs):
@@ -234,20 +195,10 @@ def run_in_vm(
     states: int,
     threads: int = 1,
 ) -> VmRun:
-    """Integrate m segments of n samples each, as `Rollout.run` does.
+    """Integrate m segments of n samples each, as `Rollout.run` does with x0, u, p, t and h.
 
-    Parameters
-    ----------
-    functions : mapping of str to casadi.Function
-        "step", "output" and, if there are such, "update" and "rate", as `prepare_rollout` makes them.
-    given : tuple of ndarray
-        x0, u, p, t and h, as `Rollout.run` takes them.
-    start_columns : int
-        How many of the sensitivity's columns are those of the start state.
-    substeps, states : int
-        As for `Rollout.run`.
-    threads : int
-        Segments are shared out to so many at most.
+    `functions` are those of `prepare_rollout`; the first `start_columns` of the sensitivity's columns are the start
+    state's.
     """
     (m, n), nx = given[3].shape, given[0].shape[1]
     if nx == 0 and n > 1:
@@ -405,16 +356,10 @@ def _count_parts(operations: int, m: int, threads: int) -> int:
 def bind_array_step(
     rate: ca.Function, program: ArrayProgram, inputs: Sequence[Array], results: Sequence[Array]
 ) -> Callable[[], None]:
-    """A call without arguments that takes a step of all segments from inputs to results.
+    """A call without arguments that takes a step of all segments from inputs (t, h, x, u, p, S) to results (x, S).
 
-    Parameters
-    ----------
-    rate : casadi.Function
-        ``(t, x, u, p) -> (xdot, d(xdot)/dx, d(xdot)/d(chosen parameters))``, the last two sparse.
-    program : ArrayProgram
-        Its program.
-    inputs, results : sequence of ndarray
-        t, h, x, u, p, S and x, S after the step, of shape (numbers, segments); S column by column.
+    Their shapes are (numbers, segments), S column by column; `program` is that of `rate`, ``(t, x, u, p) -> (xdot,
+    d(xdot)/dx, d(xdot)/d(chosen parameters))`` with sparse slopes.
     """
     at, size, x, u, p, flat = inputs
     nx, m = x.shape
@@ -429,7 +374,7 @@ def bind_array_step(
         evaluate()
         spread(S)
         sums[0][:], sums[1][:] = k, slope
-        for fraction, weight in LATER_STAGES:
+        for fraction, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):  # where RK4's later stages stand, their weights
             np.multiply(size, fraction, out=share)
             np.add(at, share, out=time)
             np.add(x, np.multiply(k, share, out=stage_x), out=stage_x)

@@ -1,3 +1,5 @@
+"""The parameters as they are searched."""
+
 from types import SimpleNamespace
 from typing import Any, cast
 
