@@ -124,6 +124,10 @@ class ParameterSet(Mapping[str, Parameter]):
     def __contains__(self, name: object) -> bool:
         return name in self._parameters
 
+    def get(self, name: str, default: Any = None) -> Any:
+        """The parameter of that name; `default` where there is none."""
+        return self._parameters.get(name, default)  # Mapping's own catches a KeyError only
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._parameters)
 

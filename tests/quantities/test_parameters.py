@@ -60,6 +60,12 @@ def test_unknown_names_are_refused_everywhere() -> None:
             call("load.mas")
 
 
+def test_get_gives_the_default_for_a_name_that_is_not_there_as_every_mapping_does() -> None:
+    assert RIG.get("load.mas") is None
+    assert RIG.get("load.mas", RIG["load.mass"]) is RIG["load.mass"]
+    assert RIG.get("load.mass") is RIG["load.mass"]
+
+
 def test_a_value_outside_its_bounds_names_the_parameter() -> None:
     with pytest.raises(InputError, match=r"load\.mass: value 50 kg lies outside its bounds \[1, 10\]"):
         RIG.with_values({"load.mass": 50.0})
