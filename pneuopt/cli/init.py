@@ -28,7 +28,7 @@ from pneuopt.files.first_files import (
     unused_channels,
 )
 from pneuopt.files.tolerances import SAMPLE_TIME
-from pneuopt.logs.foreign import read_table
+from pneuopt.logs.foreign import parse_log
 from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.table import Table, read_bytes
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
@@ -79,7 +79,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     force : bool
         Whether old files may be replaced; without it those that stand beside another log's sidecar are kept.
     """
-    table = None if log is None else read_table(log, read_bytes(log))
+    table = None if log is None else parse_log(log, read_bytes(log))
     guessed = None if table is None or kind is not None else _guess_kind(table)
     message = f"say what drives the load: pneuopt init KIND, one of {', '.join(first_kinds())}"
     require(

@@ -1,8 +1,6 @@
 """What the columns of a log mean, whatever its file format: channels, their units, centres and scales, and checks.
 
 The channels that the log of a plant may hold beside the usual ones.
-
-The keys of a log's sidecar, by which it is read.
 """
 
 import difflib
@@ -16,8 +14,8 @@ from pneuopt.logs.table import EMPTY_CELL, Table
 from pneuopt.logs.tolerances import MAX_MAGNITUDE, MAX_NAME_PARTS, MAX_ROWS_SHOWN, MIN_SAMPLES
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_names, require
-from pneuopt.quantities.keys import Key, Takes, table
-from pneuopt.quantities.parameters import Intersample, Quantity
+from pneuopt.quantities.keys import Key, Takes, read_entry, read_table
+from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.units import read_value, si_conversion
 
 CHANNELS: Mapping[str, str] = {
@@ -97,7 +95,7 @@ def find_columns(
     """The column of each channel, and what the user may want to know of the others; see `read_channels`."""
     check_names("channel", entries, channels, where)
     found = {
-        name: _resolve_column(table, name, entry, f"{where}.{name}", channels, entry_from=where)
+        name: _resolve_column(table, name, entry, f"{where} {name}", channels, entry_from=where)
         for name, entry in entries.items()
         if entry is not False
     }
@@ -209,9 +207,9 @@ def _resolve_column(
     table: Table, channel: str, entry: Any, where: str, channels: Mapping[str, str], *, entry_from: str = ""
 ) -> ChannelColumn:
     column = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
+    stated = {n: key for n, key in COLUMN_KEYS.items() if key.takes is Takes.TEXT}
     check_names("key", column, COLUMN_KEYS, where)
-    require(isinstance(column.get("column"), str), f'{where}: say which column: {{ column = "U valve" }}', LogError)
-    name = column["column"]
+    name = read_table(stated, column, where, partial=True)["column"]
     bare, unit = split_unit(name)
     if name not in table.names:
         name = bare
@@ -228,7 +226,11 @@ def _resolve_column(
     }
     unit_from, unit = next(((place, str(said)) for place, said in places.items() if said), ("", ""))
     require(bool(unit), f'{where}: no unit; write "{bare} [{channels[channel]}]", or unit = "..."', UnitError)
-    raw_centre = read_value(column["centre"], unit, where=f"{where}.centre") if "centre" in column else 0.0
+    raw_centre = (
+        read_entry(COLUMN_KEYS["centre"], column["centre"], f"{where} centre", {"column": unit})
+        if "centre" in column
+        else COLUMN_KEYS["centre"].usual
+    )
     factor, offset = _column_scaling(unit, column.get("scale"), channels[channel], where)
     return ChannelColumn(name, factor, offset - factor * raw_centre, unit, unit_from, entry_from)
 
@@ -247,12 +249,12 @@ def _column_scaling(unit: str, scale: str | float | None, target: str, where: st
     level = re.search(r"\([ag]\)", f"{unit} {scale}")
     require(
         bool(level) or "(" not in target,
-        f'{where}.scale: {scale!r} does not say from where the pressure counts; write "2 bar(g)/V" or "2 bar(a)/V"',
+        f'{where} scale: {scale!r} does not say from where the pressure counts; write "2 bar(g)/V" or "2 bar(a)/V"',
         UnitError,
     )
     bare, bare_target = (re.sub(r"\([ag]\)", "", text) for text in (unit, target))
-    gain = _read_gain(re.sub(r"\([ag]\)", "", str(scale)), bare, bare_target, f"{where}.scale")
-    return gain, si_conversion(bare_target + (level[0] if level else ""), target, where=f"{where}.scale")[1]
+    gain = _read_gain(re.sub(r"\([ag]\)", "", str(scale)), bare, bare_target, f"{where} scale")
+    return gain, si_conversion(bare_target + (level[0] if level else ""), target, where=f"{where} scale")[1]
 
 
 def _read_gain(scale: str, unit: str, target: str, where: str) -> float:
@@ -343,46 +345,3 @@ def plant_channels(plant: Plant) -> dict[str, str]:
     """The channels that a plant's log may hold: its signals, and the references of its outputs."""
     references = {f"{q.name}_reference": q.unit for q in plant.outputs}
     return {**{q.name: q.unit for q in (*plant.inputs, *plant.outputs)}, **references}
-
-
-ACCEPTED_CHECKS = "accept"  # the checks that the log need not pass
-DATE = "date"  # when the log was taken
-
-
-def _column_key(channel: str, unit: str) -> Key:
-    meaning = f"column of the {channel.replace('_', ' ')}"
-    return Key(meaning, Takes.COLUMN, unit, keys=COLUMN_KEYS, example=f'"{channel} [{unit}]"')
-
-
-INTERSAMPLE_KEY = Key(
-    "by default a command is held", Takes.TEXT, choices={kind.value: kind for kind in Intersample}, example='"held"'
-)
-SIDECAR_KEYS: Mapping[str, Key] = {
-    ACCEPTED_CHECKS: Key("checks that this log need not pass", Takes.LIST, usual=[], example='["work"]'),
-    DATE: Key("when this log was taken, for track; before its stamps and its name", Takes.TEXT, example='"2026-03-12"'),
-    "columns": table(
-        "which column is which channel; false leaves one out; the header says the others",
-        {channel: _column_key(channel, unit) for channel, unit in CHANNELS.items()},
-        others=Key("column of another signal of the drive", Takes.COLUMN, "{own}", keys=COLUMN_KEYS),
-        named="signal",
-    ),
-    "noise": table(
-        "standard deviations; by default as the log shows",
-        {},
-        others=Key("of that channel", unit="{own}", example='"20 um"'),
-        named="channel",
-    ),
-    "conditions": table(
-        "known values that hold in this log only",
-        {},
-        others=Key("its value in this log", unit="{own}", example='"6.3 bar(g)"'),
-        named="parameter",
-    ),
-    "intersample": table(
-        "how channels run between two samples",
-        {},
-        others=INTERSAMPLE_KEY,
-        named="channel",
-    ),
-}
-"""The sections of a sidecar, and what stands before them."""

@@ -52,10 +52,10 @@ from pneuopt.logs.text import (
     has_table,
     is_stamp,
     plain_unit,
+    read_delimited,
     read_text,
     seconds_from_first,
 )
-from pneuopt.logs.text import read_delimited as csv_read_table
 from pneuopt.logs.tolerances import (
     COMPRESSED,
     HEAD_BYTES,
@@ -663,10 +663,10 @@ def _seconds(sheet: _Sheet, name: str, days: Array) -> Array:
 
 
 READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
-    ".csv": csv_read_table,
-    ".txt": csv_read_table,
-    ".tsv": csv_read_table,
-    ".dat": csv_read_table,
+    ".csv": read_delimited,
+    ".txt": read_delimited,
+    ".tsv": read_delimited,
+    ".dat": read_delimited,
     ".parquet": read_parquet,
     ".mat": read_mat,
     ".lvm": read_lvm,
@@ -678,7 +678,7 @@ READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
 """The suffix of a file, in lower case, to the function that reads it."""
 
 
-def read_table(path: Path, raw: bytes) -> Table:
+def parse_log(path: Path, raw: bytes) -> Table:
     """Read a log's columns with the reader of its suffix.
 
     Parameters

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from pneuopt.logs.columns import CHANNELS, ChannelColumn, Plant, find_columns, nearest_channel, plant_channels
 from pneuopt.logs.experiment import Experiment
-from pneuopt.logs.foreign import READERS, read_table
+from pneuopt.logs.foreign import READERS, parse_log
 from pneuopt.logs.read_log import Sidecar, assemble_log, read_sidecar
 from pneuopt.logs.table import Table, read_bytes
-from pneuopt.logs.text import block_table, decode, find_block, mend_cells
-from pneuopt.logs.text import read_delimited as csv_read_table
+from pneuopt.logs.text import block_table, decode, find_block, mend_cells, read_delimited
 from pneuopt.logs.tolerances import MAX_MAGNITUDE, MAX_ROWS_LISTED, MAX_ROWS_OUT
 from pneuopt.quantities.arrays import Mask
 from pneuopt.quantities.errors import LogError, require
@@ -91,8 +90,8 @@ def list_rows(rows: Sequence[int]) -> str:
 
 def _table_maker(path: Path, raw: bytes) -> Callable[[Sequence[str]], tuple[Table, dict[str, list[int]]]]:
     """A function from the columns that have to be numbers to the table, and what was mended in its cells."""
-    if READERS.get(path.suffix.lower()) is not csv_read_table:
-        return lambda _: (read_table(path, raw), {})
+    if READERS.get(path.suffix.lower()) is not read_delimited:
+        return lambda _: (parse_log(path, raw), {})
     block, layout = find_block(path, decode(path, raw))
 
     def make(used: Sequence[str]) -> tuple[Table, dict[str, list[int]]]:

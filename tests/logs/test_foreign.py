@@ -16,8 +16,7 @@ import scipy.io
 from scipy.io import savemat
 
 from pneuopt.logs.experiment import Experiment
-from pneuopt.logs.foreign import READERS
-from pneuopt.logs.foreign import read_mat as read_table
+from pneuopt.logs.foreign import READERS, read_mat
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.errors import LogError, UnknownNameError
 from tests.logs.binary_styles import BINARY_STYLES
@@ -28,7 +27,7 @@ TIME = 0.1 * np.arange(12)
 LOADMAT = """
 import io, resource, sys, warnings
 from scipy.io import loadmat
-from tests.logs.test_mat import damaged_files
+from tests.logs.test_foreign import damaged_files
 resource.setrlimit(resource.RLIMIT_AS, (2**31, 2**31))
 warnings.simplefilter("ignore")
 for k, raw in enumerate(damaged_files(int(sys.argv[2]))):
@@ -128,7 +127,7 @@ def test_damaged_files_end_scipys_process_and_not_ours() -> None:
     read = 0
     for raw in damaged_files(count):
         try:
-            read_table(Path("run.mat"), raw)
+            read_mat(Path("run.mat"), raw)
             read += 1
         except LogError:
             pass

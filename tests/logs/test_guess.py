@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pneuopt.logs.columns import CHANNELS
-from pneuopt.logs.foreign import read_table
+from pneuopt.logs.foreign import parse_log
 from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.arrays import Array
@@ -44,7 +44,7 @@ def guess(
         assert answer in question.options
         return answer
 
-    return guess_log(read_table(path, path.read_bytes()), channels, ask), asked
+    return guess_log(parse_log(path, path.read_bytes()), channels, ask), asked
 
 
 FOREIGN: dict[str, tuple[dict[str, Array], dict[str, str], set[str]]] = {
@@ -116,7 +116,7 @@ def test_a_command_from_0_to_10_v_that_leaves_doubt_is_asked_for(tmp_path: Path)
 def test_a_centre_that_is_estimated_is_not_rounded_to_5_v(tmp_path: Path) -> None:
     """A valve closed at 5.06 V: 5 V in the sidecar leave 60 mV, which become a smaller valve and dead zone."""
     log = write(tmp_path / "run.csv", {"t [s]": T, "u [V]": 5.06 + 2 * np.sin(9 * T), "x [mm]": T})
-    found = guess_log(read_table(log, log.read_bytes()), CHANNELS, lambda q: q.options[0], has_centre=True)
+    found = guess_log(parse_log(log, log.read_bytes()), CHANNELS, lambda q: q.options[0], has_centre=True)
     assert [(c.centre, c.centre_is_estimated) for c in found.columns] == [("", False), ("", True), ("", False)]
     assert [c.centre for c in guess(log)[0].columns] == ["", "5 V", ""]
 
