@@ -28,8 +28,8 @@ from pneuopt.files.first_files import (
     unused_channels,
 )
 from pneuopt.files.tolerances import SAMPLE_TIME
+from pneuopt.logs.columns import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.foreign import parse_log
-from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.table import Table, read_bytes
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
 from pneuopt.quantities.errors import check_names, require

@@ -936,7 +936,10 @@ def check_has_motion(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFi
         if y.size and not np.any(np.diff(y)) and (name == axis.position or y[0] == 0):
             message = f"{name!r} is constant: without motion friction is unidentifiable"
             yield LogFinding(name, message, True, evidence=_stillness(experiment, name, axis))
-        elif y.size >= 2 * MEAN_BLOCKS and (_is_motionless(y, noise) or (name == axis.position and _is_white(y))):
+        elif y.size >= 2 * MEAN_BLOCKS and (
+            _is_motionless(y, noise)
+            or (name == axis.position and bool(np.max(np.abs(_autocorrelation(y))) < 4 / math.sqrt(y.size)))
+        ):
             message = f"{name!r} shows noise and no motion: log a run in which the drive moves"
             yield LogFinding(name, message, True, evidence=_stillness(experiment, name, axis))
 
@@ -967,11 +970,6 @@ def _is_motionless(y: Array, noise: float) -> bool:
     is_small = float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
     flickers = float(np.ptp(y)) <= STILL_STEPS * find_resolution(y)
     return is_small and (flickers or float(np.max(np.abs(_autocorrelation(y)))) < MIN_SPEED_CORRELATION)
-
-
-def _is_white(y: Array) -> bool:
-    """Whether samples are uncorrelated, which the position of a moving mass never is."""
-    return bool(np.max(np.abs(_autocorrelation(y))) < 4 / math.sqrt(y.size))
 
 
 def _autocorrelation(y: Array) -> Array:
@@ -1016,7 +1014,10 @@ def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFindi
     work; the force brakes the motion on balance ; change the sign of 'force'
     """
     experiment = _with_noise(experiment, axis)
-    whole = _fill_between(experiment)
+    log = experiment.trajectory
+    known = {n: np.isfinite(log[n]) for n in log}
+    lacking = [n for n, there in known.items() if MIN_SPLINE <= there.sum() < there.size]
+    whole = replace(experiment, trajectory=log.with_columns({n: _spline(log.t, log[n], known[n]) for n in lacking}))
     logs = {name: experiment if name in SINGLE_SAMPLE_CHECKS else whole for name in CHECKS}
     named = ((name, finding) for name, check in CHECKS.items() for finding in check(logs[name], axis))
     found = [replace(finding, check=name, log=experiment.name) for name, finding in named]
@@ -1030,17 +1031,6 @@ def _with_noise(experiment: Experiment, axis: StatedAxis) -> Experiment:
         if name in log and name not in experiment.noise:
             found[name] = noise_level(log[name], log.t)
     return experiment.with_noise({name: level for name, level in found.items() if level > 0})
-
-
-def _fill_between(experiment: Experiment) -> Experiment:
-    """The log with each channel at every instant, as recorders that give each its own rate do not write it.
-
-    A spline runs through the samples, but not across a hole.
-    """
-    log = experiment.trajectory
-    known = {n: np.isfinite(log[n]) for n in log}
-    lacking = [n for n, there in known.items() if MIN_SPLINE <= there.sum() < there.size]
-    return replace(experiment, trajectory=log.with_columns({n: _spline(log.t, log[n], known[n]) for n in lacking}))
 
 
 def _spline(t: Array, column: Array, known: Mask) -> Array:

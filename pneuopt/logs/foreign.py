@@ -101,7 +101,10 @@ def read_lvm(path: Path, raw: bytes) -> Table:
     keys = {row[0]: row[1:] for row in rows}
     names = _names(rows[head])
     require(_TIME in rows[head], f"{path}: row {head + 1} names no {_TIME}; save the log again", LogError)
-    units = _units(names, keys.get("Y_Unit_Label", []))
+    labels = keys.get("Y_Unit_Label", [])
+    channels = [name for name in names[1:] if name]
+    said = {name: plain_unit(label) or label for name, label in zip(channels, labels, strict=False) if label}
+    units = {**said, "time": "s"}
     samples = [_without_comment(line, delimiter, names) for line in lines[head + 1 :]]
     block = TextBlock(path, names, samples, delimiter, head + 2)
     grid = _lvm_grid(path, keys) if keys.get("X_Columns", [""])[0] == "No" else None
@@ -114,12 +117,6 @@ def _names(row: Sequence[str]) -> list[str]:
     names = ["" if name == _TIME else name for name in row]
     names[names.index("") if "" in names else 0] = "time"
     return names[: names.index("Comment")] if "Comment" in names else names[: len(names) - (not names[-1])]
-
-
-def _units(names: Sequence[str], labels: Sequence[str]) -> dict[str, str]:
-    channels = [name for name in names[1:] if name]
-    said = {name: plain_unit(label) or label for name, label in zip(channels, labels, strict=False) if label}
-    return {**said, "time": "s"}
 
 
 def _without_comment(line: str, delimiter: str, names: Sequence[str]) -> str:
@@ -178,7 +175,12 @@ def read_mat(path: Path, raw: bytes) -> Table:
     `Name`, and their time is in seconds. NaN is a missing sample. Whatever else the file holds is left alone.
     """
     variables = (_flatten(_Column(name, value), 0) for name, value in _load(path, raw))
-    columns = [column for found in variables for column in found if _is_vector(column.values)]
+    columns = [
+        column
+        for found in variables
+        for column in found
+        if (isinstance(column.values, np.ndarray) and column.values.ndim == 1 and (column.values.dtype.kind in "fiub"))
+    ]
     require(bool(columns), f"{path}: no vector of numbers; {_STRUCTURE_REMEDY}", LogError)
     names = [column.name for column in columns]
     check_columns(path, names)
@@ -225,10 +227,6 @@ def _signal(name: str, element: Mapping[str, Any]) -> _Column | None:
                 return _Column("time", element[values], "s")
             return _Column(str(said), element[values], unit if isinstance(unit, str) else "")
     return None
-
-
-def _is_vector(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiub"
 
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -390,7 +388,15 @@ def _read_log(path: Path, raw: bytes) -> _Log:
 
     log = _Log({}, {}, {}, {})
     with foreign_code(path, "MDF"), asammdf.MDF(io.BytesIO(raw)) as file:
-        places = _places(file)
+        # Group and index of every channel but the groups' masters, by name.
+        found = [
+            (channel.name, group, index)
+            for group, entry in enumerate(file.groups)
+            for index, channel in enumerate(entry.channels)
+            if file.masters_db.get(group) != index
+        ]
+        uses = Counter(name for name, _, _ in found)
+        places = {name if uses[name] == 1 else f"{name} (group {g})": (g, i) for name, g, i in found}
         rows = [int(file.groups[group].channel_group.cycles_nr) for group, _ in places.values()]
         check_cells(path, sum(rows), 1)
         for name, (group, index) in places.items():
@@ -399,18 +405,6 @@ def _read_log(path: Path, raw: bytes) -> _Log:
                 log.columns[name], log.units[name] = channel.samples, str(channel.unit or "")
                 log.groups[name], log.times[group] = group, channel.timestamps
     return log
-
-
-def _places(file: Any) -> dict[str, tuple[int, int]]:
-    """Group and index of every channel but the groups' masters, by name."""
-    found = [
-        (channel.name, group, index)
-        for group, entry in enumerate(file.groups)
-        for index, channel in enumerate(entry.channels)
-        if file.masters_db.get(group) != index
-    ]
-    uses = Counter(name for name, _, _ in found)
-    return {name if uses[name] == 1 else f"{name} (group {g})": (g, i) for name, g, i in found}
 
 
 def _mdf_columns(path: Path, log: _Log, names: Sequence[str]) -> dict[str, Array]:
@@ -498,7 +492,9 @@ def read_tdms(path: Path, raw: bytes) -> Table:
         listed = nptdms.TdmsFile.read_metadata(io.BytesIO(raw))
         check_cells(path, sum(len(channel) for group in listed.groups() for channel in group.channels()), 1)
         file = nptdms.TdmsFile.read(io.BytesIO(raw))
-        channels = _by_name(file)
+        pairs = [(group.name, channel) for group in file.groups() for channel in group.channels() if len(channel)]
+        uses = Counter(channel.name for _, channel in pairs)
+        channels = {c.name if uses[c.name] == 1 else f"{group}/{c.name}": c for group, c in pairs}
         columns = {name: channel[:] for name, channel in channels.items()}
         grids = {name: grid for name, channel in channels.items() if (grid := _tdms_grid(channel)) is not None}
     units = {name: unit for name, channel in channels.items() if (unit := _tdms_unit(channel))}
@@ -506,12 +502,6 @@ def read_tdms(path: Path, raw: bytes) -> Table:
         return array_table(path, columns, units)
     table = array_table(path, {"time": np.zeros(0), **columns}, {**units, "time": "s"})
     return Table(path, table.names, 1, partial(_read_waveforms, table, grids), table.units, table.stamps)
-
-
-def _by_name(file: Any) -> dict[str, Any]:
-    pairs = [(group.name, channel) for group in file.groups() for channel in group.channels() if len(channel)]
-    uses = Counter(channel.name for _, channel in pairs)
-    return {c.name if uses[c.name] == 1 else f"{group}/{c.name}": c for group, c in pairs}
 
 
 def _tdms_grid(channel: Any) -> _Grid | None:
@@ -553,7 +543,15 @@ def read_xlsx(path: Path, raw: bytes) -> Table:
     """
     openpyxl = import_extra("openpyxl", "openpyxl", path, "an Excel workbook", "xlsx")
     with foreign_code(path, "an Excel workbook"):
-        sheets = _read_sheets(path, raw, openpyxl)
+        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        require(size <= MAX_BYTES, f"{path}: holds {size / 2**20:.0f} MiB of cells; export it as CSV", LogError)
+        book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
+        # openpyxl rounds dates to milliseconds; as numbers they keep all digits.
+        date_styles = book._date_formats | book._timedelta_formats
+        book._date_formats.clear()
+        book._timedelta_formats.clear()
+        sheets = {sheet.title: _read_cells(path, sheet, date_styles) for sheet in book.worksheets}
     shown = {title: [[_show(cell) for cell in row] for row in rows[:MAX_HEAD_ROWS]] for title, rows in sheets.items()}
     title = next((title for title, rows in shown.items() if has_table(rows)), next(iter(sheets), ""))
     require(any(shown.values()), f"{path}: no sheet holds cells; it has to name the columns in a row", LogError)
@@ -576,18 +574,6 @@ class _Sheet(NamedTuple):
     stamps: frozenset[str]
 
 
-def _read_sheets(path: Path, raw: bytes, openpyxl: Any) -> dict[str, list[list[Any]]]:
-    with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-        size = sum(member.file_size for member in archive.infolist())
-    require(size <= MAX_BYTES, f"{path}: holds {size / 2**20:.0f} MiB of cells; export it as CSV", LogError)
-    book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
-    # openpyxl rounds dates to milliseconds; as numbers they keep all digits.
-    date_styles = book._date_formats | book._timedelta_formats
-    book._date_formats.clear()
-    book._timedelta_formats.clear()
-    return {sheet.title: _read_cells(path, sheet, date_styles) for sheet in book.worksheets}
-
-
 def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]]:
     sheet.reset_dimensions()  # which some programs write wrong
     rows: list[list[Any]] = []
@@ -598,7 +584,14 @@ def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]
         require(
             empty <= MAX_EMPTY_ROWS, f"{path}: {empty} rows are empty; delete them, or what is below them", LogError
         )
-        rows.append([_Date(cell.value) if _is_date(cell, date_styles) else cell.value for cell in row])
+        rows.append(
+            [
+                _Date(cell.value)
+                if (cell.data_type == "n" and cell.value is not None and (cell._style_id in date_styles))
+                else cell.value
+                for cell in row
+            ]
+        )
         require(
             len(rows) <= MAX_SHEET_ROWS and width <= MAX_COLUMNS, f"{path}: the sheet is too large; cut it", LogError
         )
@@ -606,11 +599,6 @@ def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]
     while rows and all(cell is None for cell in rows[-1]):
         rows.pop()
     return [_without_tail(row) for row in rows]
-
-
-def _is_date(cell: Any, date_styles: Set[int]) -> bool:
-    # not by the cell's own `is_date`, which searches the style's text again for each cell: a quarter of the time
-    return cell.data_type == "n" and cell.value is not None and cell._style_id in date_styles
 
 
 def _without_tail(row: list[Any]) -> list[Any]:

@@ -8,8 +8,6 @@ MIN_SAMPLES = 10
 MAX_MAGNITUDE = 1e30
 """Magnitude of a sample in the file's unit [1]: more is the 9.91e37 by which instruments say overload; a smaller bound
 refuses counts."""
-MAX_ROWS_SHOWN = 20
-"""Rows that a message lists [1]: more fill the screen, fewer leave repeated stamps to be found one a run."""
 MAX_NAME_PARTS = 8
 """Words of a column's name that are compared with channels [1]: each costs a search; no channel has more than three."""
 

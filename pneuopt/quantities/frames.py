@@ -30,7 +30,10 @@ class WideFrame(pd.DataFrame):
         counts = isinstance(self.index, pd.RangeIndex) and self.index.name is None
         names = [] if counts else [", ".join(str(name or "") for name in self.index.names)]
         half = MAX_SHOWN_ROWS // 2
-        keys = ([] if counts else [_format_key(key)] for key in self.index)
+        keys = (
+            [] if counts else [", ".join(map(_format_cell, key if isinstance(key, tuple) else (key,)))]
+            for key in self.index
+        )
         values = self.itertuples(index=False, name=None)
         cells = [(*key, *map(_format_cell, row)) for key, row in zip(keys, values, strict=True)]
         heads = [Column(name, is_text=True) for name in names]
@@ -38,10 +41,6 @@ class WideFrame(pd.DataFrame):
         if len(cells) > MAX_SHOWN_ROWS:
             cells = [*cells[:half], ("...",) * len(heads), *cells[-half:]]
         return Report((Table(tuple(heads), tuple(cells)),)) if heads else Report()
-
-
-def _format_key(key: Any) -> str:
-    return ", ".join(map(_format_cell, key if isinstance(key, tuple) else (key,)))
 
 
 def _is_numeric(column: "pd.Series[Any]") -> bool:

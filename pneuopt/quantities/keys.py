@@ -222,7 +222,17 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
     if key.takes is Takes.COUNT:
         return _in_bounds(key, entry, entry, where)
     if key.takes is Takes.LIST:
-        return _read_list(key, entry, where, units)
+        entries = entry
+        least, most = key.counts
+        count = f"{least}" if least == most else f"{least} at least" if most == inf else f"{least} to {most:g}"
+        told = f"{where} must be a list of {count}, got {entries}{_remedy(key, where)}"
+        require(least <= len(entries) <= most, told)
+        item = key.of or (Key("", Takes.TEXT, choices=key.choices, named=key.named) if key.choices else None)
+        spots = [f"{where} {k}" if isinstance(entry, dict) else where for k, entry in enumerate(entries, 1)]
+        return tuple(
+            entry if item is None else read_entry(item, entry, spot, units)
+            for spot, entry in zip(spots, entries, strict=True)
+        )
     if key.takes is Takes.TABLE and key.keys:
         return read_table(key.keys, entry, where, units=units)
     if key.choices is not None:
@@ -266,19 +276,6 @@ def _in_bounds(key: Key, value: Any, entry: Any, where: str) -> Any:
     inside = key.least < value < key.most if key.is_open else key.least <= value <= key.most
     require(inside, f"{where} must be {key.limits}, got {entry}")
     return value
-
-
-def _read_list(key: Key, entries: list[Any], where: str, units: Mapping[str, str]) -> tuple[Any, ...]:
-    least, most = key.counts
-    count = f"{least}" if least == most else f"{least} at least" if most == inf else f"{least} to {most:g}"
-    told = f"{where} must be a list of {count}, got {entries}{_remedy(key, where)}"
-    require(least <= len(entries) <= most, told)
-    item = key.of or (Key("", Takes.TEXT, choices=key.choices, named=key.named) if key.choices else None)
-    spots = [f"{where} {k}" if isinstance(entry, dict) else where for k, entry in enumerate(entries, 1)]
-    return tuple(
-        entry if item is None else read_entry(item, entry, spot, units)
-        for spot, entry in zip(spots, entries, strict=True)
-    )
 
 
 def _read_samples(entry: Any, where: str) -> int:

@@ -50,7 +50,11 @@ def encode(value: Any) -> Any:
     import pandas as pd
 
     if isinstance(value, pd.DataFrame):
-        return _encode_frame(value)
+        levels = [value.index.get_level_values(k) for k in range(value.index.nlevels)]
+        return {
+            "index": [_encode_column(level.name, level) for level in levels],
+            "columns": [_encode_column(name, column) for name, column in value.items()],
+        }
     if isinstance(value, Enum):
         return value.value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -82,7 +86,11 @@ def decode(kind: Any, data: Any, where: str = "result") -> Any:
 
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is float:
-        return _decode_number(data, where)
+        if isinstance(data, str):
+            _expect(data in _NONFINITE, where)
+            return _NONFINITE[data]
+        _expect(isinstance(data, int | float) and not isinstance(data, bool), where)
+        return float(data)
     if kind in _PLAIN_TYPES:
         _expect(type(data) in _PLAIN_TYPES[kind], where)
         return data
@@ -134,14 +142,6 @@ def _encode_scalar(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is nothing that a result is saved with")
 
 
-def _decode_number(data: Any, where: str) -> float:
-    if isinstance(data, str):
-        _expect(data in _NONFINITE, where)
-        return _NONFINITE[data]
-    _expect(isinstance(data, int | float) and not isinstance(data, bool), where)
-    return float(data)
-
-
 def _decode_union(kinds: tuple[Any, ...], data: Any, where: str) -> Any:
     """The first kind that the data are of; the last one's error where they are of none."""
     for kind in kinds[:-1]:
@@ -150,14 +150,6 @@ def _decode_union(kinds: tuple[Any, ...], data: Any, where: str) -> Any:
         except DamagedError:
             continue
     return decode(kinds[-1], data, where)
-
-
-def _encode_frame(frame: "pd.DataFrame") -> dict[str, Any]:
-    levels = [frame.index.get_level_values(k) for k in range(frame.index.nlevels)]
-    return {
-        "index": [_encode_column(level.name, level) for level in levels],
-        "columns": [_encode_column(name, column) for name, column in frame.items()],
-    }
 
 
 def _encode_column(name: Any, column: Any) -> list[Any]:

@@ -77,8 +77,16 @@ def read_value(text: str | float, unit: str, *, where: str = "") -> float:
         unit_text = "1"
     factor, offset = _exact_conversion(unit_text, unit, where)
     value = _convert(number, factor, offset, where)
-    _check_vacuum(value, _split_level(unit)[1], text, where)
-    _check_absolute_zero(value, unit_text, text, where)
+    level = _split_level(unit)[1]
+    floor = {"a": 0.0, "g": -_gauge_zero.get()}.get(level, -math.inf)
+    require(
+        value >= floor or value == -math.inf,
+        f"{_place_prefix(where)}{text!r} lies below vacuum; check (a) and (g)",
+        UnitError,
+    )
+    # Refuse a temperature on a scale of its own, as degC, below 0 K; in K it may be a difference.
+    message = f"{_place_prefix(where)}{text!r} lies below absolute zero, -273.15 degC; check sign and unit"
+    require(value >= 0 or not _parse_unit(_split_level(unit_text)[0]).offset, message, UnitError)
     return value
 
 
@@ -268,21 +276,6 @@ def _convert(number: str, factor: Fraction, offset: Fraction, where: str) -> flo
 def _split_level(unit_text: str) -> tuple[str, str]:
     match = _PRESSURE_LEVEL.fullmatch(unit_text)
     return (match[1], match[2]) if match else (unit_text, "")
-
-
-def _check_vacuum(value: float, level: str, text: str | float, where: str) -> None:
-    floor = {"a": 0.0, "g": -_gauge_zero.get()}.get(level, -math.inf)
-    require(
-        value >= floor or value == -math.inf,
-        f"{_place_prefix(where)}{text!r} lies below vacuum; check (a) and (g)",
-        UnitError,
-    )
-
-
-def _check_absolute_zero(value: float, unit_text: str, text: str | float, where: str) -> None:
-    """Refuse a temperature on a scale of its own, as degC, below 0 K; in K it may be a difference."""
-    message = f"{_place_prefix(where)}{text!r} lies below absolute zero, -273.15 degC; check sign and unit"
-    require(value >= 0 or not _parse_unit(_split_level(unit_text)[0]).offset, message, UnitError)
 
 
 def _parse_unit(unit_text: str, where: str = "") -> _UnitScale:

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.columns import CHANNELS, LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.foreign import parse_log
-from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError
@@ -155,7 +154,7 @@ def test_a_log_that_says_nothing_is_refused(columns: dict[str, Array], message: 
 def test_an_entry_is_toml_whatever_the_name(name: str) -> None:
     import tomllib
 
-    from pneuopt.logs.guess import ColumnGuess
+    from pneuopt.logs.columns import ColumnGuess
 
     assert tomllib.loads(f"x = {ColumnGuess('position', name, 'mm').entry}")["x"] == {"column": name, "unit": "mm"}
 

@@ -208,7 +208,8 @@ def test_all_rows_whose_time_repeats_are_told_at_once(tmp_path: Path) -> None:
     )
     coarse = HEADER + "".join(f"{k // 10},{k}\n" for k in range(300))
     with pytest.raises(
-        LogError, match=r"23, 24, \.\.\. \(270 in all\): .*too coarse for the samples; export it with more"
+        LogError,
+        match=r"rows 3 to 11, 13 to 21, .*, \.\.\. \(270 in all\): .*too coarse for the samples; export it with more",
     ):
         read_log(written(tmp_path, coarse))
 
