@@ -1,23 +1,7 @@
-"""Reader of LabVIEW's measurement files (.lvm).
+"""Readers of foreign formats: LabVIEW, MATLAB, MDF, Parquet, TDMS, Excel; one function and one row of `READERS` a suffix.
 
-Reader of MATLAB's .mat logs, versions 4 to 7: vectors, structures of them, Simulink's and dSPACE's structures.
-
-The variables of a .mat file of version 5 to 7: arrays, texts and structures of them; the rest is left alone.
-
-The format: MathWorks, "MAT-File Format", chapter 1. SciPy's own reader trusts the sizes in a file, as its documentation
-warns: some damaged logs end the whole process.
-
-Reader of ASAM's measurement data format (.mf4, .mdf); needs asammdf, the extra `mdf`.
-
-Reader of Parquet logs, as pandas, Spark and data loggers write them; needs pyarrow, the extra `parquet`.
-
-Reader of National Instruments' TDMS logs; needs npTDMS, the extra `tdms`.
-
-Reader of Excel's workbooks (.xlsx): the first sheet with names and samples; needs openpyxl, the extra `xlsx`.
-
-The registry of log formats: one reader a suffix. A new format is a file with a `read_table`, and a row here.
-
-Each reader takes what `read_table` takes, and raises what it raises.
+Each takes the path, for messages, and the bytes of a file, and returns a `Table` or raises a `LogError`; where a library
+reads the format for us, an `InputError` says how to get it.
 """
 
 import io
@@ -101,11 +85,9 @@ def read_lvm(path: Path, raw: bytes) -> Table:
     keys = {row[0]: row[1:] for row in rows}
     names = _names(rows[head])
     require(_TIME in rows[head], f"{path}: row {head + 1} names no {_TIME}; save the log again", LogError)
-    labels = keys.get("Y_Unit_Label", [])
-    channels = [name for name in names[1:] if name]
-    said = {name: plain_unit(label) or label for name, label in zip(channels, labels, strict=False) if label}
-    units = {**said, "time": "s"}
-    samples = [_without_comment(line, delimiter, names) for line in lines[head + 1 :]]
+    labels = zip([name for name in names[1:] if name], keys.get("Y_Unit_Label", []), strict=False)
+    units = {**{name: plain_unit(label) or label for name, label in labels if label}, "time": "s"}
+    samples = [delimiter.join(line.split(delimiter)[: len(names)]) for line in lines[head + 1 :]]  # without a comment
     block = TextBlock(path, names, samples, delimiter, head + 2)
     grid = _lvm_grid(path, keys) if keys.get("X_Columns", [""])[0] == "No" else None
     remark = f"rows 1 to {head} are read as the head of a LabVIEW measurement file"
@@ -117,12 +99,6 @@ def _names(row: Sequence[str]) -> list[str]:
     names = ["" if name == _TIME else name for name in row]
     names[names.index("") if "" in names else 0] = "time"
     return names[: names.index("Comment")] if "Comment" in names else names[: len(names) - (not names[-1])]
-
-
-def _without_comment(line: str, delimiter: str, names: Sequence[str]) -> str:
-    """A row without what stands behind its last channel."""
-    cells = line.split(delimiter)
-    return delimiter.join(cells[: len(names)])
 
 
 def _lvm_grid(path: Path, keys: Mapping[str, Sequence[str]]) -> tuple[float, float]:
@@ -147,14 +123,11 @@ def _lvm_columns(block: TextBlock, grid: tuple[float, float] | None, names: Sequ
         return {name: time if name == "time" else columns[name] for name in names}
     columns = block.columns(names)
     for i in times[1:]:
-        own = TextBlock(block.path, _rename(block.names, i), block.lines, block.delimiter, block.first_row)
+        renamed = ["own" if k == i else name for k, name in enumerate(block.names)]
+        own = TextBlock(block.path, renamed, block.lines, block.delimiter, block.first_row)
         same = np.array_equal(own.columns(["own"])["own"], own.columns(["time"])["time"])
         require(same, f"{block.path}: the channels have times of their own; save them with one X column", LogError)
     return columns
-
-
-def _rename(names: Sequence[str], index: int) -> list[str]:
-    return ["own" if i == index else name for i, name in enumerate(names)]
 
 
 _STRUCTURE_REMEDY = "in MATLAB, save('run.mat', '-struct', 'S') with S a structure of vectors; of a table T, "
@@ -174,32 +147,26 @@ def read_mat(path: Path, raw: bytes) -> Table:
     structure array, as Simulink's ("Structure With Time") and dSPACE's, each element is a column by its `label` or
     `Name`, and their time is in seconds. NaN is a missing sample. Whatever else the file holds is left alone.
     """
-    variables = (_flatten(_Column(name, value), 0) for name, value in _load(path, raw))
-    columns = [
-        column
-        for found in variables
-        for column in found
-        if (isinstance(column.values, np.ndarray) and column.values.ndim == 1 and (column.values.dtype.kind in "fiub"))
-    ]
+    remedy = "in MATLAB, save it with the option '-v7'"
+    require(b"MATLAB 7.3" not in raw[:20], f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}", LogError)
+    variables: list[tuple[str, Any]] = []
+    with foreign_code(path, "a .mat file"):
+        if raw[HEAD_BYTES - 4 : HEAD_BYTES] in {b"\x00\x01IM", b"\x01\x00MI"}:  # versions 5 to 7
+            variables = read_elements(raw)
+        else:
+            require(0 in raw[:4], "its head names no version from 4 to 7")  # SciPy would read it as version 5
+            from scipy.io import loadmat
+
+            file: Any = io.BytesIO(raw)  # which the types do not know
+            variables = [(n, v) for n, v in loadmat(file, squeeze_me=True).items() if not n.startswith("__")]
+    flat = [column for name, value in variables for column in _flatten(_Column(name, value), 0)]
+    columns = [c for c in flat if isinstance(c.values, np.ndarray) and c.values.ndim == 1]
+    columns = [c for c in columns if c.values.dtype.kind in "fiub"]
     require(bool(columns), f"{path}: no vector of numbers; {_STRUCTURE_REMEDY}", LogError)
     names = [column.name for column in columns]
     check_columns(path, names)
     units = {column.name: column.unit for column in columns if column.unit}
     return array_table(path, {column.name: column.values for column in columns}, units)
-
-
-def _load(path: Path, raw: bytes) -> list[tuple[str, Any]]:
-    remedy = "in MATLAB, save it with the option '-v7'"
-    require(b"MATLAB 7.3" not in raw[:20], f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}", LogError)
-    with foreign_code(path, "a .mat file"):
-        if has_elements(raw):
-            return read_elements(raw)
-        require(0 in raw[:4], "its head names no version from 4 to 7")  # SciPy would read it as version 5
-        from scipy.io import loadmat
-
-        file: Any = io.BytesIO(raw)  # which the types do not know
-        return [(n, v) for n, v in loadmat(file, squeeze_me=True).items() if not n.startswith("__")]  # loadmat's own
-    raise AssertionError  # the context lets no error pass
 
 
 def _flatten(column: _Column, depth: int) -> Iterator[_Column]:
@@ -240,31 +207,17 @@ class _Element(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """A structure, or an array of them.
-
-    Attributes
-    ----------
-    elements : list of dict
-        A field's value by its name.
-    """
+    """A structure, or an array of them: each element's values by field."""
 
     elements: list[dict[str, Any]]
     fields: tuple[str, ...]
 
 
-def has_elements(raw: bytes) -> bool:
-    """Whether a file says that it is of version 5 to 7."""
-    head = raw[HEAD_BYTES - 4 : HEAD_BYTES]
-    return head in {b"\x00\x01IM", b"\x01\x00MI"}
-
-
 def read_elements(raw: bytes) -> list[tuple[str, Any]]:
     """Read the variables: arrays without dimensions of length one, texts, structures; None for all others.
 
-    Raises
-    ------
-    InputError
-        If sizes, types or nesting contradict each other.
+    The format is that of MathWorks, "MAT-File Format", chapter 1. SciPy's own reader trusts the sizes in a file, as its
+    documentation warns: some damaged logs end the whole process.
     """
     order = "<" if raw[HEAD_BYTES - 2 : HEAD_BYTES] == b"IM" else ">"
     budget, found = MAX_BYTES, []
@@ -306,27 +259,22 @@ def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
     kind, is_complex = word & 0xFF, bool(word & 0x800)
     if kind not in {_STRUCTURE, _CHARACTERS, *_NUMERIC} or is_complex:
         return "", None
-    shape, name = _shape(_next(parts), order), _text(_next(parts), order)
-    if kind == _STRUCTURE:
-        return name, _structure(parts, math.prod(shape), order, level)
-    part = _next(parts)
-    return name, _text(part, order) if kind == _CHARACTERS else _array(part, shape, order)
-
-
-def _shape(dims: _Element, order: str) -> tuple[int, ...]:
+    dims = _next(parts)
     n = len(dims.data) // 4
     require(dims.kind in {5, 6} and 1 <= n <= 32 and len(dims.data) == 4 * n, "an array has no size")
     shape = struct.unpack_from(f"{order}{n}i", dims.data)
     require(min(shape) >= 0 and math.prod(shape) <= MAX_BYTES, "an array has an impossible size")
-    return shape
-
-
-def _array(part: _Element, shape: tuple[int, ...], order: str) -> Any:
+    name = _text(_next(parts), order)
+    if kind == _STRUCTURE:
+        return name, _structure(parts, math.prod(shape), order, level)
+    part = _next(parts)
+    if kind == _CHARACTERS:
+        return name, _text(part, order)
     require(part.kind in _NUMBERS, "numbers are none")
     dtype = np.dtype(order + _NUMBERS[part.kind])
     require(len(part.data) == math.prod(shape) * dtype.itemsize, "an array has another size than it says")
     array = np.frombuffer(part.data, dtype).reshape(shape, order="F")
-    return array.astype(_NUMBERS[part.kind]).squeeze()
+    return name, array.astype(_NUMBERS[part.kind]).squeeze()
 
 
 def _text(part: _Element, order: str) -> str:
@@ -357,9 +305,6 @@ def _next(parts: Iterator[_Element]) -> _Element:
     return part
 
 
-TIME = "time"
-
-
 def read_mdf(path: Path, raw: bytes) -> Table:
     """Read an MDF file; its first sample is row 1.
 
@@ -367,10 +312,10 @@ def read_mdf(path: Path, raw: bytes) -> Table:
     master of the group that the channels are of. Channels of groups with different times are refused.
     """
     import_extra("asammdf", "asammdf", path, "MDF", "mdf")
-    log = run_apart(_read_log, path, raw, kind="MDF")
-    names = [TIME, *(name for name in log.columns if name.casefold() != TIME)]
+    log = run_apart(_read_mdf_channels, path, raw, kind="MDF")
+    names = ["time", *(name for name in log.columns if name.casefold() != "time")]
     units = {name: plain_unit(unit) or unit for name, unit in log.units.items() if unit}
-    return Table(path, names, 1, partial(_mdf_columns, path, log), {**units, TIME: "s"})
+    return Table(path, names, 1, partial(_mdf_columns, path, log), {**units, "time": "s"})
 
 
 class _Log(NamedTuple):
@@ -382,13 +327,13 @@ class _Log(NamedTuple):
     times: dict[int, Any]
 
 
-def _read_log(path: Path, raw: bytes) -> _Log:
+def _read_mdf_channels(path: Path, raw: bytes) -> _Log:
     """Read all channels that hold numbers."""
     import asammdf
 
     log = _Log({}, {}, {}, {})
     with foreign_code(path, "MDF"), asammdf.MDF(io.BytesIO(raw)) as file:
-        # Group and index of every channel but the groups' masters, by name.
+        # group and index of every channel but the groups' masters, by name
         found = [
             (channel.name, group, index)
             for group, entry in enumerate(file.groups)
@@ -408,11 +353,11 @@ def _read_log(path: Path, raw: bytes) -> _Log:
 
 
 def _mdf_columns(path: Path, log: _Log, names: Sequence[str]) -> dict[str, Array]:
-    channels = [name for name in names if name != TIME]
+    channels = [name for name in names if name != "time"]
     times = [log.times[log.groups[name]] for name in channels]
     text = f"{path}: channels {', '.join(channels)} are of groups with different times; export them at one rate"
     require(all(np.array_equal(t, times[0], equal_nan=True) for t in times), text, LogError)
-    columns = {TIME: times[0], **{name: log.columns[name] for name in channels}}
+    columns = {"time": times[0], **{name: log.columns[name] for name in channels}}
     return dict(array_table(path, columns, {}).read(names))
 
 
@@ -426,8 +371,18 @@ def read_parquet(path: Path, raw: bytes) -> Table:
         fields = list(file.schema_arrow)
         check_cells(path, file.metadata.num_rows, len(fields))
     stamps = frozenset(field.name for field in fields if _is_time(field.type))
-    units = {field.name: unit for field in fields if (unit := _parquet_unit(field))}
+    texts = {f.name: {k.decode(): v.decode(errors="replace") for k, v in (f.metadata or {}).items()} for f in fields}
+    units = {name: unit for name, said in texts.items() if (unit := _unit(said))}
     return Table(path, [field.name for field in fields], 1, partial(_parquet_columns, path, raw), units, stamps)
+
+
+_UNIT_KEYS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "units")
+
+
+def _unit(properties: Mapping[str, Any]) -> str:
+    """The unit of a channel by the keys that National Instruments and several loggers use; empty where none says it."""
+    said = next((str(properties[key]) for key in _UNIT_KEYS if properties.get(key)), "")
+    return plain_unit(said) or said
 
 
 @contextmanager
@@ -444,7 +399,7 @@ def _parquet_columns(path: Path, raw: bytes, names: Sequence[str]) -> dict[str, 
     with _parquet_file(path, raw) as file:
         places = [file.schema_arrow.names.index(name) for name in names]
         columns = file.read()
-        return {name: _floats(path, name, columns.column(i)) for name, i in zip(names, places, strict=True)}
+        return {name: _parquet_numbers(path, name, columns.column(i)) for name, i in zip(names, places, strict=True)}
 
 
 def _is_time(kind: "pa.DataType") -> bool:
@@ -453,15 +408,7 @@ def _is_time(kind: "pa.DataType") -> bool:
     return bool(pa.types.is_timestamp(kind) or pa.types.is_duration(kind))
 
 
-def _parquet_unit(field: "pa.Field") -> str:
-    """What a field's metadata say, by the key that several loggers use."""
-    metadata = field.metadata or {}
-    said = next((metadata[key].decode(errors="replace") for key in (b"unit", b"units") if key in metadata), "")
-    return plain_unit(said) or said
-
-
-def _floats(path: Path, name: str, column: "pa.ChunkedArray") -> Array:
-    import numpy as np
+def _parquet_numbers(path: Path, name: str, column: "pa.ChunkedArray") -> Array:
     import pyarrow as pa
 
     kind = column.type
@@ -477,7 +424,6 @@ def _floats(path: Path, name: str, column: "pa.ChunkedArray") -> Array:
     return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=float)
 
 
-_UNIT_KEYS = ("unit_string", "NI_UnitDescription", "Unit", "unit")
 _Grid = tuple[str, float, float]  # when the first sample was taken, its time and the step [s]
 
 
@@ -497,7 +443,7 @@ def read_tdms(path: Path, raw: bytes) -> Table:
         channels = {c.name if uses[c.name] == 1 else f"{group}/{c.name}": c for group, c in pairs}
         columns = {name: channel[:] for name, channel in channels.items()}
         grids = {name: grid for name, channel in channels.items() if (grid := _tdms_grid(channel)) is not None}
-    units = {name: unit for name, channel in channels.items() if (unit := _tdms_unit(channel))}
+    units = {name: unit for name, channel in channels.items() if (unit := _unit(channel.properties))}
     if not grids or any(name.casefold() == "time" for name in columns):
         return array_table(path, columns, units)
     table = array_table(path, {"time": np.zeros(0), **columns}, {**units, "time": "s"})
@@ -510,11 +456,6 @@ def _tdms_grid(channel: Any) -> _Grid | None:
         return None
     start = float(properties.get("wf_start_offset", 0.0))
     return str(properties.get("wf_start_time", "")), start, float(properties["wf_increment"])
-
-
-def _tdms_unit(channel: Any) -> str:
-    said = next((str(channel.properties[key]) for key in _UNIT_KEYS if channel.properties.get(key)), "")
-    return plain_unit(said) or said
 
 
 def _read_waveforms(table: Table, grids: dict[str, _Grid], names: Sequence[str]) -> dict[str, Array]:
@@ -584,27 +525,19 @@ def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]
         require(
             empty <= MAX_EMPTY_ROWS, f"{path}: {empty} rows are empty; delete them, or what is below them", LogError
         )
-        rows.append(
-            [
-                _Date(cell.value)
-                if (cell.data_type == "n" and cell.value is not None and (cell._style_id in date_styles))
-                else cell.value
-                for cell in row
-            ]
-        )
+        # not by a cell's own `is_date`, which searches the style's text again for each: a quarter of the time
+        dates = [cell.data_type == "n" and cell.value is not None and cell._style_id in date_styles for cell in row]
+        rows.append([_Date(c.value) if is_date else c.value for c, is_date in zip(row, dates, strict=True)])
         require(
             len(rows) <= MAX_SHEET_ROWS and width <= MAX_COLUMNS, f"{path}: the sheet is too large; cut it", LogError
         )
         check_cells(path, len(rows), width)
     while rows and all(cell is None for cell in rows[-1]):
         rows.pop()
-    return [_without_tail(row) for row in rows]
-
-
-def _without_tail(row: list[Any]) -> list[Any]:
-    while row and row[-1] is None:
-        row.pop()
-    return row
+    for cells in rows:
+        while cells and cells[-1] is None:
+            cells.pop()
+    return rows
 
 
 def _show(cell: Any) -> str:
@@ -617,16 +550,16 @@ def _xlsx_columns(sheet: _Sheet, names: Sequence[str]) -> dict[str, Array]:
     width = len(sheet.names)
     for i, row in enumerate(sheet.rows, sheet.first_row):
         require(len(row) <= width, f"{sheet.path}: row {i} has {len(row)} cells, the header {width}; mend it", LogError)
-    return {name: _column(sheet, name) for name in names}
-
-
-def _column(sheet: _Sheet, name: str) -> Array:
-    i = sheet.names.index(name)
-    cells = [row[i] if i < len(row) else None for row in sheet.rows]
-    if name in sheet.stamps and not isinstance(cells[0], _Date):
-        return seconds_from_first([_show(cell) for cell in cells], sheet.path, name, sheet.first_row)
-    numbers = np.array([_number(sheet, name, k, cell) for k, cell in enumerate(cells)])
-    return _seconds(sheet, name, numbers) if name in sheet.stamps else numbers
+    columns = {}
+    for name in names:
+        i = sheet.names.index(name)
+        cells = [row[i] if i < len(row) else None for row in sheet.rows]
+        if name in sheet.stamps and not isinstance(cells[0], _Date):
+            columns[name] = seconds_from_first([_show(cell) for cell in cells], sheet.path, name, sheet.first_row)
+            continue
+        numbers = np.array([_number(sheet, name, k, cell) for k, cell in enumerate(cells)])
+        columns[name] = _seconds(sheet, name, numbers) if name in sheet.stamps else numbers
+    return columns
 
 
 def _number(sheet: _Sheet, name: str, index: int, cell: Any) -> float:
@@ -667,22 +600,7 @@ READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
 
 
 def parse_log(path: Path, raw: bytes) -> Table:
-    """Read a log's columns with the reader of its suffix.
-
-    Parameters
-    ----------
-    path : Path
-        Its suffix says the format, and messages name it.
-    raw : bytes
-        What the file holds.
-
-    Raises
-    ------
-    LogError
-        If no reader has that suffix, or the file is not of that format, is damaged, or holds no samples.
-    InputError
-        If the library that reads the format is not installed.
-    """
+    """Read a log's columns from the bytes of a file with the reader of its path's suffix."""
     suffix = path.suffix.lower()
     shown = f"{suffix!r} files" if suffix else "a name without suffix"
     require(suffix in READERS, f"{path}: no reader for {shown}; known: {', '.join(READERS)}", LogError)

@@ -142,7 +142,7 @@ def _levels(t: Array, y: Array) -> list[_Level]:
 
 
 def _quiet_level(off: Array, order: int) -> tuple[float, float]:
-    """The deviation of all differences or of their quietest quarter of blocks, and its standard deviation, over itself."""
+    """The deviation of all differences or of their quietest blocks, and its standard deviation, over itself."""
     # neighbours share samples: this many count as one
     shared = math.comb(4 * order, 2 * order) / math.comb(2 * order, order) ** 2
     uncertainty = MAD_SPREAD * math.sqrt(shared / off.size)
