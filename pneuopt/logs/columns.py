@@ -17,7 +17,6 @@ from pneuopt.logs.table import EMPTY_CELL, Table, list_rows
 from pneuopt.logs.tolerances import (
     CENTRES,
     MAX_MAGNITUDE,
-    MAX_NAME_PARTS,
     MIN_SAMPLES,
     RANGE,
     SHOWN_CENTRES,
@@ -172,7 +171,7 @@ def nearest_channel(name: str, channels: Mapping[str, str]) -> str:
     bare, unit = split_unit(name)
     if _split_channel(name, channels)[0]:
         return ""
-    parts = bare.casefold().replace(" ", "_").split("_")[:MAX_NAME_PARTS]
+    parts = bare.casefold().replace(" ", "_").split("_")
     for n in range(len(parts), 0 if not unit else len(parts) - 1, -1):
         head = "_".join(parts[:n])
         near = difflib.get_close_matches(head, channels, n=1, cutoff=0.85) or [_SYNONYMS.get(head, "")]

@@ -1,7 +1,7 @@
-"""Readers of foreign formats: LabVIEW, MATLAB, MDF, Parquet, TDMS, Excel; one function and one row of `READERS` a suffix.
+"""Readers of foreign formats: LabVIEW, MATLAB, MDF, Parquet, TDMS, Excel; one function and one row of `READERS` each.
 
-Each takes the path, for messages, and the bytes of a file, and returns a `Table` or raises a `LogError`; where a library
-reads the format for us, an `InputError` says how to get it.
+A reader takes the path, for messages, and the bytes of a file, and returns a `Table` or raises a `LogError`; where a
+library reads the format for us, an `InputError` says how to get it.
 """
 
 import io
@@ -12,6 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
+from enum import IntEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -41,9 +42,6 @@ from pneuopt.logs.text import (
     seconds_from_first,
 )
 from pneuopt.logs.tolerances import (
-    COMPRESSED,
-    HEAD_BYTES,
-    MATRIX,
     MAX_BYTES,
     MAX_COLUMNS,
     MAX_DAYS,
@@ -52,7 +50,6 @@ from pneuopt.logs.tolerances import (
     MAX_HEAD_ROWS,
     MAX_LEVELS,
     MAX_MAGNITUDE,
-    MAX_SHEET_ROWS,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, require
@@ -151,7 +148,7 @@ def read_mat(path: Path, raw: bytes) -> Table:
     require(b"MATLAB 7.3" not in raw[:20], f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}", LogError)
     variables: list[tuple[str, Any]] = []
     with foreign_code(path, "a .mat file"):
-        if raw[HEAD_BYTES - 4 : HEAD_BYTES] in {b"\x00\x01IM", b"\x01\x00MI"}:  # versions 5 to 7
+        if raw[124:128] in {b"\x00\x01IM", b"\x01\x00MI"}:  # versions 5 to 7
             variables = read_elements(raw)
         else:
             require(0 in raw[:4], "its head names no version from 4 to 7")  # SciPy would read it as version 5
@@ -198,7 +195,15 @@ def _signal(name: str, element: Mapping[str, Any]) -> _Column | None:
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
-_STRUCTURE, _CHARACTERS, _NUMERIC = 2, 4, range(6, 16)
+
+
+class _Kind(IntEnum):
+    """Types of elements, and classes of arrays."""
+
+    MATRIX = 14
+    COMPRESSED = 15
+    STRUCTURE_ARRAY = 2
+    CHARACTER_ARRAY = 4
 
 
 class _Element(NamedTuple):
@@ -219,10 +224,10 @@ def read_elements(raw: bytes) -> list[tuple[str, Any]]:
     The format is that of MathWorks, "MAT-File Format", chapter 1. SciPy's own reader trusts the sizes in a file, as its
     documentation warns: some damaged logs end the whole process.
     """
-    order = "<" if raw[HEAD_BYTES - 2 : HEAD_BYTES] == b"IM" else ">"
+    order = "<" if raw[126:128] == b"IM" else ">"
     budget, found = MAX_BYTES, []
-    for element in _elements(memoryview(raw)[HEAD_BYTES:], order):
-        if element.kind == COMPRESSED:
+    for element in _elements(memoryview(raw)[128:], order):
+        if element.kind == _Kind.COMPRESSED:
             unpacked = zlib.decompressobj().decompress(element.data, budget)
             budget -= len(unpacked)
             require(budget > 0, "it unpacks to more than a log's size")
@@ -244,11 +249,11 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
             require(size <= 4, "a short element is too long")
         require(start + size <= len(data), "an element is longer than what holds it")
         yield _Element(kind, data[start : start + size])
-        at = start + size if kind == COMPRESSED else at + 8 * math.ceil((start + size - at) / 8)
+        at = start + size if kind == _Kind.COMPRESSED else at + 8 * math.ceil((start + size - at) / 8)
 
 
 def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
-    require(element.kind == MATRIX, f"an element of type {element.kind} stands where a variable should")
+    require(element.kind == _Kind.MATRIX, f"an element of type {element.kind} stands where a variable should")
     require(level < MAX_LEVELS, "it is nested too deep")
     parts = _elements(element.data, order)
     flags = next(parts, None)
@@ -257,7 +262,7 @@ def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
     require(len(flags.data) == 8, "a variable has no flags")
     word = struct.unpack_from(order + "I", flags.data)[0]
     kind, is_complex = word & 0xFF, bool(word & 0x800)
-    if kind not in {_STRUCTURE, _CHARACTERS, *_NUMERIC} or is_complex:
+    if kind not in {_Kind.STRUCTURE_ARRAY, _Kind.CHARACTER_ARRAY, *range(6, 16)} or is_complex:
         return "", None
     dims = _next(parts)
     n = len(dims.data) // 4
@@ -265,10 +270,10 @@ def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
     shape = struct.unpack_from(f"{order}{n}i", dims.data)
     require(min(shape) >= 0 and math.prod(shape) <= MAX_BYTES, "an array has an impossible size")
     name = _text(_next(parts), order)
-    if kind == _STRUCTURE:
+    if kind == _Kind.STRUCTURE_ARRAY:
         return name, _structure(parts, math.prod(shape), order, level)
     part = _next(parts)
-    if kind == _CHARACTERS:
+    if kind == _Kind.CHARACTER_ARRAY:
         return name, _text(part, order)
     require(part.kind in _NUMBERS, "numbers are none")
     dtype = np.dtype(order + _NUMBERS[part.kind])
@@ -528,9 +533,6 @@ def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]
         # not by a cell's own `is_date`, which searches the style's text again for each: a quarter of the time
         dates = [cell.data_type == "n" and cell.value is not None and cell._style_id in date_styles for cell in row]
         rows.append([_Date(c.value) if is_date else c.value for c, is_date in zip(row, dates, strict=True)])
-        require(
-            len(rows) <= MAX_SHEET_ROWS and width <= MAX_COLUMNS, f"{path}: the sheet is too large; cut it", LogError
-        )
         check_cells(path, len(rows), width)
     while rows and all(cell is None for cell in rows[-1]):
         rows.pop()

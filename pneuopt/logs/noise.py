@@ -14,11 +14,8 @@ from numpy.typing import ArrayLike
 from pneuopt.logs.tolerances import (
     BLOCK,
     LATTICE_TOLERANCE,
-    MAD_SPREAD,
     MAX_CORRELATION,
-    MIN_BLOCKS,
     ORDERS,
-    QUIET_QUARTILE,
     ROUNDING,
     WHITE_LAGS,
 )
@@ -145,16 +142,18 @@ def _quiet_level(off: Array, order: int) -> tuple[float, float]:
     """The deviation of all differences or of their quietest blocks, and its standard deviation, over itself."""
     # neighbours share samples: this many count as one
     shared = math.comb(4 * order, 2 * order) / math.comb(2 * order, order) ** 2
-    uncertainty = MAD_SPREAD * math.sqrt(shared / off.size)
+    # 1.17 / sqrt(n): standard deviation of the median absolute deviation of n normal numbers, over itself
+    uncertainty = 1.17 * math.sqrt(shared / off.size)
     sizes, count = np.abs(off), max(1, off.size // BLOCK)
     whole = 1.4826 * float(np.median(sizes))
-    if count < MIN_BLOCKS:
+    if count < 4:  # a quarter of them is none
         return whole, uncertainty
     length, longer = divmod(off.size, count)  # the first blocks are one longer
     parts = np.split(sizes, [longer * (length + 1)])
     blocks = parts[0].reshape(longer, length + 1), parts[1].reshape(-1, length)
     deviations = 1.4826 * np.concatenate([np.median(block, axis=1) for block in blocks])
-    quiet = float(np.quantile(deviations, 0.25)) / (1 + QUIET_QUARTILE * uncertainty * math.sqrt(count))
+    # a quarter of the blocks need to be quiet: -0.674 is the lower quartile of a normal variable
+    quiet = float(np.quantile(deviations, 0.25)) / (1 - 0.674 * uncertainty * math.sqrt(count))
     return whole if whole < (1 + 4 * uncertainty) * quiet else quiet, uncertainty
 
 

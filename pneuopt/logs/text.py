@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pneuopt.logs.table import EMPTY_CELL, Table, check_cells
-from pneuopt.logs.tolerances import DAY, MAX_HEAD_ROWS, MIN_BLOCK_ROWS
+from pneuopt.logs.tolerances import MAX_HEAD_ROWS, MIN_BLOCK_ROWS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.units import is_unit
@@ -280,7 +280,7 @@ class TextBlock:
 
 
 def mend_cells(block: TextBlock, used: Sequence[str]) -> tuple[TextBlock, dict[str, list[int]]]:
-    """Empty rows of another length than the header, and cells of columns `used` that hold no number, with what was done."""
+    """Empty rows of another length than the header and cells of columns `used` that hold no number; both are listed."""
     width, changes = len(block.names), dict[str, list[int]]()
     cells = [split_cells(line, block.delimiter) for line in block.lines]
     cells = [row[:-1] if len(row) == width + 1 and not row[-1] else row for row in cells]
@@ -439,10 +439,10 @@ def seconds_from_first(cells: Sequence[str], path: Path | str, name: str, first_
     for k, match in enumerate(matches):
         moments.append(_nanoseconds(match, days, month_first, places[k]) if match else None)
     if not any(days):
-        shift, last = 0, None
+        day, shift, last = 86400 * 10**9, 0, None
         for k, moment in enumerate(moments):
             if moment is not None:
-                shift += DAY if last is not None and moment + DAY // 2 < last else 0
+                shift += day if last is not None and moment + day // 2 < last else 0
                 last, moments[k] = moment, moment + shift
     start = next((moment for moment in moments if moment is not None), 0)
     return np.array([np.nan if m is None else (m - start) / 1e9 for m in moments])
@@ -472,7 +472,7 @@ def _nanoseconds(match: re.Match[str], days: dict[str, int], month_first: bool, 
     zone = (match["zone"] or "Z").replace(":", "").replace("Z", "+0000").ljust(5, "0")
     shift = (int(zone[1:3]) * 60 + int(zone[3:5])) * (-1 if zone[0] == "-" else 1)
     fraction = int((match["f"] or "0").ljust(9, "0"))
-    return days[text] * DAY + ((hour * 60 + minute - shift) * 60 + second) * 10**9 + fraction
+    return (((days[text] * 24 + hour) * 60 + minute - shift) * 60 + second) * 10**9 + fraction
 
 
 def _day_number(text: str, month_first: bool, place: str) -> int:
