@@ -30,7 +30,7 @@ from pneuopt.files.first_files import (
 from pneuopt.files.tolerances import SAMPLE_TIME
 from pneuopt.logs.columns import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.foreign import parse_log
-from pneuopt.logs.table import Table, read_bytes
+from pneuopt.logs.table import LogTable, read_bytes
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import check_output_paths, write_text
@@ -139,11 +139,11 @@ def write_files(files: Mapping[Path, str], force: bool) -> None:
         write_text(path, text)
 
 
-def _guess_log(table: Table, kind: str, ask: Asker) -> LogGuess:
+def _guess_log(table: LogTable, kind: str, ask: Asker) -> LogGuess:
     return guess_log(table, first_channels(kind), ask, has_centre=kind == _PNEUMATIC)
 
 
-def _guess_kind(table: Table) -> str:
+def _guess_kind(table: LogTable) -> str:
     """What drives the load, by the channels that a log's columns may be."""
     channels = {n: unit for kind in first_kinds() for n, unit in first_channels(kind).items()}
     found = guess_channels(table.names, channels)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from pneuopt.logs.table import EMPTY_CELL, Table, list_rows
+from pneuopt.logs.table import EMPTY_CELL, LogTable, list_rows
 from pneuopt.logs.tolerances import (
     CENTRES,
     MAX_MAGNITUDE,
@@ -56,7 +56,7 @@ _BRACKETED_UNIT = re.compile(r"(.+?)\s*\[\s*(.*?)\s*\]|(.+?)\s+\((.+)\)")
 
 
 def read_channels(
-    table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str] = CHANNELS
+    table: LogTable, entries: Mapping[str, Any], where: str, channels: Mapping[str, str] = CHANNELS
 ) -> "ReadChannels":
     """Read the channels of a log: `entries` say channel to column, as a sidecar's [columns] does, names the others."""
     found, remarks = find_columns(table, entries, where, channels)
@@ -83,7 +83,7 @@ class ReadChannels(NamedTuple):
 
 
 def find_columns(
-    table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str]
+    table: LogTable, entries: Mapping[str, Any], where: str, channels: Mapping[str, str]
 ) -> tuple[dict[str, "ChannelColumn"], tuple[str, ...]]:
     """The column of each channel, and what the user may want to know of the others; see `read_channels`."""
     check_names("channel", entries, channels, where)
@@ -114,7 +114,7 @@ class ChannelColumn(NamedTuple):
 
 
 def _columns_from_names(
-    table: Table, channels: Mapping[str, str], entries: Mapping[str, Any], used: Collection[str], remarks: list[str]
+    table: LogTable, channels: Mapping[str, str], entries: Mapping[str, Any], used: Collection[str], remarks: list[str]
 ) -> dict[str, ChannelColumn]:
     """Columns whose name is a channel and its unit; a name that nearly is a channel is an error.
 
@@ -181,7 +181,7 @@ def nearest_channel(name: str, channels: Mapping[str, str]) -> str:
 
 
 def _resolve_column(
-    table: Table, channel: str, entry: Any, where: str, channels: Mapping[str, str], *, entry_from: str = ""
+    table: LogTable, channel: str, entry: Any, where: str, channels: Mapping[str, str], *, entry_from: str = ""
 ) -> ChannelColumn:
     column = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
     stated = {n: key for n, key in COLUMN_KEYS.items() if key.takes is Takes.TEXT}
@@ -244,7 +244,7 @@ def _read_gain(scale: str, unit: str, target: str, where: str) -> float:
         return 1 / inverse
 
 
-def _check_samples(table: Table, found: Mapping[str, ChannelColumn], values: Mapping[str, Array]) -> None:
+def _check_samples(table: LogTable, found: Mapping[str, ChannelColumn], values: Mapping[str, Array]) -> None:
     t = values["time"]
     require(
         t.size >= MIN_SAMPLES,
@@ -263,7 +263,7 @@ def _check_samples(table: Table, found: Mapping[str, ChannelColumn], values: Map
     _check_order(table, t)
 
 
-def _check_order(table: Table, t: Array) -> None:
+def _check_order(table: LogTable, t: Array) -> None:
     """Refuse a time that does not increase, and name all rows where it does not."""
     steps = np.diff(t)
     if (steps > 0).all():
@@ -384,7 +384,7 @@ def guess_channels(names: Sequence[str], channels: Mapping[str, str]) -> dict[st
     return {c: [name for _, name in sorted(own, key=lambda pair: pair[0])] for c, own in found.items()}
 
 
-def guess_log(table: Table, channels: Mapping[str, str], ask: Ask, has_centre: bool = False) -> LogGuess:
+def guess_log(table: LogTable, channels: Mapping[str, str], ask: Ask, has_centre: bool = False) -> LogGuess:
     """Guess what a log's columns are; `ask` settles a `Question`, `has_centre`: the drive has a valve's centre."""
     found = guess_channels([n for n in table.names if n not in table.stamps], channels)
     if "time" not in found and table.stamps:
@@ -425,7 +425,9 @@ def _guess_channel(name: str, channels: Mapping[str, str]) -> tuple[str, int]:
     return "", 0
 
 
-def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask, has_centre: bool) -> list[ColumnGuess]:
+def _guess_column(
+    table: LogTable, channel: str, name: str, target: str, ask: Ask, has_centre: bool
+) -> list[ColumnGuess]:
     """A channel's column with unit and centre; nothing where its unit does not measure the channel."""
     try:
         values = table.read([name])[name]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pneuopt.logs.columns import CHANNELS, ChannelColumn, Plant, plant_channels, read_channels
-from pneuopt.logs.table import Table, array_table, check_columns
+from pneuopt.logs.table import LogTable, array_table, check_columns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.parameters import Intersample, as_tuple, check_argument, usual_intersample
@@ -184,7 +184,7 @@ class Experiment:
 
 
 def experiment_from_table(
-    table: Table, columns: Mapping[str, Any], where: str, plant: Plant | None, name: str
+    table: LogTable, columns: Mapping[str, Any], where: str, plant: Plant | None, name: str
 ) -> Experiment:
     """Give the columns of a table their meaning; `columns` says channel to column, and `where` whence that comes."""
     own = {} if plant is None else plant_channels(plant)
@@ -197,7 +197,7 @@ def experiment_from_table(
     return Experiment(trajectory, name=name, units=units, remarks=read.remarks, source=source)
 
 
-def frame_table(frame: "pd.DataFrame", units: Mapping[str, str], name: str) -> Table:
+def frame_table(frame: "pd.DataFrame", units: Mapping[str, str], name: str) -> LogTable:
     """The columns of a DataFrame, its first sample in row 1, and its index where that holds times or is named so."""
     require(all(isinstance(column, str) for column in frame.columns), f"{name}: columns need names, as text", LogError)
     columns = {str(column): _array(frame.iloc[:, i]) for i, column in enumerate(frame.columns)}

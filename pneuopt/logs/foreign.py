@@ -1,6 +1,6 @@
 """Readers of foreign formats: LabVIEW, MATLAB, MDF, Parquet, TDMS, Excel; one function and one row of `READERS` each.
 
-A reader takes the path, for messages, and the bytes of a file, and returns a `Table` or raises a `LogError`; where a
+A reader takes the path, for messages, and the bytes of a file, and returns a `LogTable` or raises a `LogError`; where a
 library reads the format for us, an `InputError` says how to get it.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from pneuopt.logs.table import (
     EMPTY_CELL,
-    Table,
+    LogTable,
     array_table,
     check_cells,
     check_columns,
@@ -63,7 +63,7 @@ _END = "***End_of_Header***"
 _TIME = "X_Value"
 
 
-def read_lvm(path: Path, raw: bytes) -> Table:
+def read_lvm(path: Path, raw: bytes) -> LogTable:
     """Read a measurement file of one segment; one without a head is read as text.
 
     Its time is the column X_Value, or, with X_Columns "No", X0 and Delta_X. Rows have the numbers that an editor shows.
@@ -88,7 +88,7 @@ def read_lvm(path: Path, raw: bytes) -> Table:
     block = TextBlock(path, names, samples, delimiter, head + 2)
     grid = _lvm_grid(path, keys) if keys.get("X_Columns", [""])[0] == "No" else None
     remark = f"rows 1 to {head} are read as the head of a LabVIEW measurement file"
-    return Table(path, names, head + 2, partial(_lvm_columns, block, grid), units, frozenset(), (remark,))
+    return LogTable(path, names, head + 2, partial(_lvm_columns, block, grid), units, frozenset(), (remark,))
 
 
 def _names(row: Sequence[str]) -> list[str]:
@@ -137,7 +137,7 @@ class _Column(NamedTuple):
     unit: str = ""
 
 
-def read_mat(path: Path, raw: bytes) -> Table:
+def read_mat(path: Path, raw: bytes) -> LogTable:
     """Read a .mat file; its first sample is row 1, MATLAB's index 1.
 
     Its vectors of real numbers are columns, and so are those in its structures, by the name of their field. In a
@@ -310,7 +310,7 @@ def _next(parts: Iterator[_Element]) -> _Element:
     return part
 
 
-def read_mdf(path: Path, raw: bytes) -> Table:
+def read_mdf(path: Path, raw: bytes) -> LogTable:
     """Read an MDF file; its first sample is row 1.
 
     A column is a channel, by its name, or as "name (group 2)" where two groups have one of that name; "time" is the
@@ -320,7 +320,7 @@ def read_mdf(path: Path, raw: bytes) -> Table:
     log = run_apart(_read_mdf_channels, path, raw, kind="MDF")
     names = ["time", *(name for name in log.columns if name.casefold() != "time")]
     units = {name: plain_unit(unit) or unit for name, unit in log.units.items() if unit}
-    return Table(path, names, 1, partial(_mdf_columns, path, log), {**units, "time": "s"})
+    return LogTable(path, names, 1, partial(_mdf_columns, path, log), {**units, "time": "s"})
 
 
 class _Log(NamedTuple):
@@ -366,7 +366,7 @@ def _mdf_columns(path: Path, log: _Log, names: Sequence[str]) -> dict[str, Array
     return dict(array_table(path, columns, {}).read(names))
 
 
-def read_parquet(path: Path, raw: bytes) -> Table:
+def read_parquet(path: Path, raw: bytes) -> LogTable:
     """Read a Parquet file; its first sample is row 1.
 
     Its columns that are used hold integers, floats or decimals, or, for the time, stamps or durations; a null or NaN is
@@ -378,7 +378,7 @@ def read_parquet(path: Path, raw: bytes) -> Table:
     stamps = frozenset(field.name for field in fields if _is_time(field.type))
     texts = {f.name: {k.decode(): v.decode(errors="replace") for k, v in (f.metadata or {}).items()} for f in fields}
     units = {name: unit for name, said in texts.items() if (unit := _unit(said))}
-    return Table(path, [field.name for field in fields], 1, partial(_parquet_columns, path, raw), units, stamps)
+    return LogTable(path, [field.name for field in fields], 1, partial(_parquet_columns, path, raw), units, stamps)
 
 
 _UNIT_KEYS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "units")
@@ -432,7 +432,7 @@ def _parquet_numbers(path: Path, name: str, column: "pa.ChunkedArray") -> Array:
 _Grid = tuple[str, float, float]  # when the first sample was taken, its time and the step [s]
 
 
-def read_tdms(path: Path, raw: bytes) -> Table:
+def read_tdms(path: Path, raw: bytes) -> LogTable:
     """Read a TDMS file; its first sample is row 1.
 
     A column is a channel, by its name, or as "group/channel" where two groups have one of that name. Without a channel
@@ -452,7 +452,7 @@ def read_tdms(path: Path, raw: bytes) -> Table:
     if not grids or any(name.casefold() == "time" for name in columns):
         return array_table(path, columns, units)
     table = array_table(path, {"time": np.zeros(0), **columns}, {**units, "time": "s"})
-    return Table(path, table.names, 1, partial(_read_waveforms, table, grids), table.units, table.stamps)
+    return LogTable(path, table.names, 1, partial(_read_waveforms, table, grids), table.units, table.stamps)
 
 
 def _tdms_grid(channel: Any) -> _Grid | None:
@@ -463,7 +463,7 @@ def _tdms_grid(channel: Any) -> _Grid | None:
     return str(properties.get("wf_start_time", "")), start, float(properties["wf_increment"])
 
 
-def _read_waveforms(table: Table, grids: dict[str, _Grid], names: Sequence[str]) -> dict[str, Array]:
+def _read_waveforms(table: LogTable, grids: dict[str, _Grid], names: Sequence[str]) -> dict[str, Array]:
     channels = [name for name in names if name != "time"]
     columns = dict(table.read(channels))
     rates = {grids.get(name) for name in channels}
@@ -481,7 +481,7 @@ class _Date(float):
     """A cell in days that Excel shows as a date or a time."""
 
 
-def read_xlsx(path: Path, raw: bytes) -> Table:
+def read_xlsx(path: Path, raw: bytes) -> LogTable:
     """Read a workbook; rows have Excel's numbers.
 
     An empty cell is a missing sample; a formula counts by its last value. Above the names may stand metadata, below
@@ -507,7 +507,7 @@ def read_xlsx(path: Path, raw: bytes) -> Table:
     stamps = frozenset(name for name, cell in zip(layout.names, first, strict=False) if name and is_stamp(cell))
     read = partial(_xlsx_columns, _Sheet(path, layout.names, rows, layout.start + 1, stamps))
     others = (f"sheet {title!r} is read, of {len(sheets)}",) if len(sheets) > 1 else ()
-    return Table(path, layout.names, layout.start + 1, read, layout.units, stamps, layout.remarks + others)
+    return LogTable(path, layout.names, layout.start + 1, read, layout.units, stamps, layout.remarks + others)
 
 
 class _Sheet(NamedTuple):
@@ -585,7 +585,7 @@ def _seconds(sheet: _Sheet, name: str, days: Array) -> Array:
     return np.asarray(np.round((days - (known[0] if known.size else 0.0)) * 86400, 6))
 
 
-READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
+READERS: Mapping[str, Callable[[Path, bytes], LogTable]] = {
     ".csv": read_delimited,
     ".txt": read_delimited,
     ".tsv": read_delimited,
@@ -601,7 +601,7 @@ READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
 """The suffix of a file, in lower case, to the function that reads it."""
 
 
-def parse_log(path: Path, raw: bytes) -> Table:
+def parse_log(path: Path, raw: bytes) -> LogTable:
     """Read a log's columns from the bytes of a file with the reader of its path's suffix."""
     suffix = path.suffix.lower()
     shown = f"{suffix!r} files" if suffix else "a name without suffix"

@@ -12,7 +12,7 @@ from pneuopt.logs.columns import CHANNELS, ChannelColumn, Plant, find_columns, n
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.foreign import READERS, parse_log
 from pneuopt.logs.read_log import assemble_log, read_sidecar
-from pneuopt.logs.table import Table, list_rows, read_bytes
+from pneuopt.logs.table import LogTable, list_rows, read_bytes
 from pneuopt.logs.text import block_table, decode, find_block, mend_cells, read_delimited
 from pneuopt.logs.tolerances import MAX_MAGNITUDE, MAX_ROWS_OUT
 from pneuopt.quantities.arrays import Indices, Mask
@@ -58,13 +58,13 @@ def mend_log(path: str | Path, *, plant: Plant | None = None, ambient_pressure: 
     return MendedLog(log, rows, (*names, *(f"{list_rows(r)}: {what}" for what, r in changes.items())))
 
 
-def _table_maker(path: Path, raw: bytes) -> Callable[[Sequence[str]], tuple[Table, dict[str, list[int]]]]:
+def _table_maker(path: Path, raw: bytes) -> Callable[[Sequence[str]], tuple[LogTable, dict[str, list[int]]]]:
     """A function from the columns that have to be numbers to the table, and what was mended in its cells."""
     if READERS.get(path.suffix.lower()) is not read_delimited:
         return lambda _: (parse_log(path, raw), {})
     block, layout = find_block(path, decode(path, raw))
 
-    def make(used: Sequence[str]) -> tuple[Table, dict[str, list[int]]]:
+    def make(used: Sequence[str]) -> tuple[LogTable, dict[str, list[int]]]:
         mended, changes = mend_cells(block, used)
         return block_table(mended, layout), changes
 
@@ -72,8 +72,8 @@ def _table_maker(path: Path, raw: bytes) -> Callable[[Sequence[str]], tuple[Tabl
 
 
 def _mend_rows(
-    table: Table, found: Mapping[str, ChannelColumn], changes: dict[str, list[int]]
-) -> tuple[Table, Indices]:
+    table: LogTable, found: Mapping[str, ChannelColumn], changes: dict[str, list[int]]
+) -> tuple[LogTable, Indices]:
     """The table without rows whose time is missing or does not increase, and without samples of no sensor."""
     columns = {n: np.array(y) for n, y in table.read([c.name for c in found.values()]).items()}
     count = next(iter(columns.values())).size

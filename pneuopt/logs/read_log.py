@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from pneuopt.logs.columns import CHANNELS, COLUMN_KEYS, Plant
 from pneuopt.logs.experiment import Experiment, experiment_from_table
 from pneuopt.logs.foreign import parse_log
-from pneuopt.logs.table import Table, read_bytes
+from pneuopt.logs.table import LogTable, read_bytes
 from pneuopt.logs.tolerances import STAMP_BYTES
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.keys import Key, Takes, check_sections, read_named, read_table, table
@@ -99,7 +99,7 @@ def read_sidecar(path: Path, sidecar: str | Path | None, columns: Mapping[str, A
 
 
 def assemble_log(
-    path: Path, raw: bytes, table: Table, beside: Sidecar, plant: Plant | None, ambient_pressure: float
+    path: Path, raw: bytes, table: LogTable, beside: Sidecar, plant: Plant | None, ambient_pressure: float
 ) -> Experiment:
     """A log of a table and of what stands beside it; see `read_log`."""
     side, sections, columns, where = beside

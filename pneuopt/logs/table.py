@@ -1,7 +1,7 @@
 """A log as its file has it: named columns of numbers that have no meaning yet, within a budget of bytes and cells.
 
-What readers share follows `Table`: the budget, columns that a file holds as arrays, and how to run the libraries that
-read some formats.
+What readers share follows `LogTable`: the budget, columns that a file holds as arrays, and how to run the libraries
+that read some formats.
 """
 
 import importlib
@@ -30,7 +30,7 @@ EMPTY_CELL = "leave the cell empty if the sample is missing, as `pneuopt check -
 
 
 @dataclass(frozen=True)
-class Table:
+class LogTable:
     """What a reader of one file format returns; two columns of one name, or too many, are a `LogError`."""
 
     path: Path | str  # for messages
@@ -136,10 +136,10 @@ def run_apart(read: Callable[[Path, bytes], Result], path: Path, raw: bytes, kin
         executor.shutdown(kill_workers=True)
 
 
-def array_table(path: Path | str, columns: Mapping[str, Any], units: Mapping[str, str]) -> Table:
+def array_table(path: Path | str, columns: Mapping[str, Any], units: Mapping[str, str]) -> LogTable:
     """A table of arrays, each (n,), its first sample in row 1; dates or durations count in seconds from the first."""
     stamps = frozenset(name for name, column in columns.items() if np.asarray(column).dtype.kind in "Mm")
-    return Table(path, list(columns), 1, partial(_read_columns, path, columns), units, stamps)
+    return LogTable(path, list(columns), 1, partial(_read_columns, path, columns), units, stamps)
 
 
 def _read_columns(path: Path | str, columns: Mapping[str, Any], names: Sequence[str]) -> dict[str, Array]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pneuopt.logs.table import EMPTY_CELL, Table, check_cells
+from pneuopt.logs.table import EMPTY_CELL, LogTable, check_cells
 from pneuopt.logs.tolerances import MAX_HEAD_ROWS, MIN_BLOCK_ROWS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
@@ -33,7 +33,7 @@ _COMMENT = re.compile(r"\s*(?:#|%|//|!)+\s*")
 _BRACKETS = re.compile(r"\[\s*(.*?)\s*\]|\(\s*(.*?)\s*\)")
 
 
-def read_delimited(path: Path, raw: bytes) -> Table:
+def read_delimited(path: Path, raw: bytes) -> LogTable:
     """Read a text file of which a row names the columns: UTF-8, UTF-16 with its mark, or Windows-1252.
 
     An empty cell or NaN is a missing sample. One decimal mark holds for all columns that are read. Above the names may
@@ -42,7 +42,7 @@ def read_delimited(path: Path, raw: bytes) -> Table:
     return read_text(path, decode(path, raw))
 
 
-def read_text(path: Path, text: str) -> Table:
+def read_text(path: Path, text: str) -> LogTable:
     """Read the text of such a file."""
     block, layout = find_block(path, text)
     return block_table(block, layout)
@@ -71,9 +71,9 @@ def find_block(path: Path, text: str) -> "tuple[TextBlock, Layout]":
     return TextBlock(path, names, lines[start:], delimiter, start + 1, stamps), layout
 
 
-def block_table(block: "TextBlock", layout: "Layout") -> Table:
+def block_table(block: "TextBlock", layout: "Layout") -> LogTable:
     """The table of such samples."""
-    return Table(block.path, block.names, block.first_row, block.columns, layout.units, block.stamps, layout.remarks)
+    return LogTable(block.path, block.names, block.first_row, block.columns, layout.units, block.stamps, layout.remarks)
 
 
 def decode(path: Path, raw: bytes) -> str:
