@@ -345,7 +345,7 @@ def _fit_balance(experiment: Experiment, axis: StatedAxis) -> ForceBalance | Non
     mass = 0.0 if math.isnan(axis.inertia) else axis.inertia
     columns = [np.column_stack([s, v, np.ones(v.size), a, f]) for _, a, s, v, f in lags]
     # the triangular factor over the root of the length: root mean squares of regressions stand in it
-    one = [np.linalg.qr(each, mode="r") / math.sqrt(len(each)) for each in columns]
+    one = [np.asarray(np.linalg.qr(each, mode="r"), dtype=float) / math.sqrt(len(each)) for each in columns]
     left = [abs(R[4, 4]) for R in one]
     # a lag turns speed into acceleration: where the log hardly tells lags apart, the least one is assumed
     told = [k for k in range(len(one)) if left[k] <= MIN_RESIDUAL_FACTOR * min(left)]

@@ -337,7 +337,8 @@ def _read_mdf_channels(path: Path, raw: bytes) -> _Log:
     import asammdf
 
     log = _Log({}, {}, {}, {})
-    with foreign_code(path, "MDF"), asammdf.MDF(io.BytesIO(raw)) as file:
+    with foreign_code(path, "MDF"), asammdf.MDF(io.BytesIO(raw)) as opened:
+        file: Any = opened  # which the types know in part
         # group and index of every channel but the groups' masters, by name
         found = [
             (channel.name, group, index)
