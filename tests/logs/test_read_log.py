@@ -1,4 +1,4 @@
-"""When a log was taken: by its time stamps, by its name, and never by the file's own time."""
+"""A log from its file and its sidecar, and when it was taken: by stamps, by its name, never by the file's own time."""
 
 import hashlib
 import io
@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.read_log import find_date, read_log
-from pneuopt.quantities.errors import InputError, LogError, UnitError, UnknownNameError
+from pneuopt.quantities.errors import InputError, LogError, UnknownNameError
 from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.units import ATMOSPHERE, si_conversion
+from tests.logs.fuzz import fuzz
 
 HEADER = "time [s],position [mm]\n"
 BODY = "\n".join(f"{k / 10},{k}" for k in range(12)) + "\n"
@@ -131,51 +132,6 @@ def test_missing_samples_and_any_start_time(tmp_path: Path) -> None:
     assert run.trajectory.t[0] == 1.7e9
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (HEADER + BODY + "1.2,abc\n", "row 14, column 'position [mm]': 'abc' is not a number"),
-        (HEADER + BODY + "1.2,n/a\n", "'n/a' is not a number (decimal mark '.'); leave the cell empty"),
-        (HEADER + BODY + "1.2,9.91e37\n", "9.91e+37 is no measured value; leave the cell empty"),
-        (HEADER + BODY + "1.2,1e999\n", "row 14, column 'position [mm]': '1e999' is not a number"),
-        (HEADER + BODY + "1.2,inf\n", "'inf' is not a number"),
-        (HEADER + BODY + "1.2,1_0\n", "'1_0' is not a number"),
-        (HEADER + BODY + ",3\n", "row 14, column 'time [s]': the time is missing; delete the row"),
-        (HEADER + BODY + "1.1,3\n", "row 14: time repeats (1.1 s, then 1.1 s); delete the row"),
-        (HEADER + BODY + "0.5,3\n", "row 14: time runs backwards (1.1 s, then 0.5 s)"),
-        (HEADER + BODY + "1.2\n", "row 14 has 1 field, the header 2; mend or delete the row"),
-        (HEADER + BODY + "1.2;3\n", "row 14 has 1 field"),
-        (HEADER + BODY + "\n1.3,4\n", "row 14 has 1 field"),
-        (HEADER + BODY.replace(".", ","), "row 2 has 3 fields, the header 2; is ',' the decimal mark, too?"),
-        (HEADER.replace(",", ";") + "0.5;1,5\n" * 12, "row 2, column 'time [s]': '0.5' is not a number"),
-        (HEADER.replace(",", ";") + "0;1.234,5\n" * 12, "'1.234,5' is not a number"),
-        (HEADER + "0,1\n1,2\n", "2 samples are too few; at least 10"),
-        (HEADER + "".join(f"{k},\n" for k in range(12)), "column 'position [mm]' is empty; leave it out"),
-        ("", "row 1 is empty"),
-        (HEADER, "a header, but no samples"),
-        (BODY, "row 1 holds the number '0.0', not a column's name"),
-        ("time [s]\n" + "".join(f"{k}\n" for k in range(12)), "one column only; put ',', ';' or a tab"),
-        ("time [s],position [mm],position [mm]\n" + BODY, "two columns are named 'position [mm]'; rename one"),
-        ("time [s],position [mm],position_mm\n" + BODY.replace("\n", ",1\n"), "'position' has another column"),
-        ("\n" + "time [s] mass\n" + BODY.replace(",", " "), "no channel but time"),
-        ("a,b\n" + BODY, 'no time; name a column "time [s]"'),
-        ("time [s],b\n" + BODY, "no channel but time; known: time, valve_voltage"),
-        ("time [s],presure_a_bar(g)\n" + BODY, "'presure_a_bar(g)' looks like the channel 'pressure_a'"),
-        ("time [s],Pressure_c [bar(g)]\n" + BODY, "looks like the channel 'pressure_"),
-        ("time [s],velocity [m/s]\n" + BODY, "looks like the channel 'speed'"),
-        ("t [s],position [mm]\n" + BODY, "'time'; write it so, or list the columns to use in a sidecar: pneuopt init"),
-        (b"PK\x03\x04\0\0", "not a text file"),
-        ((HEADER + BODY).encode("utf-16")[2:], "export the log as CSV in UTF-8"),
-    ],
-)
-def test_refuses_a_log_and_says_where(tmp_path: Path, text: str | bytes, said: str) -> None:
-    path = written(tmp_path, text)
-    with pytest.raises(LogError) as error:
-        read_log(path)
-    assert str(error.value).startswith(f"{path}: ")
-    assert said in str(error.value)
-
-
 def test_a_quote_that_is_not_closed_swallows_no_row(tmp_path: Path) -> None:
     rows = BODY.splitlines()
     inches = "".join(f'{row},{5}" pipe\n' for row in rows)
@@ -224,65 +180,6 @@ def test_a_sidecar_adds_to_the_headers(tmp_path: Path) -> None:
     ]
     run = read_log(written(tmp_path, text, '[columns]\ntime = "t [ms]"\nspeed = "velocity [m/s]"\nposition = false\n'))
     assert run.trajectory.names == ("speed",)
-
-
-@pytest.mark.parametrize(
-    ("header", "said"),
-    [
-        ("time [s],position", 'no unit; write "position [m]", or unit = "..."'),
-        ("time [s],position [kg]", "unit 'kg' does not measure 'm'"),
-        ("time [s],position_raw", "unknown unit 'raw'"),
-        ("time [s],pressure_a [bar]", 'write "bar(a)" or "bar(g)"'),
-        ("time [s],speed [bar(g)]", "does not measure 'm/s'"),
-    ],
-)
-def test_refuses_a_columns_unit(tmp_path: Path, header: str, said: str) -> None:
-    with pytest.raises(UnitError) as error:
-        read_log(written(tmp_path, f"{header}\n{BODY}"))
-    assert f"column {header.split(',')[1]!r}" in str(error.value)
-    assert said in str(error.value)
-    assert "list the columns to use in a sidecar" in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("valve_voltage", "valve_volts", "[columns]: unknown channel 'valve_volts'; did you mean 'valve_voltage'?"),
-        ('"t [ms]"', '"tt [ms]"', "[columns] time: unknown column 'tt [ms]'; did you mean 't [ms]'?"),
-        ("centre = ", "center = ", "unknown key 'center'; did you mean 'centre'?"),
-        (
-            'column = "U valve", unit = "V", centre = "5 V"',
-            'unit = "V"',
-            '[columns] valve_voltage has no column; write column = "U valve"',
-        ),
-        ("[noise]", "[noises]", "unknown section 'noises'; did you mean 'noise'?"),
-        ("[noise]\nforce", "[noise]\nposition", "[noise]: unknown channel 'position'; known: force, valve_voltage"),
-        ('"2 N"', '"2 mm"', "[noise] force: unit 'mm' does not measure 'N'"),
-        ('"2 N"', '"-2 N"', "run_01.toml: [noise] force must be positive, got -2 N"),
-        ('"2 N"', "2", '[noise] force: 2 has no unit; write "2 N"'),
-        ("N/V", "N/m", "[columns] force scale: unit 'N/m' does not measure"),
-        ('"5 V"', '"5 N"', "[columns] valve_voltage centre: unit 'N' does not measure 'V'"),
-        ('unit = "V", centre = "5 V"', 'centre = "5 V"', "[columns] valve_voltage: no unit"),
-        ("6.3 bar(g)", "6.3 bar", "[conditions] supply.pressure: a pressure level in 'bar'"),
-        ("[columns]", 'accept = "work"\n[columns]', "accept must be a list, got 'work'; write accept = [\"work\"]"),
-        ("[columns]", 'accept = ["work", 3]\n[columns]', "accept must be text, got 3"),
-        ("[noise]", "[noise", "not valid TOML: "),
-        ("[columns]", "noise = 3\n[columns]", "noise must be a section, [noise]"),
-        (
-            "force = { column",
-            "pressure_a = { column",
-            "[columns] pressure_a scale: '-35.15065 N/V' does not say from where",
-        ),
-    ],
-)
-def test_refuses_a_sidecar_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
-    text = SIDECAR.replace('[noise]\nforce = "2 N"\n', "") if new.startswith("noise =") else SIDECAR
-    assert old in text
-    path = written(tmp_path, RENAMED, text.replace(old, new, 1))
-    with pytest.raises(InputError) as error:
-        read_log(path)
-    assert said in str(error.value)
-    assert "run_01" in str(error.value)
 
 
 def test_refuses_what_is_not_there(tmp_path: Path) -> None:
@@ -455,3 +352,12 @@ def test_a_sidecars_date_that_is_none_is_refused(tmp_path: Path) -> None:
     for read in (find_date, read_log):
         with pytest.raises(LogError, match=r'date must be a date, as date = "2026-03-12"; got'):
             read(log)
+
+
+def test_a_few_mutated_logs() -> None:
+    fuzz(100, seed=1, styles="plain").check()
+
+
+@pytest.mark.slow
+def test_many_mutated_logs() -> None:
+    fuzz(100_000, seed=0).check()

@@ -1,4 +1,4 @@
-""""""
+"""Libraries that read a format for us fail alone, and in one line."""
 
 import os
 import warnings
