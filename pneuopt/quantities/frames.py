@@ -21,7 +21,7 @@ class WideFrame(pd.DataFrame):
         return self._report().to_html()
 
     def _report(self, most_rows: int = 60) -> Report:
-        """The table as a report, its rows named by the index, or if that only counts by the first column; the middle is cut."""
+        """The table as a report; the index names its rows, or the first column where that only counts."""
         counts = isinstance(self.index, pd.RangeIndex) and self.index.name is None
         names = [] if counts else [", ".join(str(name or "") for name in self.index.names)]
         keys = (

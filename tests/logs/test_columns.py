@@ -180,11 +180,10 @@ def test_time_stamps_are_the_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("columns", "message"),
-    [({"foo": T, "x": T}, "no column may be the time"), ({"t [s]": T, "foo": T}, "no column but the time")],
+    "columns", [{"foo": T, "x": T}, {"t [s]": T, "foo": T}], ids=["no time", "no channel but the time"]
 )
-def test_a_log_that_says_nothing_is_refused(columns: dict[str, Array], message: str, tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=message):
+def test_a_log_that_says_nothing_is_refused(columns: dict[str, Array], tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"run\.csv"):
         guess(write(tmp_path / "run.csv", columns))
 
 

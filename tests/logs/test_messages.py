@@ -7,11 +7,14 @@ from typing import NamedTuple
 import pytest
 
 from pneuopt.logs.doctor import PISTON, examine
-from pneuopt.logs.read_log import read_log
+from pneuopt.logs.experiment import Experiment, differentiate, resample, split
+from pneuopt.logs.read_log import find_date, read_log
 from pneuopt.logs.text import seconds_from_first
 from pneuopt.quantities.errors import InputError, LogError, UnitError
 from tests.logs.bad_logs import BAD_LOGS, STATED
-from tests.logs.test_foreign import TIME, write_variables, write_workbook
+from tests.logs.test_experiment import FRAME, ramp
+from tests.logs.test_experiment import UNITS as UNIT_NAMES
+from tests.logs.test_foreign import TIME, write_frame, write_variables, write_workbook
 from tests.logs.test_read_log import BODY, HEADER, RENAMED, SIDECAR, written
 
 
@@ -120,6 +123,9 @@ CELLS: list[tuple[str, object, str]] = [
 ]
 
 
+NOTE: dict[str, str | bool | dict[str, str | float]] = {"time": "time [s]", "force": {"column": "note", "unit": "N"}}
+
+
 def sidecar(old: str, new: str) -> str:
     """The sidecar with one change; a section that becomes a number does not stand there as well."""
     text = SIDECAR.replace('[noise]\nforce = "2 N"\n', "") if new.startswith("noise =") else SIDECAR
@@ -127,9 +133,104 @@ def sidecar(old: str, new: str) -> str:
     return text.replace(old, new, 1)
 
 
+INCHES = "".join(('"' if k == 3 else "") + f"ok,{row}\n" for k, row in enumerate(BODY.splitlines()))
+LONG_NAME = f"time [s],position [mm],{'a' * 300}\n" + BODY.replace("\n", ",1\n")
+LONG_CELL = 'time [s],position [mm],note\n0,1,"' + "a" * 200_000 + '"\n1,1,\n'
+WIDE = f"time [s],{','.join(f'c{i}' for i in range(20_000))}\n" + f"0{',1' * 20_000}\n" * 12
+COARSE = HEADER + "".join(f"{k // 10},{k}\n" for k in range(300))
+NO_VERSION = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n" + bytes(512)
+BLOCKS = HEADER + BODY + "time [s],position [mm],force [N]\n" + "".join(f"{k},{k},{k}\n" for k in range(20))
+MORE_LOGS: list[tuple[str, str]] = [
+    (WIDE, "20001 columns are more than 4096; export fewer channels"),
+    (LONG_NAME, "the name of column 'aaaaaaaaaaaaaaaaaaaa'... has 300 characters; shorten it"),
+    (LONG_CELL, "row 2: a cell has more than 131072 characters; cut it"),
+    (f"remark,time [s],position [mm]\n{INCHES}", 'row 5: a quote (") is opened and not closed; mend the row'),
+    (COARSE, "(270 in all): time repeats (0 s, then 0 s); the time is too coarse for the samples; export it with more"),
+    (BLOCKS, "rows 2 to 13 hold numbers, but other columns than the rows below; make two files of it"),
+]
+MORE_SIDECARS = [
+    ('[drive]\nkind = "force"\n', "is a drive, but has the name of the sidecar of run_01.csv; rename one"),
+    ("[columns]\ntime = " + "[" * 3000 + "]" * 3000, "too many brackets in brackets"),
+    ("#" * 2**21, "is larger than 128 KiB"),
+    ('date = "12.3.26"\n', "date must be a date, as date = \"2026-03-12\"; got '12.3.26'"),
+    ('[intersample]\nposition = "foh"\n', "[intersample] position: unknown choice 'foh'; known: held, linear"),
+    ("[intersample]\nposition = 1\n", '[intersample] position must be text, got 1; write position = "held"'),
+]
+EXPERIMENTS: list[tuple[Callable[[], object], str]] = [
+    (lambda: split(ramp(), 2.0), "samples of run, which has 1001, one every 0.001 s; choose between 0.002 and 1.001 s"),
+    (lambda: resample(ramp(), 2.0), "a step of 2 s does not fit a log of 1 s"),
+    (
+        lambda: differentiate(ramp(), window=1e-3),
+        "a window of 0.001 s holds fewer than 3 samples; take 0.004 s or more",
+    ),
+    (lambda: differentiate(differentiate(ramp(), window=0.01), window=0.01), "the log has a speed already"),
+    (
+        lambda: differentiate(ramp(), window=0.01, position="positon"),
+        "unknown channel 'positon'; did you mean 'position'",
+    ),
+    (lambda: ramp().with_noise({"positon": 1e-5}), "run: noise: unknown channel 'positon'; did you mean 'position'"),
+    (lambda: ramp().with_noise({"position": 0.0}), "run: noise of 'position' must be positive, got 0"),
+    (lambda: ramp().with_conditions({"load.mass": float("nan")}), "run: condition 'load.mass' must be finite"),
+    (
+        lambda: ramp().with_intersample({"position": "linear"}),  # type: ignore[dict-item]
+        "intersample['position'] takes Intersample.HELD or Intersample.LINEAR",
+    ),
+    (lambda: Experiment.from_frame(FRAME, units={"time": "s"}), "frame: column 'position': no unit"),
+    (
+        lambda: Experiment.from_frame(FRAME, units={"postion": "mm"}),
+        "frame: units: unknown column 'postion'; did you mean 'position'",
+    ),
+    (
+        lambda: Experiment.from_frame(FRAME.drop(columns="time"), units={"position": "mm"}),
+        "frame: no time; name a column",
+    ),
+    (
+        lambda: Experiment.from_frame(FRAME.set_axis(["time", "position", "position"], axis=1), units=UNIT_NAMES),
+        "two columns are named 'position'; rename one",
+    ),
+    (lambda: Experiment.from_frame(FRAME.set_axis([0, 1, 2], axis=1)), "frame: columns need names, as text"),
+]
+
+
+def write_bytes(folder: Path, name: str, raw: bytes) -> Path:
+    (folder / name).write_bytes(raw)
+    return folder / name
+
+
 DATES = "yyyy-mm-dd hh:mm:ss.000"
 REFUSALS = [
-    *(Refusal(lambda d, t=t: read_log(written(d, t)), LogError, ("run_01.csv: ", said)) for t, said in LOGS),
+    *(
+        Refusal(lambda d, t=t: read_log(written(d, t)), LogError, ("run_01.csv: ", said))
+        for t, said in (*LOGS, *MORE_LOGS)
+    ),
+    *(
+        Refusal(lambda d, s=s: read_log(written(d, HEADER + BODY, s)), InputError, ("run_01.toml: ", said))
+        for s, said in MORE_SIDECARS
+    ),
+    *(Refusal(lambda _, make=make: make(), InputError, (said,)) for make, said in EXPERIMENTS),
+    Refusal(lambda d: read_log(d / "none.csv"), LogError, ("none.csv: cannot be read (No such file",)),
+    Refusal(read_log, LogError, ("cannot be read",)),
+    Refusal(lambda _: read_log("/dev/zero"), LogError, ("/dev/zero: is a pipe or a device; give the name of a file",)),
+    Refusal(
+        lambda d: find_date(written(d, HEADER + BODY)),
+        LogError,
+        ("run_01.csv: neither its time column nor its name says when", "give --dates 2026-03-12"),
+    ),
+    Refusal(
+        lambda d: read_log(write_bytes(d, "run.mat", NO_VERSION)),
+        LogError,
+        ("version 7.3 (HDF5) is not read; in MATLAB, save it with the option '-v7'",),
+    ),
+    Refusal(
+        lambda d: read_log(write_bytes(d, "run.mat", b"x" * 200)),
+        LogError,
+        ("run.mat: cannot be read as a .mat file (its head names no version from 4 to 7); save the log again",),
+    ),
+    Refusal(
+        lambda d: read_log(write_frame(d, note=["", "good", *[""] * 10]), columns=NOTE),
+        LogError,
+        ("row 1, column 'note': '' is not a number, as the column's type is ", "; store the column as float64"),
+    ),
     *(
         Refusal(
             lambda d, h=h: read_log(written(d, f"{h}\n{BODY}")),
