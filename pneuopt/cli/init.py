@@ -28,9 +28,9 @@ from pneuopt.files.first_files import (
     unused_channels,
 )
 from pneuopt.files.tolerances import SAMPLE_TIME
-from pneuopt.logs.foreign import read_table
-from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
-from pneuopt.logs.table import Table, read_bytes
+from pneuopt.logs.columns import LogGuess, Question, guess_channels, guess_log
+from pneuopt.logs.foreign import parse_log
+from pneuopt.logs.table import LogTable, read_bytes
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import check_output_paths, write_text
@@ -79,7 +79,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     force : bool
         Whether old files may be replaced; without it those that stand beside another log's sidecar are kept.
     """
-    table = None if log is None else read_table(log, read_bytes(log))
+    table = None if log is None else parse_log(log, read_bytes(log))
     guessed = None if table is None or kind is not None else _guess_kind(table)
     message = f"say what drives the load: pneuopt init KIND, one of {', '.join(first_kinds())}"
     require(
@@ -139,11 +139,11 @@ def write_files(files: Mapping[Path, str], force: bool) -> None:
         write_text(path, text)
 
 
-def _guess_log(table: Table, kind: str, ask: Asker) -> LogGuess:
+def _guess_log(table: LogTable, kind: str, ask: Asker) -> LogGuess:
     return guess_log(table, first_channels(kind), ask, has_centre=kind == _PNEUMATIC)
 
 
-def _guess_kind(table: Table) -> str:
+def _guess_kind(table: LogTable) -> str:
     """What drives the load, by the channels that a log's columns may be."""
     channels = {n: unit for kind in first_kinds() for n, unit in first_channels(kind).items()}
     found = guess_channels(table.names, channels)

@@ -20,7 +20,8 @@ from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
 from pneuopt.files.tolerances import COMMENT_WIDTH, DIGITS, SAMPLE_TIME, SAMPLES_A_DITHER_PERIOD, SWEEP
 from pneuopt.files.tuning import TUNED_SECTIONS
-from pneuopt.logs.columns import CHANNELS, SIDECAR_KEYS, plant_channels
+from pneuopt.logs.columns import CHANNELS, plant_channels
+from pneuopt.logs.read_log import SIDECAR_KEYS
 from pneuopt.models.catalog import CATALOGUE_SOURCE
 from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drive_kinds import DRIVE_KINDS

@@ -13,7 +13,7 @@ from pneuopt.files.loop import tuning_keys
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
 from pneuopt.files.tolerances import COMMENT_COLUMN, MAX_WIDTH, SHARED_BY
-from pneuopt.logs.columns import SIDECAR_KEYS
+from pneuopt.logs.read_log import SIDECAR_KEYS
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.keys import PARAMETER_KEYS, Key, Takes, table

@@ -1,23 +1,31 @@
-"""What the columns of a log mean, whatever its file format: channels, their units, centres and scales, and checks.
+"""What the columns of a log mean, whatever its file format: channels, their units, centres and scales.
 
-The channels that the log of a plant may hold beside the usual ones.
-
-The keys of a log's sidecar, by which it is read.
+`read_channels` takes names and a sidecar's entries at their word; `guess_log` says what the columns of a foreign log
+may be, by their names, units and values, and asks where that leaves a doubt.
 """
 
 import difflib
+import json
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from pneuopt.logs.table import EMPTY_CELL, Table
-from pneuopt.logs.tolerances import MAX_MAGNITUDE, MAX_NAME_PARTS, MAX_ROWS_SHOWN, MIN_SAMPLES
+from pneuopt.logs.table import EMPTY_CELL, LogTable, list_rows
+from pneuopt.logs.tolerances import (
+    CENTRES,
+    MAX_MAGNITUDE,
+    MIN_SAMPLES,
+    RANGE,
+    SHOWN_CENTRES,
+    VACUUM_LIMIT,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_names, require
-from pneuopt.quantities.keys import Key, Takes, table
-from pneuopt.quantities.parameters import Intersample, Quantity
+from pneuopt.quantities.keys import Key, Takes, read_entry, read_table
+from pneuopt.quantities.parameters import COMMAND_SUFFIX, Quantity
 from pneuopt.quantities.units import read_value, si_conversion
 
 CHANNELS: Mapping[str, str] = {
@@ -48,56 +56,39 @@ _BRACKETED_UNIT = re.compile(r"(.+?)\s*\[\s*(.*?)\s*\]|(.+?)\s+\((.+)\)")
 
 
 def read_channels(
-    table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str] = CHANNELS
+    table: LogTable, entries: Mapping[str, Any], where: str, channels: Mapping[str, str] = CHANNELS
 ) -> "ReadChannels":
-    """Read the channels of a log from its columns.
-
-    Parameters
-    ----------
-    entries : mapping
-        Channel to column, as in a sidecar's [columns]; false leaves a channel out. The other columns' names say what
-        they are.
-    where : str
-        Where the entries come from, for messages.
-    channels : mapping of str to str
-        The channels that a column may be, and their SI units.
-
-    Raises
-    ------
-    LogError, UnitError, UnknownNameError
-        If the log cannot be understood beyond doubt.
-    """
+    """Read the channels of a log: `entries` say channel to column, as a sidecar's [columns] does, names the others."""
     found, remarks = find_columns(table, entries, where, channels)
     numbers = table.read([column.name for column in found.values()])
-    _check_finite(table, numbers)
+    for name, column in numbers.items():
+        wrong = np.abs(column) > MAX_MAGNITUDE  # an infinite sample among them; NaN stands for a missing one
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            what = "is not a number" if np.isinf(column[row]) else "is no measured value"
+            raise LogError(
+                f"{table.path}: row {row + table.first_row}, column {name!r}: {column[row]:.6g} {what}; {EMPTY_CELL}"
+            )
     values = {channel: c.factor * numbers[c.name] + c.offset for channel, c in found.items()}
     _check_samples(table, found, values)
     return ReadChannels(values, found, remarks)
 
 
 class ReadChannels(NamedTuple):
-    """What `read_channels` returns.
+    """What `read_channels` returns."""
 
-    Attributes
-    ----------
-    samples : dict of str to ndarray, each of shape (n,)
-        In SI units, "time" among them, strictly increasing; NaN where a sample is missing.
-    remarks : tuple of str
-        What the table says of itself, and the columns that are not read although their names nearly are channels.
-    """
-
-    samples: dict[str, Array]
+    samples: dict[str, Array]  # each (n,), in SI units, "time" among them, increasing; NaN where a sample is missing
     columns: Mapping[str, "ChannelColumn"]
-    remarks: tuple[str, ...]
+    remarks: tuple[str, ...]  # the table's, and the columns that are not read although their names nearly are channels
 
 
 def find_columns(
-    table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str]
+    table: LogTable, entries: Mapping[str, Any], where: str, channels: Mapping[str, str]
 ) -> tuple[dict[str, "ChannelColumn"], tuple[str, ...]]:
     """The column of each channel, and what the user may want to know of the others; see `read_channels`."""
     check_names("channel", entries, channels, where)
     found = {
-        name: _resolve_column(table, name, entry, f"{where}.{name}", channels, entry_from=where)
+        name: _resolve_column(table, name, entry, f"{where} {name}", channels, entry_from=where)
         for name, entry in entries.items()
         if entry is not False
     }
@@ -112,30 +103,18 @@ def find_columns(
 
 
 class ChannelColumn(NamedTuple):
-    """The column of a channel, and ``si = factor * raw + offset``.
-
-    Attributes
-    ----------
-    name : str
-        Of the column.
-    unit : str
-        Of the column; empty for time stamps.
-    unit_from : str
-        What says the unit: the place of the entry, "its name", "the file's units".
-    said_by : str
-        What says that it is this channel: the place of the entry; empty: its name.
-    """
+    """The column of a channel, and ``si = factor * raw + offset``."""
 
     name: str
     factor: float
     offset: float
-    unit: str = ""
-    unit_from: str = ""
-    said_by: str = ""
+    unit: str = ""  # empty for time stamps
+    unit_from: str = ""  # what says it: the place of the entry, "its name", "the file's units"
+    said_by: str = ""  # what says that it is this channel: the place of the entry; empty: its name
 
 
 def _columns_from_names(
-    table: Table, channels: Mapping[str, str], entries: Mapping[str, Any], used: Collection[str], remarks: list[str]
+    table: LogTable, channels: Mapping[str, str], entries: Mapping[str, Any], used: Collection[str], remarks: list[str]
 ) -> dict[str, ChannelColumn]:
     """Columns whose name is a channel and its unit; a name that nearly is a channel is an error.
 
@@ -148,7 +127,13 @@ def _columns_from_names(
             continue
         try:
             if not channel:
-                _check_misspelling(table, name, channels)
+                near = "" if name in table.stamps else nearest_channel(name, channels)
+                require(
+                    not near,
+                    f"{table.path}: column {name!r} looks like the channel {near!r}; write it so, "
+                    f"or list the columns to use in a sidecar: pneuopt init --from {table.path} writes one",
+                    LogError,
+                )
                 continue
             where = f"{table.path}: column {name!r}"
             column = _resolve_column(table, channel, name, where, channels)
@@ -186,7 +171,7 @@ def nearest_channel(name: str, channels: Mapping[str, str]) -> str:
     bare, unit = split_unit(name)
     if _split_channel(name, channels)[0]:
         return ""
-    parts = bare.casefold().replace(" ", "_").split("_")[:MAX_NAME_PARTS]
+    parts = bare.casefold().replace(" ", "_").split("_")
     for n in range(len(parts), 0 if not unit else len(parts) - 1, -1):
         head = "_".join(parts[:n])
         near = difflib.get_close_matches(head, channels, n=1, cutoff=0.85) or [_SYNONYMS.get(head, "")]
@@ -195,30 +180,23 @@ def nearest_channel(name: str, channels: Mapping[str, str]) -> str:
     return ""
 
 
-def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> None:
-    near = "" if name in table.stamps else nearest_channel(name, channels)
-    require(
-        not near,
-        f"{table.path}: column {name!r} looks like the channel {near!r}; write it so, "
-        f"or list the columns to use in a sidecar: pneuopt init --from {table.path} writes one",
-        LogError,
-    )
-
-
 def _resolve_column(
-    table: Table, channel: str, entry: Any, where: str, channels: Mapping[str, str], *, entry_from: str = ""
+    table: LogTable, channel: str, entry: Any, where: str, channels: Mapping[str, str], *, entry_from: str = ""
 ) -> ChannelColumn:
     column = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
+    stated = {n: key for n, key in COLUMN_KEYS.items() if key.takes is Takes.TEXT}
     check_names("key", column, COLUMN_KEYS, where)
-    require(isinstance(column.get("column"), str), f'{where}: say which column: {{ column = "U valve" }}', LogError)
-    name = column["column"]
+    name = read_table(stated, column, where, partial=True)["column"]
     bare, unit = split_unit(name)
     if name not in table.names:
         name = bare
     if name not in table.names:
         raise UnknownNameError("column", column["column"], filter(None, table.names), where)
     if name in table.stamps:
-        return _stamp_column(name, channel, column, where)._replace(said_by=entry_from)
+        require(channel == "time", f"{where}: column {name!r} holds time stamps, no numbers; name another", LogError)
+        remedy = f"{where}: its time stamps are read in seconds; leave out unit, centre and scale"
+        require(column.keys() == {"column"}, remedy, LogError)
+        return ChannelColumn(name, 1.0, 0.0, said_by=entry_from)
     places = {
         entry_from: column.get("unit"),
         "its name": unit if column["column"] == name else "",
@@ -228,16 +206,13 @@ def _resolve_column(
     }
     unit_from, unit = next(((place, str(said)) for place, said in places.items() if said), ("", ""))
     require(bool(unit), f'{where}: no unit; write "{bare} [{channels[channel]}]", or unit = "..."', UnitError)
-    raw_centre = read_value(column["centre"], unit, where=f"{where}.centre") if "centre" in column else 0.0
+    raw_centre = (
+        read_entry(COLUMN_KEYS["centre"], column["centre"], f"{where} centre", {"column": unit})
+        if "centre" in column
+        else COLUMN_KEYS["centre"].usual
+    )
     factor, offset = _column_scaling(unit, column.get("scale"), channels[channel], where)
     return ChannelColumn(name, factor, offset - factor * raw_centre, unit, unit_from, entry_from)
-
-
-def _stamp_column(name: str, channel: str, entry: Mapping[str, Any], where: str) -> ChannelColumn:
-    require(channel == "time", f"{where}: column {name!r} holds time stamps, no numbers; name another", LogError)
-    remedy = f"{where}: its time stamps are read in seconds; leave out unit, centre and scale"
-    require(entry.keys() == {"column"}, remedy, LogError)
-    return ChannelColumn(name, 1.0, 0.0)
 
 
 def _column_scaling(unit: str, scale: str | float | None, target: str, where: str) -> tuple[float, float]:
@@ -247,12 +222,12 @@ def _column_scaling(unit: str, scale: str | float | None, target: str, where: st
     level = re.search(r"\([ag]\)", f"{unit} {scale}")
     require(
         bool(level) or "(" not in target,
-        f'{where}.scale: {scale!r} does not say from where the pressure counts; write "2 bar(g)/V" or "2 bar(a)/V"',
+        f'{where} scale: {scale!r} does not say from where the pressure counts; write "2 bar(g)/V" or "2 bar(a)/V"',
         UnitError,
     )
     bare, bare_target = (re.sub(r"\([ag]\)", "", text) for text in (unit, target))
-    gain = _read_gain(re.sub(r"\([ag]\)", "", str(scale)), bare, bare_target, f"{where}.scale")
-    return gain, si_conversion(bare_target + (level[0] if level else ""), target, where=f"{where}.scale")[1]
+    gain = _read_gain(re.sub(r"\([ag]\)", "", str(scale)), bare, bare_target, f"{where} scale")
+    return gain, si_conversion(bare_target + (level[0] if level else ""), target, where=f"{where} scale")[1]
 
 
 def _read_gain(scale: str, unit: str, target: str, where: str) -> float:
@@ -269,19 +244,7 @@ def _read_gain(scale: str, unit: str, target: str, where: str) -> float:
         return 1 / inverse
 
 
-def _check_finite(table: Table, numbers: Mapping[str, Array]) -> None:
-    """Refuse an infinite sample, and one that no sensor gives; NaN stands for a missing one."""
-    for name, column in numbers.items():
-        wrong = np.abs(column) > MAX_MAGNITUDE
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            what = "is not a number" if np.isinf(column[row]) else "is no measured value"
-            raise LogError(
-                f"{table.path}: row {row + table.first_row}, column {name!r}: {column[row]:.6g} {what}; {EMPTY_CELL}"
-            )
-
-
-def _check_samples(table: Table, found: Mapping[str, ChannelColumn], values: Mapping[str, Array]) -> None:
+def _check_samples(table: LogTable, found: Mapping[str, ChannelColumn], values: Mapping[str, Array]) -> None:
     t = values["time"]
     require(
         t.size >= MIN_SAMPLES,
@@ -300,7 +263,7 @@ def _check_samples(table: Table, found: Mapping[str, ChannelColumn], values: Map
     _check_order(table, t)
 
 
-def _check_order(table: Table, t: Array) -> None:
+def _check_order(table: LogTable, t: Array) -> None:
     """Refuse a time that does not increase, and name all rows where it does not."""
     steps = np.diff(t)
     if (steps > 0).all():
@@ -309,20 +272,13 @@ def _check_order(table: Table, t: Array) -> None:
     for kind, late in (("repeats", np.flatnonzero(steps == 0)), ("runs backwards", np.flatnonzero(steps < 0))):
         if late.size:
             before, after = t[late[0]], t[late[0] + 1]
-            rows = _list_rows((late + 1 + table.first_row).tolist())
+            rows = list_rows((late + 1 + table.first_row).tolist())
             parts.append(f"{rows}: time {kind} ({before:.9g} s, then {after:.9g} s)")
     coarse = 2 * np.count_nonzero(steps == 0) > steps.size
     remedy = "delete the row, or cut the log there"
     if coarse:
         remedy = "the time is too coarse for the samples; export it with more digits"
     raise LogError(f"{table.path}: {'; '.join(parts)}; {remedy}")
-
-
-def _list_rows(rows: Sequence[int]) -> str:
-    """As in "row 14" or "rows 14, 20, ... (57 in all)"."""
-    shown = ", ".join(str(row) for row in rows[:MAX_ROWS_SHOWN])
-    more = f", ... ({len(rows)} in all)" if len(rows) > MAX_ROWS_SHOWN else ""
-    return f"row {shown}" if len(rows) == 1 else f"rows {shown}{more}"
 
 
 class Plant(Protocol):
@@ -345,44 +301,202 @@ def plant_channels(plant: Plant) -> dict[str, str]:
     return {**{q.name: q.unit for q in (*plant.inputs, *plant.outputs)}, **references}
 
 
-ACCEPTED_CHECKS = "accept"  # the checks that the log need not pass
-DATE = "date"  # when the log was taken
-
-
-def _column_key(channel: str, unit: str) -> Key:
-    meaning = f"column of the {channel.replace('_', ' ')}"
-    return Key(meaning, Takes.COLUMN, unit, keys=COLUMN_KEYS, example=f'"{channel} [{unit}]"')
-
-
-INTERSAMPLE_KEY = Key(
-    "by default a command is held", Takes.TEXT, choices={kind.value: kind for kind in Intersample}, example='"held"'
-)
-SIDECAR_KEYS: Mapping[str, Key] = {
-    ACCEPTED_CHECKS: Key("checks that this log need not pass", Takes.LIST, usual=[], example='["work"]'),
-    DATE: Key("when this log was taken, for track; before its stamps and its name", Takes.TEXT, example='"2026-03-12"'),
-    "columns": table(
-        "which column is which channel; false leaves one out; the header says the others",
-        {channel: _column_key(channel, unit) for channel, unit in CHANNELS.items()},
-        others=Key("column of another signal of the drive", Takes.COLUMN, "{own}", keys=COLUMN_KEYS),
-        named="signal",
-    ),
-    "noise": table(
-        "standard deviations; by default as the log shows",
-        {},
-        others=Key("of that channel", unit="{own}", example='"20 um"'),
-        named="channel",
-    ),
-    "conditions": table(
-        "known values that hold in this log only",
-        {},
-        others=Key("its value in this log", unit="{own}", example='"6.3 bar(g)"'),
-        named="parameter",
-    ),
-    "intersample": table(
-        "how channels run between two samples",
-        {},
-        others=INTERSAMPLE_KEY,
-        named="channel",
-    ),
+_WORDS: Mapping[str, tuple[str, ...]] = {
+    "time": ("t", "time", "zeit", "timestamp", "seconds", "sec"),
+    "valve_voltage": ("u", "valve", "voltage", "uvalve", "cmd", "command", "control", "ventil", "spannung", "mv"),
+    "force": ("f", "force", "kraft", "loadcell"),
+    "position": ("x", "y", "pos", "position", "displacement", "weg", "travel"),
+    "speed": ("v", "vel", "velocity", "speed", "geschwindigkeit", "xdot", "dx", "omega", "w", "rpm"),
+    "pressure_a": ("pa", "p1", "pressurea", "pressure1", "pressa", "press1", "chambera", "chamber1", "druck1"),
+    "pressure_b": ("pb", "p2", "pressureb", "pressure2", "pressb", "press2", "chamberb", "chamber2", "druck2"),
+    "supply_pressure": ("ps", "p0", "supply", "psupply", "supplypressure", "pressures", "versorgung"),
+    "torque": ("m", "tau", "torque", "moment", "drehmoment"),
+    "angle": ("phi", "angle", "theta", "winkel"),
 }
-"""The sections of a sidecar, and what stands before them."""
+_REFERENCE_WORDS = frozenset(["ref", "reference", "setpoint", "sp", "soll", "target", "desired", "set"])
+_UNITS: Mapping[str, tuple[str, ...]] = {
+    "s": ("s", "ms", "us"),
+    "m": ("m", "mm"),
+    "m/s": ("m/s", "mm/s"),
+    "rad": ("rad", "deg"),
+    "rad/s": ("rad/s", "rpm", "deg/s"),
+    "Pa(a)": ("bar", "Pa", "kPa"),
+}
+"""Units that a column without one may have."""
+LARGEST_SI = {"s": 0.1, "m": 3.0, "m/s": 5.0, "rad": 30.0, "rad/s": 2000.0}
+"""Magnitudes above which numbers are hardly in the SI unit, of the time its step: a shaft turns more often than once, a
+cylinder is shorter than 3 m and slower than 5 m/s. Smaller ones ask about right logs, larger ones miss millimetres."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A doubt about a column; the first option is the guess."""
+
+    channel: str
+    text: str
+    options: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ColumnGuess:
+    """A channel's column, its unit, "" where the reader knows it, and what is subtracted from it, "" for nothing."""
+
+    channel: str
+    column: str
+    unit: str
+    centre: str = ""
+    centre_is_estimated: bool = False  # the column is a command of 0 to 10 V, whose centre `identify` finds
+
+    @property
+    def entry(self) -> str:
+        """The line of a sidecar: { column = "U valve", unit = "V", centre = "5 V" }."""
+        parts = {"column": self.column, "unit": self.unit, "centre": self.centre}
+        # JSON escapes as TOML does, but for one character
+        quoted = {n: json.dumps(s, ensure_ascii=False).replace("\x7f", "\\u007f") for n, s in parts.items() if s}
+        return "{ " + ", ".join(f"{n} = {text}" for n, text in quoted.items()) + " }"
+
+
+@dataclass(frozen=True)
+class LogGuess:
+    """What a log holds: its channels, columns that are none, and the time from sample to sample [s]."""
+
+    columns: tuple[ColumnGuess, ...]
+    unused: tuple[str, ...]
+    sample_time: float
+
+
+Ask = Callable[[Question], str]
+
+
+def guess_channels(names: Sequence[str], channels: Mapping[str, str]) -> dict[str, list[str]]:
+    """By channel the columns whose names may mean it, the surest first.
+
+    Examples
+    --------
+    >>> guess_channels(["t_ms", "U valve", "x [mm]", "x soll"], {"time": "s", "valve_voltage": "V", "position": "m"})
+    {'time': ['t_ms'], 'valve_voltage': ['U valve'], 'position': ['x [mm]']}
+    """
+    found: dict[str, list[tuple[int, str]]] = {}
+    for name in filter(None, names):
+        channel, doubt = _guess_channel(name, channels)
+        if channel:
+            found.setdefault(channel, []).append((doubt, name))
+    return {c: [name for _, name in sorted(own, key=lambda pair: pair[0])] for c, own in found.items()}
+
+
+def guess_log(table: LogTable, channels: Mapping[str, str], ask: Ask, has_centre: bool = False) -> LogGuess:
+    """Guess what a log's columns are; `ask` settles a `Question`, `has_centre`: the drive has a valve's centre."""
+    found = guess_channels([n for n in table.names if n not in table.stamps], channels)
+    if "time" not in found and table.stamps:
+        found = {"time": [next(iter(table.stamps))], **found}
+    require("time" in found, f'{table.path}: no column may be the time; name one "time [s]"', LogError)
+    require(len(found) > 1, f"{table.path}: no column but the time is understood: {', '.join(table.names)}", LogError)
+    guesses = []
+    for channel, names in found.items():
+        text = f"Which column is the {channel.replace('_', ' ')}?"
+        name = names[0] if len(names) == 1 else ask(Question(channel, text, tuple(names)))
+        guesses += _guess_column(table, channel, name, channels[channel], ask, has_centre)
+    used = {guess.column for guess in guesses}
+    time = f'{table.path}: column {found["time"][0]!r} holds no time that is understood; name one "time [s]"'
+    require("time" in {g.channel for g in guesses}, time, LogError)
+    stamps = next(g for g in guesses if g.channel == "time")
+    factor = si_conversion(stamps.unit, "s")[0] if stamps.unit else 1.0
+    step = factor * float(np.median(_steps(table.read([stamps.column])[stamps.column])))
+    unused = tuple(n for n in table.names if n and n not in used)
+    return LogGuess(tuple(guesses), unused, float(f"{step:.3g}"))
+
+
+def _guess_channel(name: str, channels: Mapping[str, str]) -> tuple[str, int]:
+    """The channel that a name may mean, and how doubtful that is; ("", 0) for none."""
+    bare, unit = split_unit(name)
+    words = [w for w in re.split(r"[^a-z0-9]+", bare.casefold()) if w]
+    plain = "_".join(words)
+    for channel in sorted(channels, key=len, reverse=True):
+        if plain == channel or (plain.startswith(f"{channel}_") and not unit and not _REFERENCE_WORDS & set(words)):
+            return channel, 0
+    suffix = COMMAND_SUFFIX if _REFERENCE_WORDS & set(words) else ""
+    words = [w for w in words if w not in _REFERENCE_WORDS]
+    joined = ["".join(words[:n]) for n in (3, 2, 1) if n <= len(words)]
+    for doubt, candidates in enumerate((joined, words), 1):
+        for word in candidates:
+            for channel, known in _WORDS.items():
+                if word in known and f"{channel}{suffix}" in channels:
+                    return f"{channel}{suffix}", doubt
+    return "", 0
+
+
+def _guess_column(
+    table: LogTable, channel: str, name: str, target: str, ask: Ask, has_centre: bool
+) -> list[ColumnGuess]:
+    """A channel's column with unit and centre; nothing where its unit does not measure the channel."""
+    try:
+        values = table.read([name])[name]
+    except LogError:  # it holds words
+        return []
+    if not np.isfinite(values).any():
+        return []
+    enough = int(np.isfinite(values).sum()) >= MIN_SAMPLES
+    few = f"{table.path}: {values.size} samples are too few; at least {MIN_SAMPLES} are needed"
+    require(enough or channel != "time", few, LogError)
+    if name in table.stamps:
+        return [ColumnGuess(channel, name, "")]
+    stated = split_unit(name)[1] or table.units.get(name, "") or _unit_suffix(name, target)
+    unit = _settle_unit(channel, name, stated, target, values, ask)
+    if not unit:
+        return []
+    low, high, middle = (float(f(values)) for f in (np.nanmin, np.nanmax, np.nanmedian))
+    is_offset = channel == "valve_voltage" and unit == "V" and RANGE[0] <= low and high <= RANGE[1] and high > 1
+    if not is_offset:
+        return [ColumnGuess(channel, name, unit)]
+    if has_centre and SHOWN_CENTRES[0] < middle < SHOWN_CENTRES[1]:
+        return [ColumnGuess(channel, name, unit, centre_is_estimated=True)]
+    options = ("5 V", "0 V") if CENTRES[0] < middle < CENTRES[1] else ("0 V", "5 V")
+    centre = options[0]
+    if low >= 0 and options[0] == "0 V":
+        centre = ask(Question(channel, f"{name!r} goes from {low:.3g} to {high:.3g} V. Where is its centre?", options))
+    return [ColumnGuess(channel, name, unit, "" if centre == "0 V" else centre)]
+
+
+def _settle_unit(channel: str, name: str, stated: str, target: str, values: Array, ask: Ask) -> str:
+    """The unit of a column, stated or guessed by its values; empty where the stated one does not fit the channel."""
+    if stated and _measures(stated, target):
+        return stated
+    if target == "Pa(a)" and (not stated or _measures(f"{stated}(a)", target)):
+        most, least = float(np.nanmax(values)), float(np.nanmin(values))
+        unit = stated or ("Pa" if most > 5e3 else "kPa" if most > 50 else "bar")
+        if least * si_conversion(f"{unit}(a)", "Pa(a)")[0] < VACUUM_LIMIT:
+            return f"{unit}(g)"  # an absolute pressure is not so low
+        text = (
+            f"{name!r} goes from {least:.3g} to {most:.3g}{' ' + stated if stated else ''}. Absolute (a), or gauge (g)?"
+        )
+        return ask(Question(channel, text, (f"{unit}(a)", f"{unit}(g)")))
+    if stated:
+        return ""
+    options = _UNITS.get(target, (target,))
+    if len(options) == 1:
+        return target
+    size = float(np.median(np.abs(_steps(values))) if channel == "time" else np.nanmax(np.abs(values)))
+    guess = options[1] if size > LARGEST_SI.get(target, np.inf) else options[0]
+    ordered = (guess, *(unit for unit in options if unit != guess))
+    what = f"is {size:.3g} from row to row" if channel == "time" else f"reaches {size:.3g}"
+    return ask(Question(channel, f"{name!r} {what}. In which unit?", ordered))
+
+
+def _measures(unit: str, target: str) -> bool:
+    try:
+        si_conversion(unit, target)
+    except UnitError:
+        return False
+    return True
+
+
+def _unit_suffix(name: str, target: str) -> str:
+    """The unit at the end of a name, "t_ms" for example."""
+    last = re.split(r"[ _]", name.strip())[-1]
+    is_unit = last != name.strip() and (_measures(last, target) or _measures(f"{last}(a)", target))
+    return last if is_unit and not last.isdigit() else ""
+
+
+def _steps(stamps: Array) -> Array:
+    """From row to row, where both have a time."""
+    return np.diff(stamps[np.isfinite(stamps)])

@@ -1,30 +1,8 @@
-"""`examine`: faults that a log shows without a model: units, signs, zero points, sampling, missing motion.
+"""Faults that a log shows without a model: units, signs, zero points, sampling, missing motion, a wrong mass.
 
-`check_mass`, `check_offset`: what a log says of the force balance, beside the mass and the forces that are stated.
-
-Newton's law holds under every weight: with a hat function w of half width H the mean of the acceleration is a second
-difference of the position, so that no noise is differentiated. Over the windows that move one way,
-
-    mean(w F) = M (x(t + H) - 2 x(t) + x(t - H)) / H^2 + F_c sign(v) + b mean(w v) + F_0
-
-is linear in the mass M, friction F_c and b, and the offset F_0. The sensors may come late against each other, so that
-each alternative has the lag that suits it best.
-
-`check_dwells`: a log of a positioning axis, which stands still most of the time; what its moves and dwells show.
-
-`check_end_stops`: a body that rests at an end of its way while the drive pushes it on.
-
-`LogFinding`: one thing about a log, with the signals that show it; `StatedAxis`: what is known of the axis.
-
-`check_jumps`: a position that jumps from one sample to the next, as where a counter loses steps.
-
-The motion of a log as closely as its noise allows, and how two sensors of it agree at a lag.
-
-Single sensors: a pressure's zero and unit, jitter, clipping, resolution.
-
-Signs and units: position and speed, what drives the motion and its work, the command and what follows it.
-
-`check_has_motion`, `check_scale`: a log in which nothing moves, or faster than any drive.
+`examine` runs the checks of `CHECKS`, at the end of the file: each takes a log and what is known of its axis, and
+yields findings with the signals that show them. Behind it stand what the figures need, the motion of a log as closely
+as its noise allows, and the checks in their order.
 """
 
 import math
@@ -35,19 +13,15 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import find_resolution, noise_level
 from pneuopt.logs.tolerances import (
     CLIPPED_SHARE,
-    FAST_PERCENTILE,
+    FAST_QUANTILE,
     LAG_STEPS,
     LARGE_SHARE,
-    LARGEST_NOISE,
     LEAST_SPEED,
-    LEAST_WAY,
-    LOWER_QUARTILE,
     MAX_ATMOSPHERE_ERROR,
     MAX_COMMAND_LAG,
     MAX_HATS,
@@ -61,7 +35,6 @@ from pneuopt.logs.tolerances import (
     MAX_SLOPE_NOISE_SHARE,
     MAX_STEPS_BETWEEN,
     MAX_UNEXPLAINED,
-    MAX_WHITE_LAG,
     MEAN_BLOCKS,
     MIN_CONTRADICTION,
     MIN_HATS,
@@ -71,11 +44,9 @@ from pneuopt.logs.tolerances import (
     MIN_OFFSET_SHARE,
     MIN_PRESSURE_RATIO,
     MIN_RESIDUAL_FACTOR,
+    MIN_SAMPLES,
     MIN_SPEED_CORRELATION,
-    MIN_SPLINE,
     MIN_STOP_FORCE_RATIO,
-    MIN_STOP_SAMPLES,
-    MIN_STOP_TIME,
     MIN_VIEW_SAMPLES,
     MIN_WORK_SHARE,
     MOST_MOTION,
@@ -83,52 +54,34 @@ from pneuopt.logs.tolerances import (
     NOISE_WIDTHS,
     RECIPROCATING_TRAVEL_RATIO,
     ROD_AREA_RATIOS,
-    SHORTEST_DWELL,
+    SHORTEST_REST,
     SPEED_SLOPE_RATIOS,
     STATED_STOP_SHARE,
+    STILL_SHARE,
     STILL_STEPS,
-    STOP_SHARE,
     STOP_WIDTH,
-    USUAL_SPEED_QUANTILE,
-    VIEW_STROKES,
+    WHITE_LAGS,
     WRONG_SIGN_CORRELATIONS,
 )
-from pneuopt.quantities.arrays import Array, Mask
+from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, write_value
 
 
 class StatedAxis(NamedTuple):
-    """What is known of the axis that a log is of: a piston's channels unless a plant names its own (angle, torque).
-
-    Attributes
-    ----------
-    push : str
-        The force or torque that drives the axis, positive in the direction of positive speed.
-    forces : mapping of str to float
-        The force on the body per unit of each channel that pushes it; empty where a channel is not logged, or a factor
-        is not known.
-    constant : float
-        The force that no channel gives, as of a weight; NaN where a free parameter stands in it.
-    inertia : float
-        As stated; NaN where it is free.
-    offset_parameter : str
-        The parameter that takes a constant force.
-    stops : tuple of float
-        Positions at which the model has end stops.
-    """
+    """What is known of the axis that a log is of: a piston's channels unless a plant names its own (angle, torque)."""
 
     position: str = "position"
     speed: str = "speed"
-    push: str = "force"
-    forces: Mapping[str, float] = {"force": 1.0}
-    constant: float = math.nan
-    inertia: float = math.nan
+    push: str = "force"  # the force or torque that drives the axis, positive in the direction of positive speed
+    forces: Mapping[str, float] = {"force": 1.0}  # on the body, per unit of each channel; empty where one is not known
+    constant: float = math.nan  # the force that no channel gives, as a weight's; NaN where a part of it is free
+    inertia: float = math.nan  # as stated; NaN where it is free
     inertia_name: str = "mass"
     inertia_unit: str = "kg"
     force_unit: str = "N"
-    offset_parameter: str = ""
-    stops: tuple[float, ...] = ()
+    offset_parameter: str = ""  # takes a constant force
+    stops: tuple[float, ...] = ()  # positions at which the model has end stops
 
     def net_force(self, channels: Mapping[str, Array]) -> Array:
         """The force on the body without friction, from channels; the constant counts as zero where it is unknown."""
@@ -148,25 +101,13 @@ class Panel(NamedTuple):
 
 @dataclass(frozen=True)
 class Evidence:
-    """The signals that contradict each other, over time.
+    """The signals that contradict each other, over time."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        [s]
-    contradiction : ndarray of bool, shape (n,)
-        Where they contradict each other.
-    view : tuple of (float, float)
-        Begin and end of the time [s] in which this is plainest.
-    label : str
-        What is seen where they contradict each other.
-    """
-
-    t: Array
+    t: Array  # (n,) [s]
     panels: tuple[Panel, ...]
-    contradiction: Mask
-    view: tuple[float, float]
-    label: str = "they contradict each other"
+    contradiction: Mask  # (n,), where they contradict each other
+    view: tuple[float, float]  # begin and end of the time [s] in which this is plainest
+    label: str = "they contradict each other"  # what is seen there
 
 
 class Severity(StrEnum):
@@ -219,6 +160,53 @@ class LogFinding:
     rows: tuple[int, int] | None = None
 
 
+def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFinding, ...]:
+    """Find faults of a log before any model is fitted to it; its noise, where given, separates motion from noise.
+
+    Faults come first: nothing moves; a channel is constant; position and speed disagree in sign or unit; the force, or
+    the pressures, brake the motion on balance, which no drive does; the piston runs against the valve's command, or to
+    and fro without one; it jumps, or rests at a stop that the model lacks; force and acceleration are those of another
+    mass than is stated; a pressure is a vacuum, or above the supply. Then notes: a constant force that is not stated;
+    jitter, a clipped sensor, a coarse resolution; of an axis that stands still most of the time, which share is motion.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pneuopt.quantities.trajectories import Trajectory
+    >>> t = np.arange(2000) * 1e-3
+    >>> swing = {"position": 0.1 * np.sin(6 * t), "force": 5.0 * np.cos(6 * t)}
+    >>> examine(Experiment(Trajectory(t, swing)))
+    ()
+    >>> finding = examine(Experiment(Trajectory(t, {**swing, "force": -swing["force"]})))[0]
+    >>> print(finding.check, finding.message.partition("(")[0], finding.message.partition(": ")[2], sep="; ")
+    work; the force brakes the motion on balance ; change the sign of 'force'
+    """
+    log = experiment.trajectory
+    moved = (n for n in (axis.position, axis.speed) if n in log and n not in experiment.noise)
+    noise = {n: noise_level(log[n], log.t) for n in moved}  # which several checks need
+    experiment = experiment.with_noise({n: level for n, level in noise.items() if level > 0})
+    # each channel at every instant, as recorders that give each its own rate do not write it
+    known = {n: np.isfinite(log[n]) for n in log}
+    lacking = [n for n, there in known.items() if 4 <= there.sum() < there.size]  # as a cubic spline needs
+    whole = replace(experiment, trajectory=log.with_columns({n: _spline(log.t, log[n], known[n]) for n in lacking}))
+    logs = {name: experiment if name in SINGLE_SAMPLE_CHECKS else whole for name in CHECKS}
+    named = ((name, finding) for name, check in CHECKS.items() for finding in check(logs[name], axis))
+    found = [replace(finding, check=name, log=experiment.name) for name, finding in named]
+    return tuple(sorted(found, key=lambda f: not f.fault))
+
+
+def _spline(t: Array, column: Array, known: Mask) -> Array:
+    """A column at every instant by a cubic spline through its samples, but not across a hole."""
+    from scipy.interpolate import CubicSpline
+
+    at, steps = t[known], np.diff(t[known])
+    out = np.asarray(CubicSpline(at, column[known], extrapolate=False)(t))
+    before = np.clip(np.searchsorted(at, t, side="right") - 1, 0, steps.size - 1)
+    out[steps[before] > MAX_STEPS_BETWEEN * float(np.median(steps))] = np.nan
+    out[known] = column[known]
+    return out
+
+
 def evidence(
     experiment: Experiment,
     *channels: str | Panel,
@@ -227,20 +215,9 @@ def evidence(
     motion: Array | None = None,
     label: str = "they contradict each other",
 ) -> Evidence:
-    """The evidence of a finding.
+    """The evidence of a finding, a panel a channel: `where` they contradict each other, seen about the sample `at`.
 
-    Parameters
-    ----------
-    *channels : str or Panel
-        Each in a panel of its own.
-    where : ndarray of bool, optional
-        Where they contradict each other; by default everywhere.
-    at : int, optional
-        The sample about which to look; by default all are seen.
-    motion : ndarray, optional
-        The speed, whose strokes say how much is to be seen.
-    label : str
-        What is seen there.
+    By default they do so everywhere, and all samples are seen; `motion` is the speed, whose strokes say how much.
     """
     log = experiment.trajectory
     panels = [c if isinstance(c, Panel) else Panel(experiment.unit(c), {c: log[c]}) for c in channels if c]
@@ -265,35 +242,21 @@ def view_about(t: Array, at: int, motion: Array | None = None) -> tuple[float, f
     if motion is not None and np.isfinite(motion).any():
         level = LARGE_SHARE * float(np.nanmax(np.abs(motion)))
         side = np.sign(motion[np.abs(motion) > level])
-        half = VIEW_STROKES * duration / (1 + int(np.count_nonzero(np.diff(side))))
+        half = duration / (1 + int(np.count_nonzero(np.diff(side))))
     half = max(half, MIN_VIEW_SAMPLES * float(np.median(np.diff(t))))
     return max(float(t[0]), float(t[at]) - half), min(float(t[-1]), float(t[at]) + half)
 
 
-class Balance(NamedTuple):
-    """What windows of a log say of its forces.
+class ForceBalance(NamedTuple):
+    """What windows of a log say of its forces, in SI units."""
 
-    Attributes
-    ----------
-    mass, offset : float
-        [kg], [N]: what the log itself shows.
-    friction : float
-        Coulomb's part [N].
-    residual : float
-        Root mean square of what is left [N].
-    with_stated_mass, without_offset : float
-        The same with the stated mass; without an offset [N].
-    spread : float
-        Standard deviation of the force [N].
-    """
-
-    mass: float
+    mass: float  # as the log itself shows, and so the offset
     offset: float
-    friction: float
-    residual: float
-    with_stated_mass: float
-    without_offset: float
-    spread: float
+    friction: float  # Coulomb's part
+    residual: float  # root mean square of what is left
+    with_stated_mass: float  # the same with the stated mass
+    without_offset: float  # the same without an offset
+    spread: float  # standard deviation of the force
 
     def holds(self) -> bool:
         """Whether the balance explains the forces, with friction that brakes."""
@@ -304,7 +267,7 @@ class Balance(NamedTuple):
         return residual > max(MIN_RESIDUAL_FACTOR * self.residual, MIN_CONTRADICTION * self.spread)
 
 
-_LAST_BALANCES: WeakKeyDictionary[Experiment, tuple[StatedAxis, Balance | None]] = WeakKeyDictionary()
+_LAST_BALANCES: WeakKeyDictionary[Experiment, tuple[StatedAxis, ForceBalance | None]] = WeakKeyDictionary()
 
 
 def check_mass(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -334,31 +297,34 @@ def check_offset(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFindin
     is_large = abs(found.offset) > MIN_OFFSET_SHARE * abs(found.friction)
     if is_large and found.contradicts(found.without_offset):
         more = "more" if found.offset > 0 else "less"
+        atmosphere = ATMOSPHERE * sum(weight for n, weight in axis.forces.items() if n.startswith("pressure_"))
+        cause = "a sensor's zero is off: " + (
+            f"free {axis.offset_parameter}, which takes it" if axis.offset_parameter else "take it off"
+        )
+        if abs(abs(found.offset) - abs(atmosphere)) < MAX_ATMOSPHERE_ERROR * abs(atmosphere):
+            taken, meant, unit = ("gauge", "absolute", "bar(a)")
+            if found.offset * atmosphere < 0:
+                taken, meant, unit = ("absolute", "gauge", "bar(g)")
+            cause = (
+                f"{meant} pressures are taken for {taken} ones: write {unit} if they are, in the header or the sidecar"
+            )
         message = (
             f"the drive pushes with {abs(found.offset):.3g} {axis.force_unit} {more} than the motion needs both ways"
         )
-        message += (
-            f" (friction is {found.friction:.3g} {axis.force_unit}), as where {_offset_cause(axis, found.offset)}"
-        )
+        message += f" (friction is {found.friction:.3g} {axis.force_unit}), as where {cause}"
         yield LogFinding(axis.push, message, False, evidence=_forces(experiment, axis, found))
 
 
-def _offset_cause(axis: StatedAxis, offset: float) -> str:
-    """What shifts the forces by this much, and the remedy: pressures that are one atmosphere off, or some zero."""
-    atmosphere = ATMOSPHERE * sum(weight for n, weight in axis.forces.items() if n.startswith("pressure_"))
-    if abs(abs(offset) - abs(atmosphere)) < MAX_ATMOSPHERE_ERROR * abs(atmosphere):
-        taken, meant, unit = (
-            ("absolute", "gauge", "bar(g)") if offset * atmosphere < 0 else ("gauge", "absolute", "bar(a)")
-        )
-        return f"{meant} pressures are taken for {taken} ones: write {unit} if they are, in the header or the sidecar"
-    remedy = f"free {axis.offset_parameter}, which takes it" if axis.offset_parameter else "take it off"
-    return f"a sensor's zero is off: {remedy}"
-
-
-def force_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
+def force_balance(experiment: Experiment, axis: StatedAxis) -> ForceBalance | None:
     """The balance of forces over the windows of a log that move one way; None where motion or forces are not known.
 
-    Two checks ask for that of one log, one after the other.
+    Newton's law holds under every weight: with a hat function w of half width H the mean of the acceleration is a
+    second difference of the position, so that no noise is differentiated. Over the windows that move one way,
+
+        mean(w F) = M (x(t + H) - 2 x(t) + x(t - H)) / H^2 + F_c sign(v) + b mean(w v) + F_0
+
+    is linear in the mass M, friction F_c and b, and the offset F_0. The sensors may come late against each other, so
+    that each alternative has the lag that suits it best.
     """
     axis_then, found = _LAST_BALANCES.get(experiment, (None, None))
     if axis_then is not axis:
@@ -367,7 +333,7 @@ def force_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
     return found
 
 
-def _fit_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
+def _fit_balance(experiment: Experiment, axis: StatedAxis) -> ForceBalance | None:
     rows = _weigh(experiment, axis)
     if rows is None:
         return None
@@ -377,15 +343,18 @@ def _fit_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
     if _rms(rows.acceleration) * (rows.t[1] - rows.t[0]) > MAX_PHASE_STEP * _rms(rows.speed):
         return None
     mass = 0.0 if math.isnan(axis.inertia) else axis.inertia
-    one = [_factor(np.column_stack([s, v, np.ones(v.size), a, f])) for _, a, s, v, f in lags]
+    columns = [np.column_stack([s, v, np.ones(v.size), a, f]) for _, a, s, v, f in lags]
+    # the triangular factor over the root of the length: root mean squares of regressions stand in it
+    one = [np.asarray(np.linalg.qr(each, mode="r"), dtype=float) / math.sqrt(len(each)) for each in columns]
     left = [abs(R[4, 4]) for R in one]
     # a lag turns speed into acceleration: where the log hardly tells lags apart, the least one is assumed
     told = [k for k in range(len(one)) if left[k] <= MIN_RESIDUAL_FACTOR * min(left)]
     chosen = min(told, key=lambda k: (abs(lags[k][0]), left[k]))
     friction, _, offset, own_mass = np.linalg.lstsq(one[chosen][:, :4], one[chosen][:, 4])[0].tolist()
     stated = min(math.hypot(R[3, 4] - mass * R[3, 3], R[4, 4]) for R in one)
-    centred = min(_rms_left(R[:, [0, 1, 3]], R[:, 4]) for R in one)
-    return Balance(own_mass, offset, friction, left[chosen], stated, centred, float(lags[chosen][4].std()))
+    fits = ((R[:, [0, 1, 3]], R[:, 4]) for R in one)
+    centred = min(float(np.linalg.norm(f - A @ np.linalg.lstsq(A, f)[0])) for A, f in fits)
+    return ForceBalance(own_mass, offset, friction, left[chosen], stated, centred, float(lags[chosen][4].std()))
 
 
 class _Rows(NamedTuple):
@@ -406,7 +375,7 @@ def _weigh(experiment: Experiment, axis: StatedAxis) -> _Rows | None:
         return None
     step = float(np.median(np.diff(log.t)))
     t = log.t[0] + step * np.arange(math.floor(float(log.t[-1] - log.t[0]) / step) + 1)
-    x, force = _on_grid(log.t, log[moved], t), axis.net_force({n: _on_grid(log.t, log[n], t) for n in axis.forces})
+    x, force = np.interp(t, log.t, log[moved]), axis.net_force({n: np.interp(t, log.t, log[n]) for n in axis.forces})
     noise = experiment.noise[moved] if moved in experiment.noise else noise_level(log[moved], log.t)
     if moved == axis.speed:
         x, noise = np.append(0.0, np.cumsum((x[1:] + x[:-1]) * step / 2)), noise * step
@@ -433,11 +402,6 @@ def _rows(t: Array, x: Array, a: Array, force: Array, half: int) -> _Rows:
     return _Rows(t[half:-half], a, speed, mean, direction)
 
 
-def _on_grid(t: Array, y: Array, grid: Array) -> Array:
-    """A column on an even grid; NaN beside missing samples."""
-    return np.asarray(np.interp(grid, t, y))
-
-
 def _columns(rows: _Rows, lag: int) -> tuple[Array, Array, Array, Array]:
     """Acceleration, direction, speed, and the force earlier by a lag, of the windows that move one way."""
     n = rows.t.size
@@ -448,20 +412,11 @@ def _columns(rows: _Rows, lag: int) -> tuple[Array, Array, Array, Array]:
     return a[used], s[used], v[used], f[used]
 
 
-def _factor(columns: Array) -> Array:
-    """The triangular factor of columns over the root of their length: root mean squares of regressions stand in it."""
-    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=float) / math.sqrt(len(columns))
-
-
-def _rms_left(A: Array, f: Array) -> float:
-    return float(np.linalg.norm(f - A @ np.linalg.lstsq(A, f)[0]))
-
-
 def _rms(e: Array) -> float:
     return math.sqrt(float(np.nanmean(e**2)))
 
 
-def _accelerations(experiment: Experiment, axis: StatedAxis, found: Balance) -> Evidence | None:
+def _accelerations(experiment: Experiment, axis: StatedAxis, found: ForceBalance) -> Evidence | None:
     """What the force leaves behind friction, beside the stated mass times the acceleration."""
     rows = _weigh(experiment, axis)
     if rows is None:
@@ -480,7 +435,7 @@ def _accelerations(experiment: Experiment, axis: StatedAxis, found: Balance) -> 
     return evidence(part, Panel(axis.force_unit, shown), speed, where=differs, at=at, motion=rows.speed)
 
 
-def _forces(experiment: Experiment, axis: StatedAxis, found: Balance) -> Evidence | None:
+def _forces(experiment: Experiment, axis: StatedAxis, found: ForceBalance) -> Evidence | None:
     """The force beside its mean in either direction, which friction makes opposite."""
     rows = _weigh(experiment, axis)
     if rows is None:
@@ -517,15 +472,16 @@ def check_dwells(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFindin
 
 def _find_moves(t: Array, size: Array) -> list[tuple[int, int]]:
     """First sample of each move and that after its last, from the speed's size."""
-    noise, fast = float(np.percentile(size, 25)) / LOWER_QUARTILE, float(np.percentile(size, FAST_PERCENTILE))
+    noise = float(np.percentile(size, 25)) / 0.3186  # the lower quartile of |N(0, 1)|
+    fast = float(np.quantile(size, FAST_QUANTILE))
     moving = np.flatnonzero(size > max(LEAST_SPEED * fast, NOISE_WIDTHS * noise))
-    if noise > LARGEST_NOISE * fast or not moving.size:
+    if noise > LARGE_SHARE * fast or not moving.size:
         return []
-    breaks = np.flatnonzero(np.diff(t[moving]) > SHORTEST_DWELL)
+    breaks = np.flatnonzero(np.diff(t[moving]) > SHORTEST_REST)
     spans = list(zip(moving[np.r_[0, breaks + 1]], moving[np.r_[breaks, moving.size - 1]] + 1, strict=True))
     travelled = size * np.gradient(t)  # in the time of each sample
     ways = [float(travelled[first:last].sum()) for first, last in spans]
-    return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > LEAST_WAY * max(ways)]
+    return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > STILL_SHARE * max(ways)]
 
 
 def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -536,14 +492,14 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
     x, push, unit = log[axis.position], axis.net_force({n: log[n] for n in axis.forces}), experiment.unit(axis.position)
     way = float(np.nanmax(x) - np.nanmin(x))
     noise = experiment.noise[axis.position] if axis.position in experiment.noise else noise_level(x, log.t)
-    width = max(STOP_WIDTH * noise, STOP_SHARE * way)
+    width = max(STOP_WIDTH * noise, STILL_SHARE * way)
     inside = (x > np.nanmin(x) + width) & (x < np.nanmax(x) - width)
     middle, level = _usual_push(inside, motion, push)
     for side, end in ((1, float(np.nanmax(x))), (-1, float(np.nanmin(x)))):
         held = (np.abs(x - end) < width) & (side * (push - middle) > MIN_STOP_FORCE_RATIO * level)
         begin, last = _longest_run(held)
-        is_long = last - begin >= MIN_STOP_SAMPLES and log.t[last] - log.t[begin] >= MIN_STOP_TIME
-        if not is_long or _is_stated(end, axis):
+        is_long = last - begin >= MIN_SAMPLES and log.t[last] - log.t[begin] >= SHORTEST_REST
+        if not is_long or any(abs(end - stop) < STATED_STOP_SHARE * float(np.ptp(axis.stops)) for stop in axis.stops):
             continue
         force = float(np.median(push[begin : last + 1]))
         times = f"from {log.t[begin]:.4g} s to {log.t[last]:.4g} s"
@@ -561,20 +517,15 @@ def _usual_push(inside: Mask, motion: Array, push: Array) -> tuple[float, float]
     fast = LARGE_SHARE * float(np.nanquantile(np.abs(motion), 0.99))
     moving = [side * motion > fast for side in (1, -1)]
     ways = [push[each] for each in moving]
-    known = [float(np.nanmedian(way)) for way in ways if way.size >= MIN_STOP_SAMPLES]
+    known = [float(np.nanmedian(way)) for way in ways if way.size >= MIN_SAMPLES]
     travels = [float(np.sum(np.abs(motion[each]))) for each in moving]
     # noise in rest goes either way: a body that only advances has no middle
     goes_back = min(travels) > LARGE_SHARE * max(travels)
     middle = sum(known) / 2 if len(known) == 2 and goes_back else 0.0
     pushes = np.abs(np.concatenate(ways) - middle)
     held = np.abs(push[(np.abs(motion) < fast) & inside] - middle)
-    holding = float(np.nanquantile(held, 0.99)) if held.size >= MIN_STOP_SAMPLES else 0.0
+    holding = float(np.nanquantile(held, 0.99)) if held.size >= MIN_SAMPLES else 0.0
     return middle, max(float(np.nanmedian(pushes)), holding)
-
-
-def _is_stated(end: float, axis: StatedAxis) -> bool:
-    """Whether the model has a stop near this position."""
-    return any(abs(end - stop) < STATED_STOP_SHARE * float(np.ptp(axis.stops)) for stop in axis.stops)
 
 
 def _longest_run(mask: Mask) -> tuple[int, int]:
@@ -586,9 +537,6 @@ def _longest_run(mask: Mask) -> tuple[int, int]:
     return int(edges[2 * longest]), int(edges[2 * longest + 1]) - 1
 
 
-Indices = NDArray[np.intp]
-
-
 def check_jumps(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find jumps of the position that no motion explains."""
     log = experiment.trajectory
@@ -598,42 +546,32 @@ def check_jumps(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding
     t, x = log.t[known], log[axis.position][known]
     if known.size < 4 * NEIGHBOURS:
         return
-    jumps = np.flatnonzero(_is_abrupt(t, x))
-    if jumps.size:  # few logs have abrupt steps, and only theirs need a level of the noise
-        noise = max(experiment.noise.get(axis.position, 0.0), noise_level(x, t))
-        jumps = jumps[np.abs(np.diff(x))[jumps] > MIN_JUMP_NOISE * noise]
-    if jumps.size:
-        shown = _evidence(experiment, axis, known, jumps)
-        yield LogFinding(axis.position, _sentence(t, x, jumps, axis.position), True, evidence=shown)
-
-
-def _is_abrupt(t: Array, x: Array) -> Mask:
-    """Which steps are far larger than those around them, and than those of most of the log."""
-    time = np.diff(t)
-    speed = np.abs(np.diff(x)) / time
+    time, steps = np.diff(t), np.diff(x)
+    speed = np.abs(steps) / time
+    usual = float(np.quantile(speed, FAST_QUANTILE))
     padded = np.pad(speed, NEIGHBOURS)
     shifts = [k for k in range(2 * NEIGHBOURS + 1) if k != NEIGHBOURS]
     around = np.max([padded[k : k + speed.size] for k in shifts], axis=0)
-    is_fast = speed > MIN_JUMP_SPEED_RATIO * np.maximum(around, _usual_speed(t, x))
-    return np.asarray(is_fast & (4 * speed / time > MIN_JUMP_ACCELERATION))
+    is_fast = speed > MIN_JUMP_SPEED_RATIO * np.maximum(around, usual)
+    jumps = np.flatnonzero(is_fast & (4 * speed / time > MIN_JUMP_ACCELERATION))
+    if jumps.size:  # few logs have abrupt steps, and only theirs need a level of the noise
+        noise = max(experiment.noise.get(axis.position, 0.0), noise_level(x, t))
+        jumps = jumps[np.abs(steps)[jumps] > MIN_JUMP_NOISE * noise]
+    if jumps.size:
+        first = int(jumps[0])
+        limit = f"{speed[first]:.3g} m/s; the log usually moves below {usual:.2g} m/s"
+        message = (
+            f"{axis.position!r} jumps by {1e3 * steps[first]:.3g} mm within a sample at {t[first + 1]:.4g} s ({limit})"
+        )
+        remedy = ": cut the log in two there"
+        if jumps.size > 1:
+            more = "and again" if jumps.size == 2 else f"and {jumps.size - 1} times more, next"
+            remedy = f", {more} at {t[jumps[1] + 1]:.4g} s: leave the cells of {axis.position!r} in between empty"
+        shown = _jump_evidence(experiment, axis, known, jumps)
+        yield LogFinding(axis.position, message + remedy, True, evidence=shown)
 
 
-def _usual_speed(t: Array, x: Array) -> float:
-    return float(np.quantile(np.abs(np.diff(x) / np.diff(t)), USUAL_SPEED_QUANTILE))
-
-
-def _sentence(t: Array, x: Array, jumps: Indices, name: str) -> str:
-    first = int(jumps[0])
-    size, speed = 1e3 * (x[first + 1] - x[first]), abs(x[first + 1] - x[first]) / (t[first + 1] - t[first])
-    usual = f"the log usually moves below {_usual_speed(t, x):.2g} m/s"
-    found = f"{name!r} jumps by {size:.3g} mm within a sample at {t[first + 1]:.4g} s ({speed:.3g} m/s; {usual})"
-    if jumps.size == 1:
-        return f"{found}: cut the log in two there"
-    more = "and again" if jumps.size == 2 else f"and {jumps.size - 1} times more, next"
-    return f"{found}, {more} at {t[jumps[1] + 1]:.4g} s: leave the cells of {name!r} in between empty"
-
-
-def _evidence(experiment: Experiment, axis: StatedAxis, known: Indices, jumps: Indices) -> Evidence:
+def _jump_evidence(experiment: Experiment, axis: StatedAxis, known: Indices, jumps: Indices) -> Evidence:
     """The position, and the speed that it would need."""
     log = experiment.trajectory
     t, speed = log.t, np.full(len(log), np.nan)
@@ -794,8 +732,9 @@ def check_position_speed(experiment: Experiment, axis: StatedAxis) -> Iterator[L
     log = experiment.trajectory
     if axis.position not in log or axis.speed not in log:
         return
-    experiment = _known_part(experiment, axis.position, axis.speed)
-    log = experiment.trajectory
+    known = np.isfinite(log.matrix((axis.position, axis.speed))).all(axis=1)
+    log = Trajectory(log.t[known], {n: log[n][known] for n in log})
+    experiment = replace(experiment, trajectory=log, holes=())
     t, x, v = log.t, log[axis.position], log[axis.speed]
     half = slope_half_width(t, x, experiment.noise.get(axis.position))
     if half is None:
@@ -817,14 +756,6 @@ def check_position_speed(experiment: Experiment, axis: StatedAxis) -> Iterator[L
             fast = np.abs(slope) > LARGE_SHARE * np.nanmax(np.abs(slope))
             shown = _speeds(experiment, axis, slope, fast, int(np.nanargmax(np.abs(slope))))
             yield LogFinding(axis.speed, message, True, evidence=shown)
-
-
-def _known_part(experiment: Experiment, *channels: str) -> Experiment:
-    """The samples in which channels are all known."""
-    log = experiment.trajectory
-    known = np.isfinite(log.matrix(channels)).all(axis=1)
-    part = Trajectory(log.t[known], {n: log[n][known] for n in log})
-    return replace(experiment, trajectory=part, holes=())
 
 
 def _speeds(experiment: Experiment, axis: StatedAxis, slope: Array, where: Mask, at: int) -> Evidence:
@@ -901,7 +832,7 @@ def _work_shares(t: Array, pushes: Array, motion: Array, lag: int) -> Array:
     """Work of each push, over the integral of its power's absolute value; NaN where the log does not return."""
     unknown = np.full(len(pushes), math.nan)
     rows, motion = shift(np.where(np.isfinite(pushes).all(axis=0), np.arange(t.size), math.nan), motion, lag)
-    if rows.size < 10:
+    if rows.size < MIN_SAMPLES:
         return unknown
     at = rows.astype(np.intp)
     steps = np.diff(t[at], prepend=t[at[0]], append=t[at[-1]])
@@ -936,7 +867,7 @@ def check_has_motion(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFi
         if y.size and not np.any(np.diff(y)) and (name == axis.position or y[0] == 0):
             message = f"{name!r} is constant: without motion friction is unidentifiable"
             yield LogFinding(name, message, True, evidence=_stillness(experiment, name, axis))
-        elif y.size >= 2 * MEAN_BLOCKS and (_is_motionless(y, noise) or (name == axis.position and _is_white(y))):
+        elif y.size >= 2 * MEAN_BLOCKS and _is_motionless(y, noise, name == axis.position):
             message = f"{name!r} shows noise and no motion: log a run in which the drive moves"
             yield LogFinding(name, message, True, evidence=_stillness(experiment, name, axis))
 
@@ -960,98 +891,27 @@ def _stillness(experiment: Experiment, name: str, axis: StatedAxis) -> Evidence:
     return evidence(experiment, name, *drives[:1])
 
 
-def _is_motionless(y: Array, noise: float) -> bool:
-    """Whether a channel, and its block means, vary by no more than its noise, which has no rhythm."""
+def _is_motionless(y: Array, noise: float, is_position: bool) -> bool:
+    """Whether a channel, and its block means, vary by no more than its noise, which has no rhythm.
+
+    Or its samples are uncorrelated, which the position of a moving mass never is.
+    """
+    correlation = float(np.max(np.abs(_autocorrelation(y))))
+    if is_position and correlation < 4 / math.sqrt(y.size):
+        return True
     size = y.size // MEAN_BLOCKS
     means = y[: MEAN_BLOCKS * size].reshape(MEAN_BLOCKS, size).mean(axis=1)
     is_small = float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
-    flickers = float(np.ptp(y)) <= STILL_STEPS * find_resolution(y)
-    return is_small and (flickers or float(np.max(np.abs(_autocorrelation(y)))) < MIN_SPEED_CORRELATION)
-
-
-def _is_white(y: Array) -> bool:
-    """Whether samples are uncorrelated, which the position of a moving mass never is."""
-    return bool(np.max(np.abs(_autocorrelation(y))) < 4 / math.sqrt(y.size))
+    return is_small and (float(np.ptp(y)) <= STILL_STEPS * find_resolution(y) or correlation < MIN_SPEED_CORRELATION)
 
 
 def _autocorrelation(y: Array) -> Array:
-    """The correlation of samples at each lag up to `MAX_WHITE_LAG`."""
+    """The correlation of samples at each lag up to `WHITE_LAGS`."""
     e = y - y.mean()
     power = float(e @ e)
     if power == 0:
         return np.zeros(1)
-    return np.array([float(e[k:] @ e[:-k]) / power for k in range(1, min(MAX_WHITE_LAG, y.size - 1) + 1)])
-
-
-def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFinding, ...]:
-    """Find faults of a log before any model is fitted to it.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Its noise, where given, separates motion from noise.
-    axis : StatedAxis
-        What the log calls its motion and what drives it.
-
-    Returns
-    -------
-    tuple of LogFinding
-        Faults first: nothing moves; a channel is constant; position and speed disagree in sign or unit; the force, or
-        the pressures, brake the motion on balance, which no drive does; the piston runs against the valve's command, or
-        to and fro without one; it jumps, or rests at a stop that the model lacks; force and acceleration are those of
-        another mass than is stated; a pressure is a vacuum, or above the supply.
-        Then notes: a constant force that is not stated; jitter, a clipped sensor, a coarse resolution; of an axis that
-        stands still most of the time, which share is motion.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pneuopt.quantities.trajectories import Trajectory
-    >>> t = np.arange(2000) * 1e-3
-    >>> swing = {"position": 0.1 * np.sin(6 * t), "force": 5.0 * np.cos(6 * t)}
-    >>> examine(Experiment(Trajectory(t, swing)))
-    ()
-    >>> finding = examine(Experiment(Trajectory(t, {**swing, "force": -swing["force"]})))[0]
-    >>> print(finding.check, finding.message.partition("(")[0], finding.message.partition(": ")[2], sep="; ")
-    work; the force brakes the motion on balance ; change the sign of 'force'
-    """
-    experiment = _with_noise(experiment, axis)
-    whole = _fill_between(experiment)
-    logs = {name: experiment if name in SINGLE_SAMPLE_CHECKS else whole for name in CHECKS}
-    named = ((name, finding) for name, check in CHECKS.items() for finding in check(logs[name], axis))
-    found = [replace(finding, check=name, log=experiment.name) for name, finding in named]
-    return tuple(sorted(found, key=lambda f: not f.fault))
-
-
-def _with_noise(experiment: Experiment, axis: StatedAxis) -> Experiment:
-    """The log with the noise of its motion, which several checks need."""
-    log, found = experiment.trajectory, dict[str, float]()
-    for name in (axis.position, axis.speed):
-        if name in log and name not in experiment.noise:
-            found[name] = noise_level(log[name], log.t)
-    return experiment.with_noise({name: level for name, level in found.items() if level > 0})
-
-
-def _fill_between(experiment: Experiment) -> Experiment:
-    """The log with each channel at every instant, as recorders that give each its own rate do not write it.
-
-    A spline runs through the samples, but not across a hole.
-    """
-    log = experiment.trajectory
-    known = {n: np.isfinite(log[n]) for n in log}
-    lacking = [n for n, there in known.items() if MIN_SPLINE <= there.sum() < there.size]
-    return replace(experiment, trajectory=log.with_columns({n: _spline(log.t, log[n], known[n]) for n in lacking}))
-
-
-def _spline(t: Array, column: Array, known: Mask) -> Array:
-    from scipy.interpolate import CubicSpline
-
-    at, steps = t[known], np.diff(t[known])
-    out = np.asarray(CubicSpline(at, column[known], extrapolate=False)(t))
-    before = np.clip(np.searchsorted(at, t, side="right") - 1, 0, steps.size - 1)
-    out[steps[before] > MAX_STEPS_BETWEEN * float(np.median(steps))] = np.nan
-    out[known] = column[known]
-    return out
+    return np.array([float(e[k:] @ e[:-k]) / power for k in range(1, min(WHITE_LAGS, y.size - 1) + 1)])
 
 
 CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {

@@ -1,9 +1,4 @@
-"""`Experiment`: a measured `Trajectory` with its noise and conditions; cutting and resampling it.
-
-A pandas DataFrame as the table of a log.
-
-`LogSource`: where a log's channels were read, for whoever checks what a file was taken for.
-"""
+"""What was measured: an `Experiment`, a `Trajectory` with its noise and conditions; cutting and resampling it."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -13,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pneuopt.logs.columns import CHANNELS, ChannelColumn, Plant, plant_channels, read_channels
-from pneuopt.logs.table import Table, array_table, check_columns
+from pneuopt.logs.table import LogTable, array_table, check_columns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.parameters import Intersample, as_tuple, check_argument, usual_intersample
@@ -24,71 +19,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def frame_table(frame: "pd.DataFrame", units: Mapping[str, str], name: str) -> Table:
-    """The columns of a DataFrame, and its index where that is the time.
-
-    Parameters
-    ----------
-    frame : DataFrame
-        Its index counts as the column "time" where it holds dates or durations, or is named so.
-    units : mapping of str to str
-        By column.
-    name : str
-        Of the log, for messages.
-
-    Returns
-    -------
-    Table
-        Its first sample is row 1.
-    """
-    require(all(isinstance(column, str) for column in frame.columns), f"{name}: columns need names, as text", LogError)
-    columns = {str(column): _array(frame.iloc[:, i]) for i, column in enumerate(frame.columns)}
-    check_columns(name, [str(column) for column in frame.columns])
-    index = frame.index
-    if index.dtype.kind in "Mm" or str(index.name or "").casefold().startswith("time"):
-        columns = {str(index.name or "time"): _array(index.to_series()), **columns}
-    check_names("column", units, columns, f"{name}: units")
-    return array_table(name, columns, units)
-
-
-def _array(series: "pd.Series[Any]") -> Any:
-    """A column as NumPy has it; a time in a zone is counted in UTC, and what is missing is NaN."""
-    import pandas as pd
-
-    kind = series.dtype
-    if isinstance(kind, pd.DatetimeTZDtype):
-        return series.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy()
-    if pd.api.types.is_bool_dtype(kind) or not pd.api.types.is_numeric_dtype(kind):
-        return series.to_numpy()
-    return series.to_numpy(dtype=np.float64, na_value=np.nan)
-
-
 @dataclass(frozen=True)
 class LogSource:
-    """The file, rows and columns of a log.
+    """Where a log's channels were read: file, rows and columns."""
 
-    Attributes
-    ----------
-    path : str
-        Of the file; a name where the log comes from no file.
-    first_row : int
-        The number of the row that holds the first sample, as messages count rows; each sample has a row.
-    columns : mapping of str to ChannelColumn
-        By channel, "time" among them.
-    unread : tuple of str
-        Columns that are no channel.
-    sidecar : str
-        The file that says more about the log; empty where there is none.
-    sections : tuple of str
-        What stands in it.
-    """
-
-    path: str
-    first_row: int
-    columns: Mapping[str, ChannelColumn]
-    unread: tuple[str, ...] = ()
-    sidecar: str = ""
-    sections: tuple[str, ...] = ()
+    path: str  # a name where the log comes from no file
+    first_row: int  # the number of the row that holds the first sample, as messages count rows; each sample has a row
+    columns: Mapping[str, ChannelColumn]  # by channel, "time" among them
+    unread: tuple[str, ...] = ()  # columns that are no channel
+    sidecar: str = ""  # the file that says more about the log; empty where there is none
+    sections: tuple[str, ...] = ()  # what stands in it
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,26 +184,9 @@ class Experiment:
 
 
 def experiment_from_table(
-    table: Table, columns: Mapping[str, Any], where: str, plant: Plant | None, name: str
+    table: LogTable, columns: Mapping[str, Any], where: str, plant: Plant | None, name: str
 ) -> Experiment:
-    """Give the columns of a table their meaning.
-
-    Parameters
-    ----------
-    columns : mapping
-        Channel to column, as in a sidecar's [columns]; the table's names say the others.
-    where : str
-        Where `columns` comes from, for messages.
-    plant : System, optional
-        Its signals are channels, too.
-    name : str
-        Of the experiment.
-
-    Raises
-    ------
-    LogError, UnitError, UnknownNameError
-        As `read_channels` does.
-    """
+    """Give the columns of a table their meaning; `columns` says channel to column, and `where` whence that comes."""
     own = {} if plant is None else plant_channels(plant)
     read = read_channels(table, columns, where, {**CHANNELS, **own})
     trajectory = Trajectory(read.samples["time"], {n: y for n, y in read.samples.items() if n != "time"})
@@ -272,6 +195,30 @@ def experiment_from_table(
     unread = tuple(n for n in table.names if n and n not in used)
     source = LogSource(str(table.path), table.first_row, read.columns, unread)
     return Experiment(trajectory, name=name, units=units, remarks=read.remarks, source=source)
+
+
+def frame_table(frame: "pd.DataFrame", units: Mapping[str, str], name: str) -> LogTable:
+    """The columns of a DataFrame, its first sample in row 1, and its index where that holds times or is named so."""
+    require(all(isinstance(column, str) for column in frame.columns), f"{name}: columns need names, as text", LogError)
+    columns = {str(column): _array(frame.iloc[:, i]) for i, column in enumerate(frame.columns)}
+    check_columns(name, [str(column) for column in frame.columns])
+    index = frame.index
+    if index.dtype.kind in "Mm" or str(index.name or "").casefold().startswith("time"):
+        columns = {str(index.name or "time"): _array(index.to_series()), **columns}
+    check_names("column", units, columns, f"{name}: units")
+    return array_table(name, columns, units)
+
+
+def _array(series: "pd.Series[Any]") -> Any:
+    """A column as NumPy has it; a time in a zone is counted in UTC, and what is missing is NaN."""
+    import pandas as pd
+
+    kind = series.dtype
+    if isinstance(kind, pd.DatetimeTZDtype):
+        return series.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy()
+    if pd.api.types.is_bool_dtype(kind) or not pd.api.types.is_numeric_dtype(kind):
+        return series.to_numpy()
+    return series.to_numpy(dtype=np.float64, na_value=np.nan)
 
 
 def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:

@@ -1,23 +1,7 @@
-"""Reader of LabVIEW's measurement files (.lvm).
+"""Readers of foreign formats: LabVIEW, MATLAB, MDF, Parquet, TDMS, Excel; one function and one row of `READERS` each.
 
-Reader of MATLAB's .mat logs, versions 4 to 7: vectors, structures of them, Simulink's and dSPACE's structures.
-
-The variables of a .mat file of version 5 to 7: arrays, texts and structures of them; the rest is left alone.
-
-The format: MathWorks, "MAT-File Format", chapter 1. SciPy's own reader trusts the sizes in a file, as its documentation
-warns: some damaged logs end the whole process.
-
-Reader of ASAM's measurement data format (.mf4, .mdf); needs asammdf, the extra `mdf`.
-
-Reader of Parquet logs, as pandas, Spark and data loggers write them; needs pyarrow, the extra `parquet`.
-
-Reader of National Instruments' TDMS logs; needs npTDMS, the extra `tdms`.
-
-Reader of Excel's workbooks (.xlsx): the first sheet with names and samples; needs openpyxl, the extra `xlsx`.
-
-The registry of log formats: one reader a suffix. A new format is a file with a `read_table`, and a row here.
-
-Each reader takes what `read_table` takes, and raises what it raises.
+A reader takes the path, for messages, and the bytes of a file, and returns a `LogTable` or raises a `LogError`; where a
+library reads the format for us, an `InputError` says how to get it.
 """
 
 import io
@@ -28,6 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
+from enum import IntEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,7 +21,7 @@ import numpy as np
 
 from pneuopt.logs.table import (
     EMPTY_CELL,
-    Table,
+    LogTable,
     array_table,
     check_cells,
     check_columns,
@@ -52,14 +37,11 @@ from pneuopt.logs.text import (
     has_table,
     is_stamp,
     plain_unit,
+    read_delimited,
     read_text,
     seconds_from_first,
 )
-from pneuopt.logs.text import read_delimited as csv_read_table
 from pneuopt.logs.tolerances import (
-    COMPRESSED,
-    HEAD_BYTES,
-    MATRIX,
     MAX_BYTES,
     MAX_COLUMNS,
     MAX_DAYS,
@@ -68,7 +50,6 @@ from pneuopt.logs.tolerances import (
     MAX_HEAD_ROWS,
     MAX_LEVELS,
     MAX_MAGNITUDE,
-    MAX_SHEET_ROWS,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, require
@@ -82,7 +63,7 @@ _END = "***End_of_Header***"
 _TIME = "X_Value"
 
 
-def read_lvm(path: Path, raw: bytes) -> Table:
+def read_lvm(path: Path, raw: bytes) -> LogTable:
     """Read a measurement file of one segment; one without a head is read as text.
 
     Its time is the column X_Value, or, with X_Columns "No", X0 and Delta_X. Rows have the numbers that an editor shows.
@@ -101,12 +82,13 @@ def read_lvm(path: Path, raw: bytes) -> Table:
     keys = {row[0]: row[1:] for row in rows}
     names = _names(rows[head])
     require(_TIME in rows[head], f"{path}: row {head + 1} names no {_TIME}; save the log again", LogError)
-    units = _units(names, keys.get("Y_Unit_Label", []))
-    samples = [_without_comment(line, delimiter, names) for line in lines[head + 1 :]]
+    labels = zip([name for name in names[1:] if name], keys.get("Y_Unit_Label", []), strict=False)
+    units = {**{name: plain_unit(label) or label for name, label in labels if label}, "time": "s"}
+    samples = [delimiter.join(line.split(delimiter)[: len(names)]) for line in lines[head + 1 :]]  # without a comment
     block = TextBlock(path, names, samples, delimiter, head + 2)
     grid = _lvm_grid(path, keys) if keys.get("X_Columns", [""])[0] == "No" else None
     remark = f"rows 1 to {head} are read as the head of a LabVIEW measurement file"
-    return Table(path, names, head + 2, partial(_lvm_columns, block, grid), units, frozenset(), (remark,))
+    return LogTable(path, names, head + 2, partial(_lvm_columns, block, grid), units, frozenset(), (remark,))
 
 
 def _names(row: Sequence[str]) -> list[str]:
@@ -114,18 +96,6 @@ def _names(row: Sequence[str]) -> list[str]:
     names = ["" if name == _TIME else name for name in row]
     names[names.index("") if "" in names else 0] = "time"
     return names[: names.index("Comment")] if "Comment" in names else names[: len(names) - (not names[-1])]
-
-
-def _units(names: Sequence[str], labels: Sequence[str]) -> dict[str, str]:
-    channels = [name for name in names[1:] if name]
-    said = {name: plain_unit(label) or label for name, label in zip(channels, labels, strict=False) if label}
-    return {**said, "time": "s"}
-
-
-def _without_comment(line: str, delimiter: str, names: Sequence[str]) -> str:
-    """A row without what stands behind its last channel."""
-    cells = line.split(delimiter)
-    return delimiter.join(cells[: len(names)])
 
 
 def _lvm_grid(path: Path, keys: Mapping[str, Sequence[str]]) -> tuple[float, float]:
@@ -150,14 +120,11 @@ def _lvm_columns(block: TextBlock, grid: tuple[float, float] | None, names: Sequ
         return {name: time if name == "time" else columns[name] for name in names}
     columns = block.columns(names)
     for i in times[1:]:
-        own = TextBlock(block.path, _rename(block.names, i), block.lines, block.delimiter, block.first_row)
+        renamed = ["own" if k == i else name for k, name in enumerate(block.names)]
+        own = TextBlock(block.path, renamed, block.lines, block.delimiter, block.first_row)
         same = np.array_equal(own.columns(["own"])["own"], own.columns(["time"])["time"])
         require(same, f"{block.path}: the channels have times of their own; save them with one X column", LogError)
     return columns
-
-
-def _rename(names: Sequence[str], index: int) -> list[str]:
-    return ["own" if i == index else name for i, name in enumerate(names)]
 
 
 _STRUCTURE_REMEDY = "in MATLAB, save('run.mat', '-struct', 'S') with S a structure of vectors; of a table T, "
@@ -170,34 +137,33 @@ class _Column(NamedTuple):
     unit: str = ""
 
 
-def read_mat(path: Path, raw: bytes) -> Table:
+def read_mat(path: Path, raw: bytes) -> LogTable:
     """Read a .mat file; its first sample is row 1, MATLAB's index 1.
 
     Its vectors of real numbers are columns, and so are those in its structures, by the name of their field. In a
     structure array, as Simulink's ("Structure With Time") and dSPACE's, each element is a column by its `label` or
     `Name`, and their time is in seconds. NaN is a missing sample. Whatever else the file holds is left alone.
     """
-    variables = (_flatten(_Column(name, value), 0) for name, value in _load(path, raw))
-    columns = [column for found in variables for column in found if _is_vector(column.values)]
+    remedy = "in MATLAB, save it with the option '-v7'"
+    require(b"MATLAB 7.3" not in raw[:20], f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}", LogError)
+    variables: list[tuple[str, Any]] = []
+    with foreign_code(path, "a .mat file"):
+        if raw[124:128] in {b"\x00\x01IM", b"\x01\x00MI"}:  # versions 5 to 7
+            variables = read_elements(raw)
+        else:
+            require(0 in raw[:4], "its head names no version from 4 to 7")  # SciPy would read it as version 5
+            from scipy.io import loadmat
+
+            file: Any = io.BytesIO(raw)  # which the types do not know
+            variables = [(n, v) for n, v in loadmat(file, squeeze_me=True).items() if not n.startswith("__")]
+    flat = [column for name, value in variables for column in _flatten(_Column(name, value), 0)]
+    columns = [c for c in flat if isinstance(c.values, np.ndarray) and c.values.ndim == 1]
+    columns = [c for c in columns if c.values.dtype.kind in "fiub"]
     require(bool(columns), f"{path}: no vector of numbers; {_STRUCTURE_REMEDY}", LogError)
     names = [column.name for column in columns]
     check_columns(path, names)
     units = {column.name: column.unit for column in columns if column.unit}
     return array_table(path, {column.name: column.values for column in columns}, units)
-
-
-def _load(path: Path, raw: bytes) -> list[tuple[str, Any]]:
-    remedy = "in MATLAB, save it with the option '-v7'"
-    require(b"MATLAB 7.3" not in raw[:20], f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}", LogError)
-    with foreign_code(path, "a .mat file"):
-        if has_elements(raw):
-            return read_elements(raw)
-        require(0 in raw[:4], "its head names no version from 4 to 7")  # SciPy would read it as version 5
-        from scipy.io import loadmat
-
-        file: Any = io.BytesIO(raw)  # which the types do not know
-        return [(n, v) for n, v in loadmat(file, squeeze_me=True).items() if not n.startswith("__")]  # loadmat's own
-    raise AssertionError  # the context lets no error pass
 
 
 def _flatten(column: _Column, depth: int) -> Iterator[_Column]:
@@ -227,13 +193,17 @@ def _signal(name: str, element: Mapping[str, Any]) -> _Column | None:
     return None
 
 
-def _is_vector(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiub"
-
-
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
-_STRUCTURE, _CHARACTERS, _NUMERIC = 2, 4, range(6, 16)
+
+
+class _Kind(IntEnum):
+    """Types of elements, and classes of arrays."""
+
+    MATRIX = 14
+    COMPRESSED = 15
+    STRUCTURE_ARRAY = 2
+    CHARACTER_ARRAY = 4
 
 
 class _Element(NamedTuple):
@@ -242,36 +212,22 @@ class _Element(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """A structure, or an array of them.
-
-    Attributes
-    ----------
-    elements : list of dict
-        A field's value by its name.
-    """
+    """A structure, or an array of them: each element's values by field."""
 
     elements: list[dict[str, Any]]
     fields: tuple[str, ...]
 
 
-def has_elements(raw: bytes) -> bool:
-    """Whether a file says that it is of version 5 to 7."""
-    head = raw[HEAD_BYTES - 4 : HEAD_BYTES]
-    return head in {b"\x00\x01IM", b"\x01\x00MI"}
-
-
 def read_elements(raw: bytes) -> list[tuple[str, Any]]:
     """Read the variables: arrays without dimensions of length one, texts, structures; None for all others.
 
-    Raises
-    ------
-    InputError
-        If sizes, types or nesting contradict each other.
+    The format is that of MathWorks, "MAT-File Format", chapter 1. SciPy's own reader trusts the sizes in a file, as its
+    documentation warns: some damaged logs end the whole process.
     """
-    order = "<" if raw[HEAD_BYTES - 2 : HEAD_BYTES] == b"IM" else ">"
+    order = "<" if raw[126:128] == b"IM" else ">"
     budget, found = MAX_BYTES, []
-    for element in _elements(memoryview(raw)[HEAD_BYTES:], order):
-        if element.kind == COMPRESSED:
+    for element in _elements(memoryview(raw)[128:], order):
+        if element.kind == _Kind.COMPRESSED:
             unpacked = zlib.decompressobj().decompress(element.data, budget)
             budget -= len(unpacked)
             require(budget > 0, "it unpacks to more than a log's size")
@@ -293,11 +249,11 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
             require(size <= 4, "a short element is too long")
         require(start + size <= len(data), "an element is longer than what holds it")
         yield _Element(kind, data[start : start + size])
-        at = start + size if kind == COMPRESSED else at + 8 * math.ceil((start + size - at) / 8)
+        at = start + size if kind == _Kind.COMPRESSED else at + 8 * math.ceil((start + size - at) / 8)
 
 
 def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
-    require(element.kind == MATRIX, f"an element of type {element.kind} stands where a variable should")
+    require(element.kind == _Kind.MATRIX, f"an element of type {element.kind} stands where a variable should")
     require(level < MAX_LEVELS, "it is nested too deep")
     parts = _elements(element.data, order)
     flags = next(parts, None)
@@ -306,29 +262,24 @@ def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
     require(len(flags.data) == 8, "a variable has no flags")
     word = struct.unpack_from(order + "I", flags.data)[0]
     kind, is_complex = word & 0xFF, bool(word & 0x800)
-    if kind not in {_STRUCTURE, _CHARACTERS, *_NUMERIC} or is_complex:
+    if kind not in {_Kind.STRUCTURE_ARRAY, _Kind.CHARACTER_ARRAY, *range(6, 16)} or is_complex:
         return "", None
-    shape, name = _shape(_next(parts), order), _text(_next(parts), order)
-    if kind == _STRUCTURE:
-        return name, _structure(parts, math.prod(shape), order, level)
-    part = _next(parts)
-    return name, _text(part, order) if kind == _CHARACTERS else _array(part, shape, order)
-
-
-def _shape(dims: _Element, order: str) -> tuple[int, ...]:
+    dims = _next(parts)
     n = len(dims.data) // 4
     require(dims.kind in {5, 6} and 1 <= n <= 32 and len(dims.data) == 4 * n, "an array has no size")
     shape = struct.unpack_from(f"{order}{n}i", dims.data)
     require(min(shape) >= 0 and math.prod(shape) <= MAX_BYTES, "an array has an impossible size")
-    return shape
-
-
-def _array(part: _Element, shape: tuple[int, ...], order: str) -> Any:
+    name = _text(_next(parts), order)
+    if kind == _Kind.STRUCTURE_ARRAY:
+        return name, _structure(parts, math.prod(shape), order, level)
+    part = _next(parts)
+    if kind == _Kind.CHARACTER_ARRAY:
+        return name, _text(part, order)
     require(part.kind in _NUMBERS, "numbers are none")
     dtype = np.dtype(order + _NUMBERS[part.kind])
     require(len(part.data) == math.prod(shape) * dtype.itemsize, "an array has another size than it says")
     array = np.frombuffer(part.data, dtype).reshape(shape, order="F")
-    return array.astype(_NUMBERS[part.kind]).squeeze()
+    return name, array.astype(_NUMBERS[part.kind]).squeeze()
 
 
 def _text(part: _Element, order: str) -> str:
@@ -359,20 +310,17 @@ def _next(parts: Iterator[_Element]) -> _Element:
     return part
 
 
-TIME = "time"
-
-
-def read_mdf(path: Path, raw: bytes) -> Table:
+def read_mdf(path: Path, raw: bytes) -> LogTable:
     """Read an MDF file; its first sample is row 1.
 
     A column is a channel, by its name, or as "name (group 2)" where two groups have one of that name; "time" is the
     master of the group that the channels are of. Channels of groups with different times are refused.
     """
     import_extra("asammdf", "asammdf", path, "MDF", "mdf")
-    log = run_apart(_read_log, path, raw, kind="MDF")
-    names = [TIME, *(name for name in log.columns if name.casefold() != TIME)]
+    log = run_apart(_read_mdf_channels, path, raw, kind="MDF")
+    names = ["time", *(name for name in log.columns if name.casefold() != "time")]
     units = {name: plain_unit(unit) or unit for name, unit in log.units.items() if unit}
-    return Table(path, names, 1, partial(_mdf_columns, path, log), {**units, TIME: "s"})
+    return LogTable(path, names, 1, partial(_mdf_columns, path, log), {**units, "time": "s"})
 
 
 class _Log(NamedTuple):
@@ -384,13 +332,22 @@ class _Log(NamedTuple):
     times: dict[int, Any]
 
 
-def _read_log(path: Path, raw: bytes) -> _Log:
+def _read_mdf_channels(path: Path, raw: bytes) -> _Log:
     """Read all channels that hold numbers."""
     import asammdf
 
     log = _Log({}, {}, {}, {})
-    with foreign_code(path, "MDF"), asammdf.MDF(io.BytesIO(raw)) as file:
-        places = _places(file)
+    with foreign_code(path, "MDF"), asammdf.MDF(io.BytesIO(raw)) as opened:
+        file: Any = opened  # which the types know in part
+        # group and index of every channel but the groups' masters, by name
+        found = [
+            (channel.name, group, index)
+            for group, entry in enumerate(file.groups)
+            for index, channel in enumerate(entry.channels)
+            if file.masters_db.get(group) != index
+        ]
+        uses = Counter(name for name, _, _ in found)
+        places = {name if uses[name] == 1 else f"{name} (group {g})": (g, i) for name, g, i in found}
         rows = [int(file.groups[group].channel_group.cycles_nr) for group, _ in places.values()]
         check_cells(path, sum(rows), 1)
         for name, (group, index) in places.items():
@@ -401,28 +358,16 @@ def _read_log(path: Path, raw: bytes) -> _Log:
     return log
 
 
-def _places(file: Any) -> dict[str, tuple[int, int]]:
-    """Group and index of every channel but the groups' masters, by name."""
-    found = [
-        (channel.name, group, index)
-        for group, entry in enumerate(file.groups)
-        for index, channel in enumerate(entry.channels)
-        if file.masters_db.get(group) != index
-    ]
-    uses = Counter(name for name, _, _ in found)
-    return {name if uses[name] == 1 else f"{name} (group {g})": (g, i) for name, g, i in found}
-
-
 def _mdf_columns(path: Path, log: _Log, names: Sequence[str]) -> dict[str, Array]:
-    channels = [name for name in names if name != TIME]
+    channels = [name for name in names if name != "time"]
     times = [log.times[log.groups[name]] for name in channels]
     text = f"{path}: channels {', '.join(channels)} are of groups with different times; export them at one rate"
     require(all(np.array_equal(t, times[0], equal_nan=True) for t in times), text, LogError)
-    columns = {TIME: times[0], **{name: log.columns[name] for name in channels}}
+    columns = {"time": times[0], **{name: log.columns[name] for name in channels}}
     return dict(array_table(path, columns, {}).read(names))
 
 
-def read_parquet(path: Path, raw: bytes) -> Table:
+def read_parquet(path: Path, raw: bytes) -> LogTable:
     """Read a Parquet file; its first sample is row 1.
 
     Its columns that are used hold integers, floats or decimals, or, for the time, stamps or durations; a null or NaN is
@@ -432,8 +377,18 @@ def read_parquet(path: Path, raw: bytes) -> Table:
         fields = list(file.schema_arrow)
         check_cells(path, file.metadata.num_rows, len(fields))
     stamps = frozenset(field.name for field in fields if _is_time(field.type))
-    units = {field.name: unit for field in fields if (unit := _parquet_unit(field))}
-    return Table(path, [field.name for field in fields], 1, partial(_parquet_columns, path, raw), units, stamps)
+    texts = {f.name: {k.decode(): v.decode(errors="replace") for k, v in (f.metadata or {}).items()} for f in fields}
+    units = {name: unit for name, said in texts.items() if (unit := _unit(said))}
+    return LogTable(path, [field.name for field in fields], 1, partial(_parquet_columns, path, raw), units, stamps)
+
+
+_UNIT_KEYS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "units")
+
+
+def _unit(properties: Mapping[str, Any]) -> str:
+    """The unit of a channel by the keys that National Instruments and several loggers use; empty where none says it."""
+    said = next((str(properties[key]) for key in _UNIT_KEYS if properties.get(key)), "")
+    return plain_unit(said) or said
 
 
 @contextmanager
@@ -450,7 +405,7 @@ def _parquet_columns(path: Path, raw: bytes, names: Sequence[str]) -> dict[str, 
     with _parquet_file(path, raw) as file:
         places = [file.schema_arrow.names.index(name) for name in names]
         columns = file.read()
-        return {name: _floats(path, name, columns.column(i)) for name, i in zip(names, places, strict=True)}
+        return {name: _parquet_numbers(path, name, columns.column(i)) for name, i in zip(names, places, strict=True)}
 
 
 def _is_time(kind: "pa.DataType") -> bool:
@@ -459,15 +414,7 @@ def _is_time(kind: "pa.DataType") -> bool:
     return bool(pa.types.is_timestamp(kind) or pa.types.is_duration(kind))
 
 
-def _parquet_unit(field: "pa.Field") -> str:
-    """What a field's metadata say, by the key that several loggers use."""
-    metadata = field.metadata or {}
-    said = next((metadata[key].decode(errors="replace") for key in (b"unit", b"units") if key in metadata), "")
-    return plain_unit(said) or said
-
-
-def _floats(path: Path, name: str, column: "pa.ChunkedArray") -> Array:
-    import numpy as np
+def _parquet_numbers(path: Path, name: str, column: "pa.ChunkedArray") -> Array:
     import pyarrow as pa
 
     kind = column.type
@@ -483,11 +430,10 @@ def _floats(path: Path, name: str, column: "pa.ChunkedArray") -> Array:
     return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=float)
 
 
-_UNIT_KEYS = ("unit_string", "NI_UnitDescription", "Unit", "unit")
 _Grid = tuple[str, float, float]  # when the first sample was taken, its time and the step [s]
 
 
-def read_tdms(path: Path, raw: bytes) -> Table:
+def read_tdms(path: Path, raw: bytes) -> LogTable:
     """Read a TDMS file; its first sample is row 1.
 
     A column is a channel, by its name, or as "group/channel" where two groups have one of that name. Without a channel
@@ -498,20 +444,16 @@ def read_tdms(path: Path, raw: bytes) -> Table:
         listed = nptdms.TdmsFile.read_metadata(io.BytesIO(raw))
         check_cells(path, sum(len(channel) for group in listed.groups() for channel in group.channels()), 1)
         file = nptdms.TdmsFile.read(io.BytesIO(raw))
-        channels = _by_name(file)
+        pairs = [(group.name, channel) for group in file.groups() for channel in group.channels() if len(channel)]
+        uses = Counter(channel.name for _, channel in pairs)
+        channels = {c.name if uses[c.name] == 1 else f"{group}/{c.name}": c for group, c in pairs}
         columns = {name: channel[:] for name, channel in channels.items()}
         grids = {name: grid for name, channel in channels.items() if (grid := _tdms_grid(channel)) is not None}
-    units = {name: unit for name, channel in channels.items() if (unit := _tdms_unit(channel))}
+    units = {name: unit for name, channel in channels.items() if (unit := _unit(channel.properties))}
     if not grids or any(name.casefold() == "time" for name in columns):
         return array_table(path, columns, units)
     table = array_table(path, {"time": np.zeros(0), **columns}, {**units, "time": "s"})
-    return Table(path, table.names, 1, partial(_read_waveforms, table, grids), table.units, table.stamps)
-
-
-def _by_name(file: Any) -> dict[str, Any]:
-    pairs = [(group.name, channel) for group in file.groups() for channel in group.channels() if len(channel)]
-    uses = Counter(channel.name for _, channel in pairs)
-    return {c.name if uses[c.name] == 1 else f"{group}/{c.name}": c for group, c in pairs}
+    return LogTable(path, table.names, 1, partial(_read_waveforms, table, grids), table.units, table.stamps)
 
 
 def _tdms_grid(channel: Any) -> _Grid | None:
@@ -522,12 +464,7 @@ def _tdms_grid(channel: Any) -> _Grid | None:
     return str(properties.get("wf_start_time", "")), start, float(properties["wf_increment"])
 
 
-def _tdms_unit(channel: Any) -> str:
-    said = next((str(channel.properties[key]) for key in _UNIT_KEYS if channel.properties.get(key)), "")
-    return plain_unit(said) or said
-
-
-def _read_waveforms(table: Table, grids: dict[str, _Grid], names: Sequence[str]) -> dict[str, Array]:
+def _read_waveforms(table: LogTable, grids: dict[str, _Grid], names: Sequence[str]) -> dict[str, Array]:
     channels = [name for name in names if name != "time"]
     columns = dict(table.read(channels))
     rates = {grids.get(name) for name in channels}
@@ -545,7 +482,7 @@ class _Date(float):
     """A cell in days that Excel shows as a date or a time."""
 
 
-def read_xlsx(path: Path, raw: bytes) -> Table:
+def read_xlsx(path: Path, raw: bytes) -> LogTable:
     """Read a workbook; rows have Excel's numbers.
 
     An empty cell is a missing sample; a formula counts by its last value. Above the names may stand metadata, below
@@ -553,7 +490,15 @@ def read_xlsx(path: Path, raw: bytes) -> Table:
     """
     openpyxl = import_extra("openpyxl", "openpyxl", path, "an Excel workbook", "xlsx")
     with foreign_code(path, "an Excel workbook"):
-        sheets = _read_sheets(path, raw, openpyxl)
+        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        require(size <= MAX_BYTES, f"{path}: holds {size / 2**20:.0f} MiB of cells; export it as CSV", LogError)
+        book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
+        # openpyxl rounds dates to milliseconds; as numbers they keep all digits.
+        date_styles = book._date_formats | book._timedelta_formats
+        book._date_formats.clear()
+        book._timedelta_formats.clear()
+        sheets = {sheet.title: _read_cells(path, sheet, date_styles) for sheet in book.worksheets}
     shown = {title: [[_show(cell) for cell in row] for row in rows[:MAX_HEAD_ROWS]] for title, rows in sheets.items()}
     title = next((title for title, rows in shown.items() if has_table(rows)), next(iter(sheets), ""))
     require(any(shown.values()), f"{path}: no sheet holds cells; it has to name the columns in a row", LogError)
@@ -563,7 +508,7 @@ def read_xlsx(path: Path, raw: bytes) -> Table:
     stamps = frozenset(name for name, cell in zip(layout.names, first, strict=False) if name and is_stamp(cell))
     read = partial(_xlsx_columns, _Sheet(path, layout.names, rows, layout.start + 1, stamps))
     others = (f"sheet {title!r} is read, of {len(sheets)}",) if len(sheets) > 1 else ()
-    return Table(path, layout.names, layout.start + 1, read, layout.units, stamps, layout.remarks + others)
+    return LogTable(path, layout.names, layout.start + 1, read, layout.units, stamps, layout.remarks + others)
 
 
 class _Sheet(NamedTuple):
@@ -576,18 +521,6 @@ class _Sheet(NamedTuple):
     stamps: frozenset[str]
 
 
-def _read_sheets(path: Path, raw: bytes, openpyxl: Any) -> dict[str, list[list[Any]]]:
-    with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-        size = sum(member.file_size for member in archive.infolist())
-    require(size <= MAX_BYTES, f"{path}: holds {size / 2**20:.0f} MiB of cells; export it as CSV", LogError)
-    book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
-    # openpyxl rounds dates to milliseconds; as numbers they keep all digits.
-    date_styles = book._date_formats | book._timedelta_formats
-    book._date_formats.clear()
-    book._timedelta_formats.clear()
-    return {sheet.title: _read_cells(path, sheet, date_styles) for sheet in book.worksheets}
-
-
 def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]]:
     sheet.reset_dimensions()  # which some programs write wrong
     rows: list[list[Any]] = []
@@ -598,25 +531,16 @@ def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]
         require(
             empty <= MAX_EMPTY_ROWS, f"{path}: {empty} rows are empty; delete them, or what is below them", LogError
         )
-        rows.append([_Date(cell.value) if _is_date(cell, date_styles) else cell.value for cell in row])
-        require(
-            len(rows) <= MAX_SHEET_ROWS and width <= MAX_COLUMNS, f"{path}: the sheet is too large; cut it", LogError
-        )
+        # not by a cell's own `is_date`, which searches the style's text again for each: a quarter of the time
+        dates = [cell.data_type == "n" and cell.value is not None and cell._style_id in date_styles for cell in row]
+        rows.append([_Date(c.value) if is_date else c.value for c, is_date in zip(row, dates, strict=True)])
         check_cells(path, len(rows), width)
     while rows and all(cell is None for cell in rows[-1]):
         rows.pop()
-    return [_without_tail(row) for row in rows]
-
-
-def _is_date(cell: Any, date_styles: Set[int]) -> bool:
-    # not by the cell's own `is_date`, which searches the style's text again for each cell: a quarter of the time
-    return cell.data_type == "n" and cell.value is not None and cell._style_id in date_styles
-
-
-def _without_tail(row: list[Any]) -> list[Any]:
-    while row and row[-1] is None:
-        row.pop()
-    return row
+    for cells in rows:
+        while cells and cells[-1] is None:
+            cells.pop()
+    return rows
 
 
 def _show(cell: Any) -> str:
@@ -629,16 +553,16 @@ def _xlsx_columns(sheet: _Sheet, names: Sequence[str]) -> dict[str, Array]:
     width = len(sheet.names)
     for i, row in enumerate(sheet.rows, sheet.first_row):
         require(len(row) <= width, f"{sheet.path}: row {i} has {len(row)} cells, the header {width}; mend it", LogError)
-    return {name: _column(sheet, name) for name in names}
-
-
-def _column(sheet: _Sheet, name: str) -> Array:
-    i = sheet.names.index(name)
-    cells = [row[i] if i < len(row) else None for row in sheet.rows]
-    if name in sheet.stamps and not isinstance(cells[0], _Date):
-        return seconds_from_first([_show(cell) for cell in cells], sheet.path, name, sheet.first_row)
-    numbers = np.array([_number(sheet, name, k, cell) for k, cell in enumerate(cells)])
-    return _seconds(sheet, name, numbers) if name in sheet.stamps else numbers
+    columns = {}
+    for name in names:
+        i = sheet.names.index(name)
+        cells = [row[i] if i < len(row) else None for row in sheet.rows]
+        if name in sheet.stamps and not isinstance(cells[0], _Date):
+            columns[name] = seconds_from_first([_show(cell) for cell in cells], sheet.path, name, sheet.first_row)
+            continue
+        numbers = np.array([_number(sheet, name, k, cell) for k, cell in enumerate(cells)])
+        columns[name] = _seconds(sheet, name, numbers) if name in sheet.stamps else numbers
+    return columns
 
 
 def _number(sheet: _Sheet, name: str, index: int, cell: Any) -> float:
@@ -662,11 +586,11 @@ def _seconds(sheet: _Sheet, name: str, days: Array) -> Array:
     return np.asarray(np.round((days - (known[0] if known.size else 0.0)) * 86400, 6))
 
 
-READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
-    ".csv": csv_read_table,
-    ".txt": csv_read_table,
-    ".tsv": csv_read_table,
-    ".dat": csv_read_table,
+READERS: Mapping[str, Callable[[Path, bytes], LogTable]] = {
+    ".csv": read_delimited,
+    ".txt": read_delimited,
+    ".tsv": read_delimited,
+    ".dat": read_delimited,
     ".parquet": read_parquet,
     ".mat": read_mat,
     ".lvm": read_lvm,
@@ -678,23 +602,8 @@ READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
 """The suffix of a file, in lower case, to the function that reads it."""
 
 
-def read_table(path: Path, raw: bytes) -> Table:
-    """Read a log's columns with the reader of its suffix.
-
-    Parameters
-    ----------
-    path : Path
-        Its suffix says the format, and messages name it.
-    raw : bytes
-        What the file holds.
-
-    Raises
-    ------
-    LogError
-        If no reader has that suffix, or the file is not of that format, is damaged, or holds no samples.
-    InputError
-        If the library that reads the format is not installed.
-    """
+def parse_log(path: Path, raw: bytes) -> LogTable:
+    """Read a log's columns from the bytes of a file with the reader of its path's suffix."""
     suffix = path.suffix.lower()
     shown = f"{suffix!r} files" if suffix else "a name without suffix"
     require(suffix in READERS, f"{path}: no reader for {shown}; known: {', '.join(READERS)}", LogError)

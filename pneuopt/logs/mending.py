@@ -1,4 +1,4 @@
-"""`mend_log`: a log read in spite of rows and cells that no reader takes, with what was done to them, row by row."""
+"""A log read in spite of rows and cells that no reader takes, with what was done to them, row by row."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -7,115 +7,73 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.logs.columns import CHANNELS, ChannelColumn, Plant, find_columns, nearest_channel, plant_channels
 from pneuopt.logs.experiment import Experiment
-from pneuopt.logs.foreign import READERS, read_table
-from pneuopt.logs.read_log import Sidecar, assemble_log, read_sidecar
-from pneuopt.logs.table import Table, read_bytes
-from pneuopt.logs.text import block_table, decode, find_block, mend_cells
-from pneuopt.logs.text import read_delimited as csv_read_table
-from pneuopt.logs.tolerances import MAX_MAGNITUDE, MAX_ROWS_LISTED, MAX_ROWS_OUT
-from pneuopt.quantities.arrays import Mask
+from pneuopt.logs.foreign import READERS, parse_log
+from pneuopt.logs.read_log import assemble_log, read_sidecar
+from pneuopt.logs.table import LogTable, list_rows, read_bytes
+from pneuopt.logs.text import block_table, decode, find_block, mend_cells, read_delimited
+from pneuopt.logs.tolerances import MAX_MAGNITUDE, MAX_ROWS_OUT
+from pneuopt.quantities.arrays import Indices, Mask
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, write_value
 
-Rows = NDArray[np.intp]
-
 
 @dataclass(frozen=True, eq=False)
 class MendedLog:
-    """A log whose faults are mended by rule.
-
-    Attributes
-    ----------
-    rows : ndarray of int, shape (n,)
-        The number of each sample's row in the file.
-    changes : tuple of str
-        What was done, a sentence each, with the rows; empty where nothing was.
-    """
+    """A log whose faults are mended by rule."""
 
     log: Experiment
-    rows: Rows
-    changes: tuple[str, ...]
+    rows: Indices  # the number of each sample's row in the file, (n,)
+    changes: tuple[str, ...]  # what was done, a sentence each, with the rows; empty where nothing was
 
 
 def mend_log(path: str | Path, *, plant: Plant | None = None, ambient_pressure: float = ATMOSPHERE) -> MendedLog:
-    """Read a log as `read_log` does, and mend by rule what that refuses.
+    """Read a log as `read_log` does, and mend by rule what that refuses; what no rule mends is refused still.
 
     A name of a column that nearly is a channel is taken for it. Cells that hold no number, or none that a sensor gives,
     are missing samples. Rows of another length, without time, or with a time that repeats or runs backwards, are left
     out.
-
-    Parameters
-    ----------
-    plant, ambient_pressure
-        As for `read_log`.
-
-    Raises
-    ------
-    LogError, UnitError, UnknownNameError
-        If no rule mends it.
     """
     path = Path(path)
-    raw, beside, changes = read_bytes(path), read_sidecar(path, None, None), dict[str, list[int]]()
-    own = {} if plant is None else plant_channels(plant)
-    names: list[str] = []
+    raw, beside = read_bytes(path), read_sidecar(path, None, None)
+    channels = {**CHANNELS, **({} if plant is None else plant_channels(plant))}
     make = _table_maker(path, raw)
     table = make(())[0]
-    beside = _mend_names(table, beside, {**CHANNELS, **own}, names)
-    found, _ = find_columns(table, beside.columns, beside.columns_from, {**CHANNELS, **own})
-    table, changes = make([column.name for column in found.values()])
-    table, rows = _mend_rows(table, found, changes)
-    log = assemble_log(path, raw, table, beside, plant, ambient_pressure)
-    return MendedLog(log, rows, (*names, *(f"{list_rows(r)}: {what}" for what, r in changes.items())))
-
-
-def list_rows(rows: Sequence[int]) -> str:
-    """As in "row 14", or "rows 14 to 20, 31, ... (57 in all)".
-
-    Examples
-    --------
-    >>> list_rows([14]), list_rows([14, 15, 16, 31])
-    ('row 14', 'rows 14 to 16, 31 (4 in all)')
-    """
-    if len(rows) == 1:
-        return f"row {rows[0]}"
-    ends = np.flatnonzero(np.diff(rows) > 1).tolist()
-    runs = list(zip([rows[0], *(rows[k + 1] for k in ends)], [*(rows[k] for k in ends), rows[-1]], strict=True))
-    shown = ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in runs[:MAX_ROWS_LISTED])
-    return f"rows {shown}{', ...' if len(runs) > MAX_ROWS_LISTED else ''} ({len(rows)} in all)"
-
-
-def _table_maker(path: Path, raw: bytes) -> Callable[[Sequence[str]], tuple[Table, dict[str, list[int]]]]:
-    """A function from the columns that have to be numbers to the table, and what was mended in its cells."""
-    if READERS.get(path.suffix.lower()) is not csv_read_table:
-        return lambda _: (read_table(path, raw), {})
-    block, layout = find_block(path, decode(path, raw))
-
-    def make(used: Sequence[str]) -> tuple[Table, dict[str, list[int]]]:
-        mended, changes = mend_cells(block, used)
-        return block_table(mended, layout), changes
-
-    return make
-
-
-def _mend_names(table: Table, beside: Sidecar, channels: Mapping[str, str], said: list[str]) -> Sidecar:
-    """Entries for columns whose names nearly are channels."""
-    entries: dict[str, Any] = {}
+    names, entries = list[str](), dict[str, Any]()  # entries for columns whose names nearly are channels
     taken = {n for n in channels if n in beside.columns}
     for name in table.names:
         channel = nearest_channel(name, channels) if name and name not in table.stamps else ""
         if channel and channel not in taken:
             entries[channel] = name
             taken.add(channel)
-            said.append(f"column {name!r} is read as the channel {channel!r}")
-    return beside._replace(columns={**entries, **beside.columns}) if entries else beside
+            names.append(f"column {name!r} is read as the channel {channel!r}")
+    beside = beside._replace(columns={**entries, **beside.columns}) if entries else beside
+    found, _ = find_columns(table, beside.columns, beside.columns_from, channels)
+    table, changes = make([column.name for column in found.values()])
+    table, rows = _mend_rows(table, found, changes)
+    log = assemble_log(path, raw, table, beside, plant, ambient_pressure)
+    return MendedLog(log, rows, (*names, *(f"{list_rows(r)}: {what}" for what, r in changes.items())))
 
 
-def _mend_rows(table: Table, found: Mapping[str, ChannelColumn], changes: dict[str, list[int]]) -> tuple[Table, Rows]:
+def _table_maker(path: Path, raw: bytes) -> Callable[[Sequence[str]], tuple[LogTable, dict[str, list[int]]]]:
+    """A function from the columns that have to be numbers to the table, and what was mended in its cells."""
+    if READERS.get(path.suffix.lower()) is not read_delimited:
+        return lambda _: (parse_log(path, raw), {})
+    block, layout = find_block(path, decode(path, raw))
+
+    def make(used: Sequence[str]) -> tuple[LogTable, dict[str, list[int]]]:
+        mended, changes = mend_cells(block, used)
+        return block_table(mended, layout), changes
+
+    return make
+
+
+def _mend_rows(
+    table: LogTable, found: Mapping[str, ChannelColumn], changes: dict[str, list[int]]
+) -> tuple[LogTable, Indices]:
     """The table without rows whose time is missing or does not increase, and without samples of no sensor."""
     columns = {n: np.array(y) for n, y in table.read([c.name for c in found.values()]).items()}
     count = next(iter(columns.values())).size
@@ -172,15 +130,7 @@ def convert(mended: MendedLog, channel: str, factor: float, offset: float, why: 
 
 
 def write_mended(mended: MendedLog, path: Path, units: Mapping[str, str]) -> dict[Path, str]:
-    """The texts of the log and of its sidecar, which say the same as the mended log.
-
-    Parameters
-    ----------
-    path : Path
-        Of the new log, a .csv; its sidecar stands beside it.
-    units : mapping of str to str
-        Of the parameters that conditions may name.
-    """
+    """The texts of the log, a .csv, and of its sidecar; `units` are those of the parameters in its conditions."""
     log, t = mended.log, mended.log.trajectory
     header = ",".join(["time [s]", *(f"{n} [{log.unit(n) or '1'}]" for n in t)])
     rows = [

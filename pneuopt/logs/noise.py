@@ -1,4 +1,4 @@
-"""`estimate_noise`: a channel's white noise and its resolution, from itself alone; `noise_level`: what a fit counts.
+"""A channel's white noise and its resolution, from itself alone.
 
 A difference of k-th order cancels any motion that is a polynomial below that order over k + 1 samples, and keeps white
 noise. Which order a log needs depends on how fast it moves for its sampling, so all are tried, in blocks of the log.
@@ -14,11 +14,8 @@ from numpy.typing import ArrayLike
 from pneuopt.logs.tolerances import (
     BLOCK,
     LATTICE_TOLERANCE,
-    MAD_SPREAD,
     MAX_CORRELATION,
-    MIN_BLOCKS,
     ORDERS,
-    QUIET_QUARTILE,
     ROUNDING,
     WHITE_LAGS,
 )
@@ -26,22 +23,11 @@ from pneuopt.quantities.arrays import Array
 
 
 class NoiseEstimate(NamedTuple):
-    """What a channel shows of its noise.
+    """What a channel shows of its noise."""
 
-    Attributes
-    ----------
-    random : float
-        Standard deviation of its white noise [unit of the channel]; NaN for a constant channel.
-    resolution : float
-        Step of the lattice on which its values lie [unit of the channel]; 0 where they lie on none.
-    is_white : bool
-        Whether what `random` counts is uncorrelated; otherwise it is motion too fast for the sampling, say, or hum, and
-        the noise is less.
-    """
-
-    random: float
-    resolution: float
-    is_white: bool = True
+    random: float  # standard deviation of its white noise [unit of the channel]; NaN for a constant channel
+    resolution: float  # step of the lattice on which its values lie [unit of the channel]; 0 where they lie on none
+    is_white: bool = True  # otherwise `random` counts motion too fast for the sampling, or hum: the noise is less
 
     @property
     def level(self) -> float:
@@ -67,21 +53,18 @@ def noise_level(column: ArrayLike, t: ArrayLike | None = None) -> float:
 
 
 def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstimate:
-    """Estimate white noise and resolution from a channel alone.
+    """Estimate white noise and resolution from a channel (n,) alone, NaN where a sample is missing; `t` [s] if uneven.
 
     The level is that of the lowest order of differences which shows hardly more than the least of all orders, in the
-    quietest quarter of the log. Motion slower than a tenth of the sampling rate does not count, nor do steps and
-    outliers.
-
-    Parameters
-    ----------
-    column : array_like, shape (n,)
-        NaN where a sample is missing.
-    t : array_like, shape (n,), optional
-        Time [s], where the samples are not evenly spaced.
+    quietest quarter of the log: motion slower than a tenth of the sampling rate, steps and outliers do not count.
     """
     y = np.asarray(column, dtype=float)
-    time = np.arange(y.size, dtype=float) if t is None else _without_rounding(np.asarray(t, dtype=float))
+    time = np.arange(y.size, dtype=float)
+    if t is not None:  # in samples, too, if even but for the rounding of doubles, which is coarse from 1.7e9 s on
+        stamps = np.asarray(t, dtype=float)
+        steps = np.diff(stamps)
+        rounding = max(1e-6 * np.max(steps, initial=0.0), 4 * np.spacing(np.max(np.abs(stamps), initial=0.0)))
+        time = time if not steps.size or np.ptp(steps) <= rounding else stamps - stamps[0]
     known = np.isfinite(y)
     if not np.any(np.diff(y[known])):
         return NoiseEstimate(math.nan, 0.0)
@@ -96,11 +79,7 @@ def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstima
 
 
 def find_resolution(values: ArrayLike) -> float:
-    """The step of the lattice on which all values lie, as an encoder's do; 0 where there is none.
-
-    Parameters
-    ----------
-    values : array_like, shape (n,)
+    """The step of the lattice on which all values (n,) lie, as an encoder's do; 0 where there is none.
 
     Examples
     --------
@@ -124,14 +103,6 @@ def find_resolution(values: ArrayLike) -> float:
     step = float(offsets @ counts / (counts @ counts)) if counts.any() else 0.0
     lies_on = float(np.max(np.abs(offsets - step * counts))) < LATTICE_TOLERANCE * step
     return step if lies_on and smallest < LATTICE_TOLERANCE * step else 0.0
-
-
-def _without_rounding(t: Array) -> Array:
-    """The time, counted in samples where they are even but for the rounding of doubles: coarse from 1.7e9 s on."""
-    steps = np.diff(t)
-    rounding = max(1e-6 * np.max(steps, initial=0.0), 4 * np.spacing(np.max(np.abs(t), initial=0.0)))
-    even = not steps.size or np.ptp(steps) <= rounding
-    return np.arange(t.size, dtype=float) if even else t - t[0]
 
 
 class _Level(NamedTuple):
@@ -168,25 +139,21 @@ def _levels(t: Array, y: Array) -> list[_Level]:
 
 
 def _quiet_level(off: Array, order: int) -> tuple[float, float]:
-    """The deviation of all differences, or of the quietest quarter of the blocks where that is certainly less.
-
-    Returns
-    -------
-    level, uncertainty : float
-        The uncertainty is the level's standard deviation by chance, over the level.
-    """
+    """The deviation of all differences or of their quietest blocks, and its standard deviation, over itself."""
     # neighbours share samples: this many count as one
     shared = math.comb(4 * order, 2 * order) / math.comb(2 * order, order) ** 2
-    uncertainty = MAD_SPREAD * math.sqrt(shared / off.size)
+    # 1.17 / sqrt(n): standard deviation of the median absolute deviation of n normal numbers, over itself
+    uncertainty = 1.17 * math.sqrt(shared / off.size)
     sizes, count = np.abs(off), max(1, off.size // BLOCK)
     whole = 1.4826 * float(np.median(sizes))
-    if count < MIN_BLOCKS:
+    if count < 4:  # a quarter of them is none
         return whole, uncertainty
     length, longer = divmod(off.size, count)  # the first blocks are one longer
     parts = np.split(sizes, [longer * (length + 1)])
     blocks = parts[0].reshape(longer, length + 1), parts[1].reshape(-1, length)
     deviations = 1.4826 * np.concatenate([np.median(block, axis=1) for block in blocks])
-    quiet = float(np.quantile(deviations, 0.25)) / (1 + QUIET_QUARTILE * uncertainty * math.sqrt(count))
+    # a quarter of the blocks need to be quiet: -0.674 is the lower quartile of a normal variable
+    quiet = float(np.quantile(deviations, 0.25)) / (1 - 0.674 * uncertainty * math.sqrt(count))
     return whole if whole < (1 + 4 * uncertainty) * quiet else quiet, uncertainty
 
 

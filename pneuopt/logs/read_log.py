@@ -1,7 +1,4 @@
-"""`read_log`: an `Experiment` from a log's file, and from the sidecar that says more about it.
-
-`find_date`: when a log was taken, as sidecar, time stamps or name say; a file's own time is that of a copy.
-"""
+"""A log from its file and from the sidecar that says more about it, and when it was taken."""
 
 import hashlib
 import re
@@ -12,16 +9,16 @@ from datetime import date, datetime, time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pneuopt.logs.columns import ACCEPTED_CHECKS, DATE, INTERSAMPLE_KEY, SIDECAR_KEYS, Plant
+from pneuopt.logs.columns import CHANNELS, COLUMN_KEYS, Plant
 from pneuopt.logs.experiment import Experiment, experiment_from_table
-from pneuopt.logs.foreign import read_table
-from pneuopt.logs.table import Table, read_bytes
+from pneuopt.logs.foreign import parse_log
+from pneuopt.logs.table import LogTable, read_bytes
 from pneuopt.logs.tolerances import STAMP_BYTES
-from pneuopt.quantities.errors import LogError, check_names, require
+from pneuopt.quantities.errors import LogError, require
+from pneuopt.quantities.keys import Key, Takes, check_sections, read_named, read_table, table
 from pneuopt.quantities.output import MAX_TOML_BYTES, check_nesting
 from pneuopt.quantities.parameters import Intersample
-from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value
+from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, difference_unit, read_si
 
 
 def read_log(
@@ -58,25 +55,19 @@ def read_log(
 
     Raises
     ------
-    LogError, UnitError, UnknownNameError
-        If anything in the files is missing, ambiguous or not a number; the message names file, row, column, remedy.
+    InputError
+        LogError, UnitError, UnknownNameError or other: if anything in the files is missing, ambiguous or not a number;
+        the message names file, row and column, or section and key, and the remedy.
     """
     path = Path(path)
     raw = read_bytes(path)
-    return assemble_log(path, raw, read_table(path, raw), read_sidecar(path, sidecar, columns), plant, ambient_pressure)
+    return assemble_log(path, raw, parse_log(path, raw), read_sidecar(path, sidecar, columns), plant, ambient_pressure)
 
 
 class Sidecar(NamedTuple):
     """What a sidecar, or a caller in its place, says about a log.
 
-    Attributes
-    ----------
-    path : Path
-        For messages; there may be no such file.
-    columns : mapping
-        Channel to column.
-    columns_from : str
-        Where these come from.
+    `path` is for messages, and there may be no such file; `columns_from` says where `columns` come from.
     """
 
     path: Path
@@ -86,86 +77,50 @@ class Sidecar(NamedTuple):
 
 
 def read_sidecar(path: Path, sidecar: str | Path | None, columns: Mapping[str, Any] | None) -> Sidecar:
-    """What stands beside a log; its columns as a caller says, if it does."""
-    side, sections = _read_sidecar(path, sidecar)
+    """What stands beside a log, by default in the file of its name; its columns as a caller says, if it does."""
+    side = path.with_suffix(".toml") if sidecar is None else Path(sidecar)
+    sections: dict[str, Any] = {}
+    if sidecar is not None or side.exists():
+        raw = read_bytes(side, MAX_TOML_BYTES)
+        check_nesting(side, raw, LogError)
+        try:
+            sections = tomllib.loads(raw.decode("utf-8-sig"))
+        except (ValueError, RecursionError) as error:  # of which TOMLDecodeError and UnicodeDecodeError are
+            raise LogError(f"{side}: not valid TOML: {error}") from None
+        other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
+        require(sidecar is not None or "drive" not in sections, other, LogError)
+        check_sections(SIDECAR_KEYS, sections, side)
+        above = {n: SIDECAR_KEYS[n] for n in (ACCEPTED_CHECKS, DATE)}
+        stated = read_table(above, sections, lambda key: f"{side}: {key}", partial=True)
+        sections |= {n: value for n, value in stated.items() if n in sections}
     if columns is not None:
         return Sidecar(side, sections, columns, "columns")
-    return Sidecar(side, sections, sections.get("columns", {}), f"{side}: columns")
+    return Sidecar(side, sections, sections.get("columns", {}), f"{side}: [columns]")
 
 
 def assemble_log(
-    path: Path, raw: bytes, table: Table, beside: Sidecar, plant: Plant | None, ambient_pressure: float
+    path: Path, raw: bytes, table: LogTable, beside: Sidecar, plant: Plant | None, ambient_pressure: float
 ) -> Experiment:
     """A log of a table and of what stands beside it; see `read_log`."""
     side, sections, columns, where = beside
+
+    def read(section: str, units: Mapping[str, str]) -> dict[str, Any]:
+        return read_named(SIDECAR_KEYS[section], sections.get(section, {}), units, f"{side}: [{section}]")
+
     with count_gauge_from(ambient_pressure):
         run = experiment_from_table(table, columns, where, plant, path.stem)
-        conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
-    read = run.source and replace(run.source, sidecar=str(side) if sections else "", sections=tuple(sections))
+        conditions = read("conditions", dict.fromkeys(sections.get("conditions", {}), ""))
+    units = {n: difference_unit(run.unit(n)) for n in run.trajectory}  # a noise is a difference, without (a) or (g)
+    source = run.source and replace(run.source, sidecar=str(side) if sections else "", sections=tuple(sections))
     return replace(
         run,
-        source=read,
-        noise=_read_noise(sections.get("noise", {}), run, f"{side}: noise"),
+        source=source,
+        noise=read("noise", units),
         conditions=conditions,
         sha256=hashlib.sha256(raw).hexdigest(),
-        intersample=_read_intersample(sections.get("intersample", {}), run.trajectory, f"{side}: intersample"),
+        intersample=read("intersample", units),
         accept=tuple(sections.get(ACCEPTED_CHECKS, ())),
     )
-
-
-def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping[str, Any]]:
-    side = path.with_suffix(".toml") if sidecar is None else Path(sidecar)
-    if sidecar is None and not side.exists():
-        return side, {}
-    sections = _parse_toml(side, read_bytes(side, MAX_TOML_BYTES))
-    other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
-    require(sidecar is not None or "drive" not in sections, other, LogError)
-    check_names("key", sections, SIDECAR_KEYS, str(side))
-    accept = sections.get(ACCEPTED_CHECKS, SIDECAR_KEYS[ACCEPTED_CHECKS].usual)
-    is_list = isinstance(accept, list) and all(isinstance(name, str) for name in accept)
-    require(
-        is_list,
-        f'{side}: {ACCEPTED_CHECKS} must list checks, as {ACCEPTED_CHECKS} = ["work"]; got {str(accept)[:60]!r}',
-        LogError,
-    )
-    read_date(sections, side)
-    for key, section in sections.items():
-        if key in (ACCEPTED_CHECKS, DATE):
-            continue
-        require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
-    return side, sections
-
-
-def _parse_toml(path: Path, raw: bytes) -> dict[str, Any]:
-    check_nesting(path, raw, LogError)
-    try:
-        return tomllib.loads(raw.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # of which TOMLDecodeError and UnicodeDecodeError are
-        raise LogError(f"{path}: not valid TOML: {error}") from None
-
-
-def _read_noise(entries: Mapping[str, Any], run: Experiment, where: str) -> dict[str, float]:
-    check_names("channel", entries, run.trajectory, where)
-    # A noise is a difference, so a pressure's takes no (a) or (g).
-    return {c: read_value(v, run.unit(c).partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}
-
-
-def _read_intersample(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, Intersample]:
-    check_names("channel", entries, trajectory, where)
-    known = INTERSAMPLE_KEY.choices or {}
-    for channel, word in entries.items():
-        require(
-            isinstance(word, str) and word in known,
-            f"{where}.{channel} is {str(word)[:60]!r}; it must be " + " or ".join(map(repr, known)),
-            LogError,
-        )
-    return {channel: known[word] for channel, word in entries.items()}
-
-
-_NAMED_DAY = r"(?P<year>20\d\d)(?P<mark>[-_.]?)(?P<month>\d\d)(?P=mark)(?P<day>\d\d)"
-_NAMED_TIME = r"(?:[T _-]?(?P<hour>[01]\d|2[0-3])[-:_.h]?(?P<minute>[0-5]\d)(?!\d{3}))?"
-_IN_NAME = re.compile(rf"(?<!\d){_NAMED_DAY}(?:(?!\d)|(?=[T _-])){_NAMED_TIME}")
-_IN_TEXT = re.compile(r"(?<![\w-])(20\d\d-\d\d-\d\d)[T ,;\t]\s*([0-2]\d:[0-5]\d(?::[0-5]\d)?)")
 
 
 def find_date(path: str | Path) -> datetime:
@@ -199,25 +154,13 @@ def find_date(path: str | Path) -> datetime:
     return found
 
 
-def read_date(sections: Mapping[str, object], side: Path) -> datetime | None:
-    """The `date` that a sidecar states, as a text or as TOML's own; None where it states none."""
-    given = sections.get(DATE)
-    if given is None or isinstance(given, datetime):
-        return None if given is None else given.replace(tzinfo=None)
-    if isinstance(given, date):
-        return datetime.combine(given, time())
-    try:
-        return datetime.fromisoformat(str(given)).replace(tzinfo=None)
-    except ValueError:
-        raise LogError(f'{side}: {DATE} must be a date, as {DATE} = "2026-03-12"; got {str(given)[:60]!r}') from None
-
-
 def _date_in_sidecar(side: Path) -> datetime | None:
-    """What a sidecar says; one that cannot be read is refused where the log is read."""
+    """The sidecar's `date`; None for one that cannot be read, which is refused where the log is read."""
     try:
-        return read_date(tomllib.loads(side.read_text("utf-8-sig")), side) if side.is_file() else None
+        sections = tomllib.loads(side.read_text("utf-8-sig")) if side.is_file() else {}
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError):
         return None
+    return _read_date(sections[DATE], f"{side}: {DATE}", {}) if DATE in sections else None
 
 
 def _stamp(path: Path) -> datetime | None:
@@ -242,3 +185,82 @@ def _date_in_name(stem: str) -> datetime | None:
         except ValueError:  # a number that is no date
             continue
     return None
+
+
+ACCEPTED_CHECKS = "accept"  # the checks that the log need not pass
+DATE = "date"  # when the log was taken
+
+
+def _read_date(entry: Any, where: str, _: Mapping[str, str]) -> datetime:
+    """The date of a text or of TOML's own."""
+    if isinstance(entry, datetime):
+        return entry.replace(tzinfo=None)
+    if isinstance(entry, date):
+        return datetime.combine(entry, time())
+    try:
+        return datetime.fromisoformat(str(entry)).replace(tzinfo=None)
+    except ValueError:
+        raise LogError(f'{where} must be a date, as {DATE} = "2026-03-12"; got {str(entry)[:60]!r}') from None
+
+
+SIDECAR_KEYS: Mapping[str, Key] = {
+    ACCEPTED_CHECKS: Key(
+        "checks that this log need not pass", Takes.LIST, usual=[], example='["work"]', of=Key("a check", Takes.TEXT)
+    ),
+    DATE: Key(
+        "when this log was taken, for track; before its stamps and its name",
+        Takes.TEXT,
+        example='"2026-03-12"',
+        read=_read_date,
+    ),
+    "columns": table(
+        "which column is which channel; false leaves one out; the header says the others",
+        {
+            channel: Key(
+                f"column of the {channel.replace('_', ' ')}",
+                Takes.COLUMN,
+                unit,
+                keys=COLUMN_KEYS,
+                example=f'"{channel} [{unit}]"',
+            )
+            for channel, unit in CHANNELS.items()
+        },
+        others=Key("column of another signal of the drive", Takes.COLUMN, "{own}", keys=COLUMN_KEYS),
+        named="signal",
+    ),
+    "noise": table(
+        "standard deviations; by default as the log shows",
+        {},
+        others=Key("of that channel", unit="{own}", example='"20 um"', least=0.0, is_open=True),
+        named="channel",
+    ),
+    "conditions": table(
+        "known values that hold in this log only",
+        {},
+        others=Key(
+            "its value in this log",
+            unit="{own}",
+            example='"6.3 bar(g)"',
+            read=lambda entry, where, _: read_si(entry, where=where),
+        ),
+        named="parameter",
+    ),
+    "intersample": table(
+        "how channels run between two samples",
+        {},
+        others=Key(
+            "by default a command is held",
+            Takes.TEXT,
+            choices={kind.value: kind for kind in Intersample},
+            example='"held"',
+            named="choice",
+        ),
+        named="channel",
+    ),
+}
+"""The sections of a sidecar, and what stands before them."""
+
+_NAMED_DAY = r"(?P<year>20\d\d)(?P<mark>[-_.]?)(?P<month>\d\d)(?P=mark)(?P<day>\d\d)"
+_NAMED_TIME = r"(?:[T _-]?(?P<hour>[01]\d|2[0-3])[-:_.h]?(?P<minute>[0-5]\d)(?!\d{3}))?"
+_IN_NAME = re.compile(rf"(?<!\d){_NAMED_DAY}(?:(?!\d)|(?=[T _-])){_NAMED_TIME}")
+_IN_TEXT = re.compile(r"(?<![\w-])(20\d\d-\d\d-\d\d)[T ,;\t]\s*([0-2]\d:[0-5]\d(?::[0-5]\d)?)")

@@ -1,10 +1,7 @@
-"""`Table`: a log as its file has it: named columns of numbers that have no meaning yet.
+"""A log as its file has it: named columns of numbers that have no meaning yet, within a budget of bytes and cells.
 
-What a log may cost: bytes, columns and cells are bounded before anything is parsed, and a file is read once.
-
-Libraries that read files for us: how to get them, and what to say where they fail.
-
-Columns that a file holds as arrays: numbers, or times, as floats.
+What readers share follows `LogTable`: the budget, columns that a file holds as arrays, and how to run the libraries
+that read some formats.
 """
 
 import importlib
@@ -23,7 +20,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from pneuopt.logs.tolerances import MAX_BYTES, MAX_CELLS, MAX_COLUMNS, MAX_NAME, MAX_SECONDS
+from pneuopt.logs.tolerances import MAX_BYTES, MAX_CELLS, MAX_COLUMNS, MAX_NAME, MAX_ROWS_LISTED, MAX_SECONDS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, require
 from pneuopt.quantities.output import MAX_REASON, read_source
@@ -33,41 +30,18 @@ EMPTY_CELL = "leave the cell empty if the sample is missing, as `pneuopt check -
 
 
 @dataclass(frozen=True)
-class Table:
-    """What a reader of one file format returns.
+class LogTable:
+    """What a reader of one file format returns; two columns of one name, or too many, are a `LogError`."""
 
-    Parameters
-    ----------
-    path : Path or str
-        For messages.
-    names : sequence of str
-        The columns in the file's order; "" for a column without a name.
-    first_row : int
-        The number that messages give to the row of the first sample.
-    read : callable
-        Takes names, and returns these columns as floats, each of shape (n,), NaN where a sample is missing. Nothing
-        else is parsed, because other columns may hold anything. It raises a `LogError` that names the row and column of
-        the first cell that is not a number.
-    units : mapping of str to str
-        Units that the file states apart from the names, by column: in a row of units, or as a property.
-    stamps : frozenset of str
-        The columns of time stamps, which `read` gives in seconds from the first.
-    remarks : tuple of str
-        What the reader did that the user may want to know, a sentence each: rows that are no samples, say.
-
-    Raises
-    ------
-    LogError
-        If two columns have the same name, or there are more columns, or longer names, than a log has.
-    """
-
-    path: Path | str
-    names: Sequence[str]
-    first_row: int
+    path: Path | str  # for messages
+    names: Sequence[str]  # in the file's order; "" for a column without a name
+    first_row: int  # the number that messages give to the row of the first sample
+    # Of the names that it takes, each column as floats (n,), NaN where a sample is missing. Nothing else is parsed,
+    # because other columns may hold anything. Its `LogError` names row and column of the first cell that is no number.
     read: Callable[[Sequence[str]], Mapping[str, Array]]
-    units: Mapping[str, str] = field(default_factory=dict)
-    stamps: frozenset[str] = frozenset()
-    remarks: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)  # stated apart from the names: in a row, or as a property
+    stamps: frozenset[str] = frozenset()  # the columns of time stamps, which `read` gives in seconds from the first
+    remarks: tuple[str, ...] = ()  # what the reader did that the user may want to know, a sentence each
 
     def __post_init__(self) -> None:
         check_columns(self.path, self.names)
@@ -84,18 +58,7 @@ def check_columns(path: Path | str, names: Sequence[str]) -> None:
 
 
 def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
-    """Read a whole file, once.
-
-    Parameters
-    ----------
-    most : int
-        Its size [byte] may be.
-
-    Raises
-    ------
-    LogError
-        If it cannot be read, is larger, or is a pipe or a device, which may never end.
-    """
+    """Read a whole file, once; a `LogError` if that fails or it is larger than `most` [byte], a pipe or a device."""
     return read_source(path, most, "cut it, or leave out rows and columns", LogError)
 
 
@@ -109,17 +72,28 @@ def check_cells(path: Path | str, rows: int, columns: int) -> None:
     )
 
 
+def list_rows(rows: Sequence[int]) -> str:
+    """As in "row 14", or "rows 14 to 20, 31, ... (57 in all)".
+
+    Examples
+    --------
+    >>> list_rows([14]), list_rows([14, 15, 16, 31])
+    ('row 14', 'rows 14 to 16, 31 (4 in all)')
+    """
+    if len(rows) == 1:
+        return f"row {rows[0]}"
+    ends = np.flatnonzero(np.diff(rows) > 1).tolist()
+    runs = list(zip([rows[0], *(rows[k + 1] for k in ends)], [*(rows[k] for k in ends), rows[-1]], strict=True))
+    shown = ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in runs[:MAX_ROWS_LISTED])
+    more = ", ..." if len(runs) > MAX_ROWS_LISTED else ""
+    return f"rows {shown}{more}" + (f" ({len(rows)} in all)" if more or len(runs) < len(rows) else "")
+
+
 Result = TypeVar("Result")
 
 
 def import_extra(module: str, package: str, path: Path | str, kind: str, extra: str) -> Any:
-    """Import the library that reads a kind of file, or say how to get it.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
+    """Import the library that reads a kind of file; an `InputError` says how to get it."""
     try:
         with warnings.catch_warnings(action="ignore"):
             return importlib.import_module(module)
@@ -149,13 +123,7 @@ def foreign_code(path: Path, kind: str) -> Iterator[None]:
 
 
 def run_apart(read: Callable[[Path, bytes], Result], path: Path, raw: bytes, kind: str) -> Result:
-    """Run a reader in a process of its own, which a damaged file may end or keep busy, but not ours.
-
-    Raises
-    ------
-    LogError
-        If it does either, or the reader says so.
-    """
+    """Run a reader in a process of its own, which a damaged file may end or keep busy, but not ours: a `LogError`."""
     import loky
 
     executor = loky.ProcessPoolExecutor(1, context=loky.backend.get_context("loky"))
@@ -168,27 +136,10 @@ def run_apart(read: Callable[[Path, bytes], Result], path: Path, raw: bytes, kin
         executor.shutdown(kill_workers=True)
 
 
-def array_table(
-    path: Path | str, columns: Mapping[str, Any], units: Mapping[str, str], remarks: Sequence[str] = ()
-) -> Table:
-    """A table of arrays.
-
-    Parameters
-    ----------
-    path : Path or str
-        For messages.
-    columns : mapping of str to array_like
-        By name. Those of dates or durations are read as seconds from the first.
-    units : mapping of str to str
-        Those that the file states.
-
-    Returns
-    -------
-    Table
-        Its first sample is row 1.
-    """
+def array_table(path: Path | str, columns: Mapping[str, Any], units: Mapping[str, str]) -> LogTable:
+    """A table of arrays, each (n,), its first sample in row 1; dates or durations count in seconds from the first."""
     stamps = frozenset(name for name, column in columns.items() if np.asarray(column).dtype.kind in "Mm")
-    return Table(path, list(columns), 1, partial(_read_columns, path, columns), units, stamps, tuple(remarks))
+    return LogTable(path, list(columns), 1, partial(_read_columns, path, columns), units, stamps)
 
 
 def _read_columns(path: Path | str, columns: Mapping[str, Any], names: Sequence[str]) -> dict[str, Array]:
@@ -205,33 +156,18 @@ def _floats(path: Path | str, name: str, column: Any) -> Array:
     if column.dtype.kind in "fiub":
         return np.asarray(column, dtype=float)
     if column.dtype.kind in "Mm":
-        return _seconds_from_first(column)
-    try:
-        return np.array([np.nan if cell is None else _number(cell) for cell in column.tolist()])
-    except (TypeError, ValueError, ArithmeticError):
-        row, cell = next((i, c) for i, c in enumerate(column.tolist(), 1) if not _is_number(c))
-        raise LogError(
-            f"{path}: row {row}, column {name!r}: {str(cell)[:40]!r} is not a number; store the column as float64"
-        ) from None
-
-
-def _seconds_from_first(column: Any) -> Array:
-    counts = column.astype(column.dtype.kind + "8[ns]").astype(np.int64)
-    missing = np.isnat(column)
-    start = counts[~missing][0] if not missing.all() else 0
-    return np.where(missing, np.nan, (counts - start) / 1e9)
-
-
-def _number(cell: Any) -> float:
-    """A number, a decimal or a missing one, not text."""
-    if isinstance(cell, str | bytes | bool):
-        raise TypeError(cell)
-    return float(cell)
-
-
-def _is_number(cell: Any) -> bool:
-    try:
-        _number(0 if cell is None else cell)
-    except (TypeError, ValueError, ArithmeticError):
-        return False
-    return True
+        counts = column.astype(column.dtype.kind + "8[ns]").astype(np.int64)
+        missing = np.isnat(column)
+        start = counts[~missing][0] if not missing.all() else 0
+        return np.where(missing, np.nan, (counts - start) / 1e9)
+    numbers = np.full(column.size, np.nan)
+    for i, cell in enumerate(column.tolist()):
+        try:
+            if isinstance(cell, str | bytes | bool):  # of which Python may make a number
+                raise TypeError(cell)
+            numbers[i] = np.nan if cell is None else float(cell)
+        except (TypeError, ValueError, ArithmeticError):
+            raise LogError(
+                f"{path}: row {i + 1}, column {name!r}: {str(cell)[:40]!r} is not a number; store the column as float64"
+            ) from None
+    return numbers

@@ -1,10 +1,6 @@
 """Reader of logs as text: columns apart by comma, semicolon, tab or white space, with decimal point or comma.
 
-Where a log's samples begin: the rows above them are metadata, one that names the columns, and one of their units.
-
-Cells of text as numbers: one row a line, one decimal mark, and the first cell that is no number named.
-
-Time stamps as loggers write them: ISO 8601, 12.03.2026 10:00:00,5, 3/12/2026 10:00:00.5 AM, 10:00:00.5.
+First where a log's samples begin, then cells of text as numbers, and time stamps as loggers write them.
 """
 
 import csv
@@ -19,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pneuopt.logs.table import EMPTY_CELL, Table, check_cells
-from pneuopt.logs.tolerances import DAY, MAX_HEAD_ROWS, MIN_BLOCK_ROWS
+from pneuopt.logs.table import EMPTY_CELL, LogTable, check_cells
+from pneuopt.logs.tolerances import MAX_HEAD_ROWS, MIN_BLOCK_ROWS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.units import is_unit
@@ -30,73 +26,105 @@ NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?")
 TOA5 = "TOA5"
 """The first cell of the files of Campbell Scientific's loggers: names, units and processing in rows 2, 3 and 4."""
 
+MISSING = ("", "NaN", "nan", "NAN")
+"""Cells of a missing sample: empty, or as MATLAB, Python and Campbell's loggers write it."""
+_DELIMITERS = (";", "\t", ",", " ")
 _COMMENT = re.compile(r"\s*(?:#|%|//|!)+\s*")
 _BRACKETS = re.compile(r"\[\s*(.*?)\s*\]|\(\s*(.*?)\s*\)")
 
 
-class Layout(NamedTuple):
-    """How the rows of a log are to be read.
+def read_delimited(path: Path, raw: bytes) -> LogTable:
+    """Read a text file of which a row names the columns: UTF-8, UTF-16 with its mark, or Windows-1252.
 
-    Attributes
-    ----------
-    names : list of str
-        Of the columns.
-    units : dict of str to str
-        By name, of those columns for which a row below the names says one.
-    start : int
-        Index of the first row of samples.
-    remarks : tuple of str
-        The rows that are skipped.
+    An empty cell or NaN is a missing sample. One decimal mark holds for all columns that are read. Above the names may
+    stand metadata, below them a row of units (`find_layout`). Rows have the numbers that an editor shows.
     """
+    return read_text(path, decode(path, raw))
+
+
+def read_text(path: Path, text: str) -> LogTable:
+    """Read the text of such a file."""
+    block, layout = find_block(path, text)
+    return block_table(block, layout)
+
+
+def find_block(path: Path, text: str) -> "tuple[TextBlock, Layout]":
+    """The samples of such a text as cells, and how its rows are to be read."""
+    lines = text.rstrip("\n ").split("\n")
+    require(any(lines), f"{path}: row 1 is empty; it has to name the columns", LogError)
+
+    def split(delimiter: str) -> list[list[str]]:
+        return [split_cells(line, delimiter, f"{path}: row {i}") for i, line in enumerate(lines[:MAX_HEAD_ROWS], 1)]
+
+    # the first that gives names and samples below them; else the first that the first line holds
+    usual = next((d for d in _DELIMITERS[:-1] if d in lines[0]), ",")
+    delimiter = next((d for d in _DELIMITERS if has_table(split(d))), usual)
+    rows = split(delimiter)
+    if rows[0][0] == TOA5 and len(rows) > 4:
+        head = ("rows 1, 3 and 4 are read as the head of a TOA5 file",)
+        layout = Layout(_names(rows[1]), _units(_names(rows[1]), rows[2]), 4, head)
+    else:
+        layout = find_layout(rows, str(path))
+    names, start = layout.names, layout.start
+    first = rows[start] if start < len(rows) else []
+    stamps = frozenset(name for name, cell in zip(names, first, strict=False) if name and is_stamp(cell))
+    return TextBlock(path, names, lines[start:], delimiter, start + 1, stamps), layout
+
+
+def block_table(block: "TextBlock", layout: "Layout") -> LogTable:
+    """The table of such samples."""
+    return LogTable(block.path, block.names, block.first_row, block.columns, layout.units, block.stamps, layout.remarks)
+
+
+def decode(path: Path, raw: bytes) -> str:
+    """The text of a file, its lines apart by a line feed; a `LogError` if it is no text."""
+    if raw[:2] in {b"\xff\xfe", b"\xfe\xff"}:
+        text = raw.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = raw.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = raw.decode("cp1252", errors="replace")
+    require("\0" not in text, f"{path}: not a text file; export the log as CSV in UTF-8", LogError)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+class Layout(NamedTuple):
+    """How the rows of a log are to be read."""
 
     names: list[str]
-    units: dict[str, str]
-    start: int
-    remarks: tuple[str, ...]
+    units: dict[str, str]  # by name, of those columns for which a row below the names says one
+    start: int  # index of the first row of samples
+    remarks: tuple[str, ...]  # the rows that are skipped
 
 
-def find_layout(rows: Sequence[Sequence[str]], where: str, first_row: int = 1) -> Layout:
-    """Find the names, the units and the first sample.
+def find_layout(rows: Sequence[Sequence[str]], where: str) -> Layout:
+    """Find the names, the units and the first sample in the cells of a file's rows, at least of its first ones.
 
     The samples begin with the first row of the usual width whose first cell is a number or a time stamp. The nearest
     row above it without a number names the columns. Between them may stand a row of units, empty rows and comments.
     Where another row stands there, or none begins with a number, the samples begin below the first row that may be
     names: no row that may be a sample is skipped.
-
-    Parameters
-    ----------
-    rows : sequence of sequence of str
-        The cells of the file's rows, at least of its first ones.
-    where : str
-        The file, for messages.
-    first_row : int
-        The number that messages give to the first row.
-
-    Raises
-    ------
-    LogError
-        If no row names the columns, or there is no sample.
     """
     width = _usual_width(rows)
     first = next((i for i, row in enumerate(rows) if _is_sample(row, width)), None)
     head = _find_names(rows, len(rows) if first is None else first, width, first is None)
     if head is None:
-        raise _missing_names(rows, first or 0, where, first_row)
+        raise _missing_names(rows, first or 0, where)
     units_row = head + 1 if head + 1 < len(rows) and is_unit_row(rows[head + 1], len(rows[head])) else None
     below = head + 1 if units_row is None else head + 2
     between = rows[below:first]
     start = below if first is None or not all(_is_no_row(row) for row in between) else first
     require(start < len(rows), f"{where}: a header, but no samples", LogError)
-    _check_blocks(rows[:head], where, first_row)
+    values = [i for i, row in enumerate(rows[:head]) if len(row) > 1 and _is_value(row[0])]
+    if len(values) >= MIN_BLOCK_ROWS:  # what may be another block of samples, of another width, is not skipped
+        span = f"{values[0] + 1} to {values[-1] + 1}"
+        raise LogError(
+            f"{where}: rows {span} hold numbers, but other columns than the rows below; make two files of it"
+        )
     names = _names(rows[head])
     units = {} if units_row is None else _units(names, rows[units_row])
-    return Layout(names, units, start, _remarks(rows, head, units_row, first_row))
-
-
-def toa5_layout(rows: Sequence[Sequence[str]]) -> Layout:
-    """The layout of a file of Campbell Scientific's loggers."""
-    names = _names(rows[1])
-    return Layout(names, _units(names, rows[2]), 4, ("rows 1, 3 and 4 are read as the head of a TOA5 file",))
+    return Layout(names, units, start, _remarks(rows, head, units_row))
 
 
 def has_table(rows: Sequence[Sequence[str]]) -> bool:
@@ -167,23 +195,14 @@ def _find_names(rows: Sequence[Sequence[str]], first: int, width: int, downwards
         return near[-1] if near and _is_header(rows[near[-1]]) else None
     if downwards:
         return may_name[0]
-    last = _skip_comments(rows, may_name)
+    last = may_name[-1]
+    plain = [i for i in may_name if not _COMMENT.match(rows[i][0])]
+    units = {i: sum(bool(_BRACKETS.search(cell)) for cell in rows[i]) for i in (last, *plain[-1:])}
+    if plain and units[last] <= units[plain[-1]]:  # a comment names the columns only if it says more units
+        last = plain[-1]
     above = last - 1
     named_above = above >= 0 and abs(len(rows[above]) - len(rows[last])) < 2 and not _is_value(rows[above][0])
     return above if named_above and any(rows[above]) and is_unit_row(rows[last], len(rows[above])) else last
-
-
-def _skip_comments(rows: Sequence[Sequence[str]], may_name: Sequence[int]) -> int:
-    """The last row that may name the columns; a comment does so if it says more units than the uncommented above it."""
-    last = may_name[-1]
-    plain = [i for i in may_name if not _COMMENT.match(rows[i][0])]
-    if not plain or _count_units(rows[last]) > _count_units(rows[plain[-1]]):
-        return last
-    return plain[-1]
-
-
-def _count_units(row: Sequence[str]) -> int:
-    return sum(bool(_BRACKETS.search(cell)) for cell in row)
 
 
 def _is_header(row: Sequence[str]) -> bool:
@@ -200,35 +219,25 @@ def _units(names: Sequence[str], row: Sequence[str]) -> dict[str, str]:
     return {name: plain_unit(text) or text for name, text in zip(names, texts, strict=False) if name and text}
 
 
-def _check_blocks(above: Sequence[Sequence[str]], where: str, first_row: int) -> None:
-    """Refuse to skip what may be another block of samples, of another width."""
-    values = [i for i, row in enumerate(above) if len(row) > 1 and _is_value(row[0])]
-    if len(values) >= MIN_BLOCK_ROWS:
-        first, last = values[0] + first_row, values[-1] + first_row
-        raise LogError(
-            f"{where}: rows {first} to {last} hold numbers, but other columns than the rows below; make two files of it"
-        )
-
-
-def _remarks(rows: Sequence[Sequence[str]], head: int, units: int | None, first_row: int) -> tuple[str, ...]:
+def _remarks(rows: Sequence[Sequence[str]], head: int, units: int | None) -> tuple[str, ...]:
     remarks = []
     above = [i for i in range(head) if any(rows[i])]
     if above:
         first, last = (next(cell for cell in rows[i] if cell)[:30] for i in (above[0], above[-1]))
         shown = f"{first!r} to {last!r}" if len(above) > 1 else repr(first)
-        span = f"rows {first_row} to {head + first_row - 1} are" if head > 1 else f"row {first_row} is"
+        span = f"rows 1 to {head} are" if head > 1 else "row 1 is"
         remarks.append(f"{span} skipped as metadata: {shown}")
     if units is not None:
-        remarks.append(f"row {units + first_row} is read as the units of the columns")
+        remarks.append(f"row {units + 1} is read as the units of the columns")
     return tuple(remarks)
 
 
-def _missing_names(rows: Sequence[Sequence[str]], first: int, where: str, first_row: int) -> LogError:
+def _missing_names(rows: Sequence[Sequence[str]], first: int, where: str) -> LogError:
     """Say which row should name the columns, and why it does not."""
     index = next((i for i in range(first - 1, -1, -1) if not _is_blank(rows[i])), 0)
     row = rows[index] if rows else []
     value = next((cell for cell in row if _is_value(cell)), "")
-    place = f"{where}: row {index + first_row}"
+    place = f"{where}: row {index + 1}"
     if not any(row):
         return LogError(f"{place} is empty; it has to name the columns")
     if value:
@@ -236,48 +245,31 @@ def _missing_names(rows: Sequence[Sequence[str]], first: int, where: str, first_
     return LogError(f"{where}: one column only; put ',', ';' or a tab between columns")
 
 
-MISSING = ("", "NaN", "nan", "NAN")
-"""Cells of a missing sample: empty, or as MATLAB, Python and Campbell's loggers write it."""
 _UNIT_SEPARATOR = "\x1f"  # ASCII's own
 _WORD = re.compile(r"(?:[#%!/]+\s*)?\S+(?:\s*\[[^\]]*\]|\s*\([^)]*\))?")  # a name keeps its unit in brackets
 
 
 @dataclass(frozen=True)
 class TextBlock:
-    """The samples of a log as text.
-
-    Attributes
-    ----------
-    names : sequence of str
-        Of the columns.
-    lines : sequence of str
-        A row each; " " as the delimiter stands for any white space.
-    first_row : int
-        The number of the first line.
-    stamps : frozenset of str
-        Columns of time stamps.
-    """
+    """The samples of a log as text, a row a line."""
 
     path: Path
     names: Sequence[str]
     lines: Sequence[str]
-    delimiter: str
-    first_row: int
-    stamps: frozenset[str] = frozenset()
+    delimiter: str  # " " stands for any white space
+    first_row: int  # the number of the first line
+    stamps: frozenset[str] = frozenset()  # columns of time stamps
 
     def columns(self, names: Sequence[str]) -> dict[str, Array]:
-        """Read the named columns; time stamps as seconds from the first.
-
-        Raises
-        ------
-        LogError
-            If a row has another length than the header, or a cell is not a number.
-        """
+        """Read the named columns (n,); time stamps as seconds from the first."""
         check_cells(self.path, len(self.lines), len(names))
         even = _equal_rows(self)
         found = {name: even.stamp_column(name) for name in names if name in self.stamps}
         used = [self.names.index(name) for name in names if name not in found]
-        numbers = _numbers(even, used) if used else {}
+        parsed = (_parse_with_decimal(even, used, decimal) for decimal in ".,") if used else iter([{}])
+        numbers = next((columns for columns in parsed if columns is not None), None)
+        if numbers is None:
+            raise _number_error(even, used)
         return {name: found[name] if name in found else numbers[self.names.index(name)] for name in names}
 
     def stamp_column(self, name: str) -> Array:
@@ -288,20 +280,7 @@ class TextBlock:
 
 
 def mend_cells(block: TextBlock, used: Sequence[str]) -> tuple[TextBlock, dict[str, list[int]]]:
-    """Leave out rows of another length than the header, and empty the cells of columns that hold no number.
-
-    Parameters
-    ----------
-    used : sequence of str
-        The columns whose cells have to be numbers.
-
-    Returns
-    -------
-    block : TextBlock
-        With a row a line still: one that is left out has empty cells.
-    changes : dict of str to list of int
-        What was done, with the numbers of the rows.
-    """
+    """Empty rows of another length than the header and cells of columns `used` that hold no number; both are listed."""
     width, changes = len(block.names), dict[str, list[int]]()
     cells = [split_cells(line, block.delimiter) for line in block.lines]
     cells = [row[:-1] if len(row) == width + 1 and not row[-1] else row for row in cells]
@@ -359,29 +338,17 @@ def _equal_rows(block: TextBlock) -> TextBlock:
         if n == width + 1 and line.rstrip(" ").endswith(mark):
             even[i] = line.rstrip(" ")[:-1]
         elif n != width:
-            raise _width_error(block, i, n)
+            row = f"{block.path}: row {i + block.first_row}"
+            if block.lines[i].count('"') % 2:
+                raise LogError(f'{row}: a quote (") is opened and not closed; mend the row')
+            doubt = block.delimiter == "," and n > width
+            remedy = "is ',' the decimal mark, too? Then export with ';'" if doubt else "mend or delete the row"
+            raise LogError(f"{row} has {n} {'field' if n == 1 else 'fields'}, the header {width}; {remedy}")
     return replace(block, lines=even, delimiter=mark)
-
-
-def _width_error(block: TextBlock, index: int, n: int) -> LogError:
-    width, row = len(block.names), f"{block.path}: row {index + block.first_row}"
-    if block.lines[index].count('"') % 2:
-        return LogError(f'{row}: a quote (") is opened and not closed; mend the row')
-    doubt = block.delimiter == "," and n > width
-    remedy = "is ',' the decimal mark, too? Then export with ';'" if doubt else "mend or delete the row"
-    return LogError(f"{row} has {n} {'field' if n == 1 else 'fields'}, the header {width}; {remedy}")
 
 
 def _row_cells(block: TextBlock, row: int) -> list[str]:
     return [cell.strip() for cell in block.lines[row].split(block.delimiter)]
-
-
-def _numbers(block: TextBlock, used: Sequence[int]) -> dict[int, Array]:
-    for decimal in (".", ","):
-        numbers = _parse_with_decimal(block, used, decimal)
-        if numbers is not None:
-            return numbers
-    raise _number_error(block, used)
 
 
 def _parse_with_decimal(block: TextBlock, used: Sequence[int], decimal: str) -> dict[int, Array] | None:
@@ -432,69 +399,6 @@ def _number_error(block: TextBlock, used: Sequence[int]) -> LogError:
     return LogError(f"{block.path}: cannot be read as numbers; export it as CSV")
 
 
-_DELIMITERS = (";", "\t", ",", " ")
-
-
-def read_delimited(path: Path, raw: bytes) -> Table:
-    """Read a text file of which a row names the columns: UTF-8, UTF-16 with its mark, or Windows-1252.
-
-    An empty cell or NaN is a missing sample. One decimal mark holds for all columns that are read. Above the names may
-    stand metadata, below them a row of units (`find_layout`). Rows have the numbers that an editor shows.
-    """
-    return read_text(path, decode(path, raw))
-
-
-def decode(path: Path, raw: bytes) -> str:
-    """The text of a file, its lines apart by a line feed.
-
-    Raises
-    ------
-    LogError
-        If it is no text.
-    """
-    if raw[:2] in {b"\xff\xfe", b"\xfe\xff"}:
-        text = raw.decode("utf-16", errors="replace")
-    else:
-        try:
-            text = raw.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = raw.decode("cp1252", errors="replace")
-    require("\0" not in text, f"{path}: not a text file; export the log as CSV in UTF-8", LogError)
-    return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def read_text(path: Path, text: str) -> Table:
-    """Read the text of such a file."""
-    block, layout = find_block(path, text)
-    return block_table(block, layout)
-
-
-def find_block(path: Path, text: str) -> tuple[TextBlock, Layout]:
-    """The samples of such a text as cells, and how its rows are to be read."""
-    lines = text.rstrip("\n ").split("\n")
-    require(any(lines), f"{path}: row 1 is empty; it has to name the columns", LogError)
-    delimiter = _find_delimiter(path, lines[:MAX_HEAD_ROWS])
-    rows = [split_cells(line, delimiter, f"{path}: row {i}") for i, line in enumerate(lines[:MAX_HEAD_ROWS], 1)]
-    layout = toa5_layout(rows) if rows[0][0] == TOA5 and len(rows) > 4 else find_layout(rows, str(path))
-    names, start = layout.names, layout.start
-    first = rows[start] if start < len(rows) else []
-    stamps = frozenset(name for name, cell in zip(names, first, strict=False) if name and is_stamp(cell))
-    return TextBlock(path, names, lines[start:], delimiter, start + 1, stamps), layout
-
-
-def block_table(block: TextBlock, layout: Layout) -> Table:
-    """The table of such samples."""
-    return Table(block.path, block.names, block.first_row, block.columns, layout.units, block.stamps, layout.remarks)
-
-
-def _find_delimiter(path: Path, lines: Sequence[str]) -> str:
-    """The first that gives names and samples below them; else the first that the first line holds."""
-    for delimiter in _DELIMITERS:
-        if has_table([split_cells(line, delimiter, f"{path}: row {i}") for i, line in enumerate(lines, 1)]):
-            return delimiter
-    return next((d for d in _DELIMITERS[:-1] if d in lines[0]), ",")
-
-
 _STAMP = re.compile(
     r"(?:(?P<date>\d{4}([-/.])\d\d?\2\d\d?|\d\d?([-/.])\d\d?\3(?:\d{4}|\d\d))(?:[T,_]\s*|\s+))?"
     r"(?P<h>\d\d?):(?P<m>\d\d)(?::(?P<s>\d\d)(?:[.,:](?P<f>\d{1,9}))?)?"
@@ -515,27 +419,9 @@ def is_stamp(cell: str) -> bool:
 
 
 def seconds_from_first(cells: Sequence[str], path: Path | str, name: str, first_row: int) -> Array:
-    """Read a column of stamps.
+    """Read a column of stamps as seconds from the first (n,), exact to 1 ns; NaN where one is empty.
 
-    Parameters
-    ----------
-    cells : sequence of str
-        An empty one is a missing stamp. Without dates, a leap back by more than half a day is midnight.
-    path : Path or str
-    name : str
-        Of the column.
-    first_row : int
-        Number of the first row, for messages.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Seconds from the first stamp, exact to 1 ns; NaN where it is missing.
-
-    Raises
-    ------
-    LogError
-        If a cell is no stamp, or its date may be read in two ways.
+    Without dates, a leap back by more than half a day is midnight.
 
     Examples
     --------
@@ -553,7 +439,11 @@ def seconds_from_first(cells: Sequence[str], path: Path | str, name: str, first_
     for k, match in enumerate(matches):
         moments.append(_nanoseconds(match, days, month_first, places[k]) if match else None)
     if not any(days):
-        moments = _unwrap_midnights(moments)
+        day, shift, last = 86400 * 10**9, 0, None
+        for k, moment in enumerate(moments):
+            if moment is not None:
+                shift += day if last is not None and moment + day // 2 < last else 0
+                last, moments[k] = moment, moment + shift
     start = next((moment for moment in moments if moment is not None), 0)
     return np.array([np.nan if m is None else (m - start) / 1e9 for m in moments])
 
@@ -582,7 +472,7 @@ def _nanoseconds(match: re.Match[str], days: dict[str, int], month_first: bool, 
     zone = (match["zone"] or "Z").replace(":", "").replace("Z", "+0000").ljust(5, "0")
     shift = (int(zone[1:3]) * 60 + int(zone[3:5])) * (-1 if zone[0] == "-" else 1)
     fraction = int((match["f"] or "0").ljust(9, "0"))
-    return days[text] * DAY + ((hour * 60 + minute - shift) * 60 + second) * 10**9 + fraction
+    return (((days[text] * 24 + hour) * 60 + minute - shift) * 60 + second) * 10**9 + fraction
 
 
 def _day_number(text: str, month_first: bool, place: str) -> int:
@@ -599,14 +489,3 @@ def _day_number(text: str, month_first: bool, place: str) -> int:
         return date(year + 2000 * (year < 100), month, day).toordinal()
     except ValueError:
         raise LogError(f"{place}: {text!r} is no date; write it as 2026-03-12") from None
-
-
-def _unwrap_midnights(moments: Sequence[int | None]) -> list[int | None]:
-    unwrapped: list[int | None] = []
-    shift, last = 0, None
-    for moment in moments:
-        if moment is not None:
-            shift += DAY if last is not None and moment + DAY // 2 < last else 0
-            last = moment
-        unwrapped.append(None if moment is None else moment + shift)
-    return unwrapped

@@ -32,17 +32,11 @@ class UnknownNameError(InputError):
 
 
 class LogError(InputError):
-    """A log cannot be read, or contradicts itself; the message names the file, row and column.
-
-    Attributes
-    ----------
-    finding : LogFinding, optional
-        What the log doctor found, which `plotting.plot_finding` draws.
-    """
+    """A log cannot be read, or contradicts itself; the message names the file, row and column."""
 
     def __init__(self, message: str, finding: Any = None) -> None:
         super().__init__(message)
-        self.finding = finding
+        self.finding = finding  # what the log doctor found, which `plotting.plot_finding` draws
 
 
 class ModelError(InputError):

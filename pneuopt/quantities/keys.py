@@ -1,4 +1,4 @@
-"""`Key`: the declaration of a key of a file; `read_table` reads by it; templates, schemas and key lists come from it.
+"""The declaration of a file's keys, by which it is read; templates, schemas and lists of keys come from it, too.
 
 A file is a table whose keys are its sections, a section is a table of keys, and so on down.
 """
@@ -10,7 +10,7 @@ from enum import Enum
 from math import inf
 from typing import Any
 
-from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.errors import MAX_SHOWN, InputError, check_names, require
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.quantities.units import read_value
 
@@ -55,67 +55,28 @@ _TYPES: Mapping[Takes, tuple[type, ...]] = {
 }
 
 
-MAX_SHOWN_ENTRY = 60
-"""Length of a wrong entry in a message [character]: more hides what would be right."""
-
-
 @dataclass(frozen=True)
 class Key:
-    """A key of a file: what it means, what it takes, and what holds where the file leaves it out.
-
-    Parameters
-    ----------
-    meaning : str
-    takes : Takes
-    unit : str
-        Of a value; words in braces stand for the units of a loop's signals: "{command}/s".
-    usual : object
-        What holds without the key: a value in `unit`, or the word that the file would say.
-    choices : mapping of str to object, optional
-        The words that the key takes, and the object that each stands for.
-    required : bool
-        Whether the file must have the key.
-    keys : mapping of str to Key
-        Those of a table.
-    others : Key, optional
-        What the further keys of a table take: names that come from the user, each a `named`.
-    named : str
-        What such a name, or a word of a list, is: "parameter".
-    example : str
-        As a file may write it; needed where nothing is usual.
-    source : str
-        Where the usual value comes from.
-    condition : str
-        When the file may have the key: 'form = "standard"'.
-    least, most : float
-        Bounds of a number, or of a whole one [unit].
-    is_open : bool
-        Whether the bounds themselves are excluded.
-    of : Key, optional
-        What each entry of a list is.
-    counts : (int, float)
-        Least and largest number of entries of a list.
-    read : callable, optional
-        ``read(entry, where, units)`` returns the value of an entry that no other key is like; it raises `InputError`.
-    """
+    """A key of a file: what it means, what it takes, and what holds where the file leaves it out."""
 
     meaning: str
     takes: Takes = Takes.NUMBER
-    unit: str = "1"
-    usual: Any = None
-    choices: Mapping[str, Any] | None = None
+    unit: str = "1"  # of a value; words in braces stand for the units of a loop's signals: "{command}/s"
+    usual: Any = None  # what holds without the key: a value in `unit`, or the word that the file would say
+    choices: Mapping[str, Any] | None = None  # the words that the key takes, and the object that each stands for
     required: bool = False
-    keys: Mapping[str, "Key"] = field(default_factory=dict)
-    others: "Key | None" = None
-    named: str = ""
-    example: str = ""
-    source: str = ""
-    condition: str = ""
-    least: float = -inf
+    keys: Mapping[str, "Key"] = field(default_factory=dict)  # those of a table
+    others: "Key | None" = None  # what further keys of a table take: names that come from the user, each a `named`
+    named: str = ""  # what such a name, or a word of a list, is: "parameter"
+    example: str = ""  # as a file may write it; needed where nothing is usual
+    source: str = ""  # where the usual value comes from
+    condition: str = ""  # when the file may have the key: 'form = "standard"'
+    least: float = -inf  # bounds of a number, or of a whole one [unit]
     most: float = inf
-    is_open: bool = False
-    of: "Key | None" = None
-    counts: tuple[int, float] = (0, inf)
+    is_open: bool = False  # whether the bounds themselves are excluded
+    of: "Key | None" = None  # what each entry of a list is
+    counts: tuple[int, float] = (0, inf)  # least and largest number of entries of a list
+    # Takes entry, place and units, and returns the value of an entry that no other key is like, or raises `InputError`.
     read: "Callable[[Any, str, Mapping[str, str]], Any] | None" = None
 
     @property
@@ -154,31 +115,11 @@ def read_table(
     units: Mapping[str, str] | None = None,
     partial: bool = False,
 ) -> dict[str, Any]:
-    """Read a table by the keys that declare it.
+    """Read a table by the keys that declare it: of each its value in its unit, or what holds without it.
 
-    Parameters
-    ----------
-    keys : mapping of str to Key
-    toml : mapping
-        The table as it was parsed.
-    where : str or callable
-        What an error's message begins with: file and section; or ``where(key)``: file, line, section and key, of no
-        key file, line and section.
-    units : mapping of str to str, optional
-        What the words in braces of the keys' units stand for.
-    partial : bool
-        Whether the table has keys that another reader reads; they are passed over.
-
-    Returns
-    -------
-    dict of str to object
-        Of every declared key its value: a number in the key's unit, what a word stands for, a tuple of a list, a dict
-        of a table; what holds without it where the table leaves it out.
-
-    Raises
-    ------
-    InputError
-        UnitError, UnknownNameError or other, if a key is unknown or missing, or has a value that it does not take.
+    `where` begins an error's message, as file and section, or says so of a key; `units` are what the words in braces of
+    the keys' units stand for; with `partial` the table has keys of another reader. A key that is unknown or missing, or
+    has a value that it does not take, is an `InputError`.
 
     Examples
     --------
@@ -218,7 +159,7 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
     if key.takes is Takes.SAMPLES:
         return _read_samples(entry, where)
     proper = type(entry) in key.takes.types
-    require(proper, f"{where} must be {key.takes.value}, got {repr(entry)[:MAX_SHOWN_ENTRY]}{_remedy(key, where)}")
+    require(proper, f"{where} must be {key.takes.value}, got {repr(entry)[:MAX_SHOWN]}{_remedy(key, where)}")
     if key.takes is Takes.COUNT:
         return _in_bounds(key, entry, entry, where)
     if key.takes is Takes.LIST:
@@ -233,19 +174,7 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
 
 
 def read_named(key: Key, toml: Any, units: Mapping[str, str], where: str) -> dict[str, Any]:
-    """Read a table whose keys the user names.
-
-    Parameters
-    ----------
-    key : Key
-        Of the table; each entry is one of its `others`.
-    toml : object
-        As it was parsed.
-    units : mapping of str to str
-        By each name that there may be its unit, for which "{own}" stands.
-    where : str
-        File, section and key.
-    """
+    """Read a table whose keys the user names, each one of `key.others`; "{own}" stands for its unit in `units`."""
     require(isinstance(toml, dict), f"{where} must be {Takes.TABLE.value}, got {toml!r}{_remedy(key, where)}")
     check_names(key.named, toml, units, where)
     assert key.others is not None
@@ -271,24 +200,23 @@ def _in_bounds(key: Key, value: Any, entry: Any, where: str) -> Any:
 def _read_list(key: Key, entries: list[Any], where: str, units: Mapping[str, str]) -> tuple[Any, ...]:
     least, most = key.counts
     count = f"{least}" if least == most else f"{least} at least" if most == inf else f"{least} to {most:g}"
-    told = f"{where} must be a list of {count}, got {entries}{_remedy(key, where)}"
-    require(least <= len(entries) <= most, told)
-    item = key.of or (Key("", Takes.TEXT, choices=key.choices, named=key.named) if key.choices else None)
-    spots = [f"{where} {k}" if isinstance(entry, dict) else where for k, entry in enumerate(entries, 1)]
-    return tuple(
-        entry if item is None else read_entry(item, entry, spot, units)
-        for spot, entry in zip(spots, entries, strict=True)
+    require(
+        least <= len(entries) <= most,
+        f"{where} must be a list of {count}, got {entries}{_remedy(key, where)}",
     )
+    item = key.of or (Key("", Takes.TEXT, choices=key.choices, named=key.named) if key.choices else None)
+    if item is None:
+        return tuple(entries)
+    spots = (f"{where} {k}" if isinstance(entry, dict) else where for k, entry in enumerate(entries, 1))
+    return tuple(read_entry(item, entry, spot, units) for spot, entry in zip(spots, entries, strict=True))
 
 
 def _read_samples(entry: Any, where: str) -> int:
     """A number of samples, "1 sample" or 1."""
     match = re.fullmatch(r"\s*(\d+)\s*samples?\s*", entry) if isinstance(entry, str) else None
     whole = type(entry) is int
-    require(
-        match is not None or whole,
-        f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"',
-    )
+    told = f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"'
+    require(match is not None or whole, told)
     return int(match[1]) if match else int(entry)
 
 

@@ -1,11 +1,7 @@
 """Files written whole or not at all, and refused before the work where they could not be written after it.
 
-Files that are read: only regular ones, once, within a budget; TOML within one for its nesting, too.
-
-`one_blas_thread`: linear algebra in the thread that calls it.
-
-BLAS shares products of a few thousand numbers out to all cores, too, and its threads then wait in a loop for the next
-one. An identification took a fifth more CPU time by it, and ended no sooner.
+Files that are read: only regular ones, once, within a budget; TOML within one for its nesting, too. And linear algebra
+in the thread that calls it.
 """
 
 import contextlib
@@ -29,38 +25,27 @@ if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
 
+MAX_TOML_BYTES = 2**17
+"""Size of a TOML file [byte], 128 KiB: more takes seconds to parse; less refuses the covariance of fifty parameters."""
+MAX_NESTING = 64
+"""Brackets in brackets of a TOML file [1]: a parser's recursion ends near 300; no file of ours needs ten."""
+MAX_REASON = 200
+"""Length of another's words in a message [character]: a parser's or a library's own may show the whole file."""
+
+_known: ContextVar[dict[str, bytes] | None] = ContextVar("known", default=None)
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 """What text begins with that a spreadsheet computes; a number is none, it is no text here."""
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file whole or not at all.
-
-    Parameters
-    ----------
-    text : str
-        Lines end with a newline character on every system.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist, or cannot be written to.
-    """
+    """Write a text file, its lines ended by a newline character on every system, whole or not at all."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file whole or not at all: a temporary file beside it is written first, and then renamed.
 
-    Parameters
-    ----------
-    path : str or Path
-        A link is followed: the file that it names is replaced. A file that is there keeps its mode and owner.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist or cannot be written to, or the path is a device, a pipe or write-protected.
+    A link is followed; a file that is there keeps its mode and owner. An `InputError` where it cannot be written.
     """
     place = _check_place(Path(path))
     part = place.with_name(f".{secrets.token_hex(6)}.part")
@@ -69,7 +54,11 @@ def write_bytes(path: str | Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        _keep_mode(place, part)
+        entry = _stat_if_there(place)
+        if entry is not None:
+            with contextlib.suppress(OSError, AttributeError):  # AttributeError: Windows has no owners
+                os.chown(part, entry.st_uid, entry.st_gid)
+            part.chmod(stat.S_IMODE(entry.st_mode))
         part.replace(place)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder") from None
@@ -79,13 +68,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def write_records(path: str | Path, frame: "pd.DataFrame") -> None:
-    """Write a table as JSON: a list of records, one a row; what is not finite becomes null.
-
-    Parameters
-    ----------
-    frame : DataFrame
-        An index that is more than a count goes into each record, as "name" if it has no name of its own.
-    """
+    """Write a table as JSON: a list of `records`; what is not finite becomes null."""
     write_text(path, _to_json(records(frame)))
 
 
@@ -128,7 +111,7 @@ def _quote_formula(cell: Any) -> Any:
 
 
 def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
-    """A table as a list of records, one a row; the index as for `write_records`."""
+    """A table as a list of records, one a row; an index that is more than a count goes in, if nameless as "name"."""
     import pandas as pd
 
     if isinstance(frame.index, pd.RangeIndex):
@@ -157,18 +140,7 @@ def plain_value(value: Any) -> Any:
 
 
 def check_output_paths(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
-    """Refuse outputs that could not be written after minutes of work, or that would overwrite an input.
-
-    Parameters
-    ----------
-    outputs : iterable of Path or None
-        None is an output that is not wanted.
-
-    Raises
-    ------
-    InputError
-        The message names the file and the remedy.
-    """
+    """Refuse outputs, None for none, that could not be written after minutes of work, or would overwrite an input."""
     read = {os.path.realpath(path) for path in inputs}
     taken: set[Path] = set()
     for path in (p for p in outputs if p is not None):
@@ -205,16 +177,6 @@ def _stat_if_there(place: Path) -> os.stat_result | None:
         return None
 
 
-def _keep_mode(place: Path, part: Path) -> None:
-    """Give a file's mode, and its owner if we may, to the one that takes its place."""
-    entry = _stat_if_there(place)
-    if entry is None:
-        return
-    with contextlib.suppress(OSError, AttributeError):  # AttributeError: Windows has no owners
-        os.chown(part, entry.st_uid, entry.st_gid)
-    part.chmod(stat.S_IMODE(entry.st_mode))
-
-
 def _to_json(value: Any) -> str:
     return json.dumps(_null_nonfinite(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
@@ -227,34 +189,8 @@ def _null_nonfinite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-MAX_TOML_BYTES = 2**17
-"""Size of a TOML file [byte], 128 KiB: more takes seconds to parse; less refuses the covariance of fifty parameters."""
-MAX_NESTING = 64
-"""Brackets in brackets of a TOML file [1]: a parser's recursion ends near 300; no file of ours needs ten."""
-
-MAX_REASON = 200
-"""Length of another's words in a message [character]: a parser's or a library's own may show the whole file."""
-
-_known: ContextVar[dict[str, bytes] | None] = ContextVar("known", default=None)
-
-
 def read_source(path: str | Path, most: int, remedy: str, error: type[InputError] = InputError) -> bytes:
-    """Read a whole file.
-
-    Parameters
-    ----------
-    most : int
-        Its size [byte] may be.
-    remedy : str
-        What to do where it is larger, or no file: "cut it".
-    error : type
-        What is raised.
-
-    Raises
-    ------
-    InputError
-        Or the other error: if it cannot be read, is larger, or is a pipe or a device, which may never end.
-    """
+    """Read a whole file of at most `most` [byte]; `error` says the `remedy` if it is larger, or a pipe or device."""
     path = Path(path)
     try:
         mode = path.stat().st_mode
@@ -273,13 +209,7 @@ def read_source(path: str | Path, most: int, remedy: str, error: type[InputError
 
 
 def read_toml_source(path: str | Path) -> bytes:
-    """Read a TOML file that no parser chokes on; within `read_once` only the first call reads the file.
-
-    Raises
-    ------
-    InputError
-        As `read_source` does, and for brackets in brackets in brackets.
-    """
+    """Read a TOML file that no parser chokes on; within `read_once` only the first call reads the file."""
     known = _known.get()
     key = str(Path(path).absolute())
     if known is not None and key in known:
@@ -302,15 +232,7 @@ def check_nesting(path: str | Path, raw: bytes, error: type[InputError] = InputE
 def read_once(known: Mapping[str, bytes] | None = None) -> Iterator[dict[str, bytes]]:
     """Read each TOML file once within, so that one that is moved or edited during long work changes nothing.
 
-    Parameters
-    ----------
-    known : mapping of str to bytes, optional
-        What was read before, in another process for example.
-
-    Yields
-    ------
-    dict of str to bytes
-        What was read, by absolute path; it grows.
+    It yields what was read, by absolute path, and begins with what another process has read, for example.
     """
     outer = _known.get()
     own = {**(known or {})} if outer is None or known is not None else outer
@@ -323,7 +245,11 @@ def read_once(known: Mapping[str, bytes] | None = None) -> Iterator[dict[str, by
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Let BLAS use no threads of its own in this process; its setting from before returns at the end."""
+    """Let BLAS use no threads of its own in this process; its setting from before returns at the end.
+
+    BLAS shares products of a few thousand numbers out to all cores, too, and its threads then wait in a loop for the
+    next one. An identification took a fifth more CPU time by it, and ended no sooner.
+    """
     with _controller().limit(limits=1, user_api="blas"):
         yield
 

@@ -1,8 +1,7 @@
 """Signals (`Quantity`) and numbers (`Parameter`, `ParameterSet`): immutable, named, in SI units, edited by copy.
 
-`Intersample`: how a signal runs between two samples of a log, held or linearly, and which of both is usual.
-
-Arguments of the verbs: one thing as well as several, and an error that says which argument came as what.
+Behind them `Intersample`, how a signal runs between two samples of a log, and the checks of the verbs' arguments: one
+thing as well as several, and an error that says which argument came as what.
 """
 
 import fnmatch
@@ -124,6 +123,10 @@ class ParameterSet(Mapping[str, Parameter]):
     def __contains__(self, name: object) -> bool:
         return name in self._parameters
 
+    def get(self, name: str, default: Any = None) -> Any:
+        """The parameter of that name; `default` where there is none."""
+        return self._parameters.get(name, default)  # Mapping's own catches a KeyError only
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._parameters)
 
@@ -139,7 +142,14 @@ class ParameterSet(Mapping[str, Parameter]):
 
     def __repr__(self) -> str:
         width = max((len(n) for n in self), default=0)
-        return "\n".join(f"{n:<{width}}  {_describe_parameter(p)}" for n, p in self.items())
+        lines = []
+        for name, p in self.items():
+            marks = ", ".join(m for m in ("free", "log", "per_log") if getattr(p, m))
+            finite = math.isfinite(p.lower) or math.isfinite(p.upper)
+            bounds = f" in [{p.lower:g}, {p.upper:g}]" if finite else ""
+            source = f"  # {p.source}" if p.source else ""
+            lines.append(f"{name:<{width}}  {p.value:g} {p.unit}{bounds}{' ' * bool(marks)}{marks}{source}")
+        return "\n".join(lines)
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -213,14 +223,6 @@ class ParameterSet(Mapping[str, Parameter]):
         return ParameterSet({**self._parameters, **edits})
 
 
-def _describe_parameter(parameter: Parameter) -> str:
-    marks = [m for m in ("free", "log", "per_log") if getattr(parameter, m)]
-    finite = math.isfinite(parameter.lower) or math.isfinite(parameter.upper)
-    bounds = f" in [{parameter.lower:g}, {parameter.upper:g}]" if finite else ""
-    source = f"  # {parameter.source}" if parameter.source else ""
-    return f"{parameter.value:g} {parameter.unit}{bounds}{' ' + ', '.join(marks) if marks else ''}{source}"
-
-
 def without_prefix(values: Mapping[str, T], prefix: str) -> dict[str, T]:
     """The entries ``prefix.name`` by their own name.
 
@@ -266,20 +268,7 @@ def usual_intersample(name: str, unit: str) -> Intersample:
 
 
 def as_tuple(argument: str, given: T | Iterable[T], kind: type[T], meant: str) -> tuple[T, ...]:
-    """Make a tuple of one or several.
-
-    Parameters
-    ----------
-    argument : str
-        Its name, for the message.
-    given : object of `kind`, or an iterable of them
-    meant : str
-        What the argument takes, for the message.
-
-    Raises
-    ------
-    InputError
-        If something else came.
+    """Make a tuple of one or several objects of a kind; an `InputError` says what the argument takes, as `meant`.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""`Report`: sentences and tables, as text of any width and as HTML; results, notebooks and the shell show the same one.
+"""Sentences and tables, as text of any width and as HTML; results, notebooks and the shell show the same one.
 
 No line breaks inside a word or a number. A table that is too wide breaks its cells between words, or has each row's
 name on a line of its own, and where that is not enough it goes on below, with its first column again.
@@ -34,33 +34,19 @@ class Tone(Enum):
 
 @dataclass(frozen=True)
 class Line:
-    """A sentence, or a verdict.
-
-    Parameters
-    ----------
-    indent : int
-        Blanks before it; where it goes on in a second line, two more.
-    """
+    """A sentence, or a verdict."""
 
     text: str
     tone: Tone = Tone.PLAIN
-    indent: int = 0
+    indent: int = 0  # blanks before it; where it goes on in a second line, two more
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table."""
 
-    Parameters
-    ----------
-    heading : str
-        It may have lines of its own.
-    is_text : bool
-        Whether its cells stand left; numbers stand right.
-    """
-
-    heading: str
-    is_text: bool = False
+    heading: str  # it may have lines of its own
+    is_text: bool = False  # its cells stand left; numbers stand right
 
 
 @dataclass(frozen=True)
@@ -123,7 +109,9 @@ class Report:
         for part in self.parts:
             if isinstance(part, Line):
                 own = width if sentences is None else sentences
-                yield from ((text, part.tone) for text in _wrap_sentence(part, own))
+                text = " " * part.indent + part.text
+                wrapped = wrap_words(text, own, " " * (part.indent + 2)) if own else [text]
+                yield from ((_plain(line), part.tone) for line in wrapped)
             else:
                 yield "", Tone.PLAIN
                 yield from _table_lines(part, width)
@@ -164,12 +152,6 @@ def wrap_words(text: str, width: int, indent: str = "") -> list[str]:
     """Lines that end between words; a word that is longer than the width has a line of its own."""
     lines = textwrap.wrap(text, max(width, 1), subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return lines or [""]
-
-
-def _wrap_sentence(line: Line, width: int | None) -> list[str]:
-    text = " " * line.indent + line.text
-    lines = wrap_words(text, width, " " * (line.indent + 2)) if width else [text]
-    return list(map(_plain, lines))
 
 
 def _table_lines(table: Table, width: int | None) -> Iterator[tuple[str, Tone]]:

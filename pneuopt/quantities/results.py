@@ -1,15 +1,12 @@
-"""Results as text: `encode` makes plain JSON values of a result's dataclasses, `decode` makes the result again.
+"""Results as text and as files: what prints itself (`Shown`), what can be saved besides (`Result`), and their JSON.
 
-A dataclass is an object with a member a field; a mapping, an object; a sequence, a list; an enumeration, its value;
-what is not finite, "nan", "inf" or "-inf". A table is an object with "index" and "columns", lists of [name, kind,
-values], where kind is "number", "integer", "flag" or "text", and null is a missing text. Numbers have all their digits.
+`encode` makes plain JSON values of a result's dataclasses, `decode` makes the result again. A dataclass is an object
+with a member a field; a mapping, an object; a sequence, a list; an enumeration, its value; what is not finite, "nan",
+"inf" or "-inf". A table is an object with "index" and "columns", lists of [name, kind, values], where kind is
+"number", "integer", "flag" or "text", and null is a missing text. Numbers have all their digits.
 
-Files of results: one of JSON, whole or not at all, with a hash of what it holds.
-
-It has the members "pneuopt", the name of the result's class, "format", 1, "sha256", the hash of the result's text, and
-"result", a member a field as `archive` says. It is for programs to read; what people edit is fit.toml and tuned.toml.
-
-`Shown`: what prints itself and stands in a notebook; `Result`: what can be saved besides.
+A file, whole or not at all, has the members "pneuopt", the name of the result's class, "format", 1, "sha256", the
+hash of the result's text, and "result". It is for programs to read; what people edit is fit.toml and tuned.toml.
 """
 
 import dataclasses
@@ -36,9 +33,73 @@ if TYPE_CHECKING:
 
 NOT_SAVED = {"saved": False}
 """Metadata of a dataclass's field that a file leaves out, as it is no data; it comes back as its default."""
+FORMAT = 1
+"""Version of the file's layout: a file of another one is refused, not misread."""
 _NONFINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 _PLAIN_TYPES: dict[Any, tuple[type, ...]] = {str: (str,), int: (int,), bool: (bool,), types.NoneType: (types.NoneType,)}
 _KIND_TYPES: dict[str, Any] = {"number": float, "integer": int, "flag": bool}
+
+
+class Shown(ABC):
+    """What prints, and shows in a notebook, as its report."""
+
+    @abstractmethod
+    def summary(self) -> Report:
+        """What there is to know, verdict first: print it, or take its `to_text(width)` or `to_html()`."""
+
+    def __repr__(self) -> str:
+        return self.summary().to_text()
+
+    def _repr_html_(self) -> str:
+        return self.summary().to_html()
+
+
+class Result(Shown):
+    """What a search or a certificate hands out: it prints, and it can be saved."""
+
+    def save(self, path: str | Path) -> None:
+        """Write all of it to a file of JSON text, whole or not at all; `load_result` reads it.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
+        write_result(path, self)
+
+
+def write_result(path: str | Path, result: object) -> None:
+    """Write a result's file."""
+    content: dict[str, Any] = encode(result)
+    members = ",\n  ".join(f"{_to_json(name)}: {_to_json(value)}" for name, value in content.items())
+    head = f'"pneuopt": "{type(result).__name__}", "format": {FORMAT}, "sha256": "{_hash(content)}"'
+    write_text(path, f'{{{head}, "result": {{\n  {members}\n}}}}\n')
+
+
+def read_result(path: str | Path, kinds: dict[str, type]) -> Any:
+    """Read a file of one of these kinds, by name; an `InputError` if it is another, damaged, or of another version."""
+    remedy = "save the result again"
+    try:
+        document = json.loads(Path(path).read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
+    except (ValueError, RecursionError):  # no UTF-8, no JSON, or brackets without end
+        raise InputError(f"{path}: not a whole result file; {remedy}") from None
+    message = f"{path}: not a result that pneuopt has saved; give a file of `save`"
+    require(isinstance(document, dict) and {"pneuopt", "format", "sha256", "result"} <= document.keys(), message)
+    version = document["format"]
+    require(
+        version == FORMAT, f"{path}: has format {version!r}, this pneuopt reads {FORMAT}; install the one that wrote it"
+    )
+    check_names("result", [str(document["pneuopt"])], kinds, str(path))
+    whole = document["sha256"] == _hash(document["result"])
+    require(whole, f"{path}: was damaged or changed after it was saved; {remedy}")
+    try:
+        return decode(kinds[document["pneuopt"]], document["result"])
+    except DamagedError as error:
+        raise InputError(f"{path}: {error} is not as pneuopt saves it; {remedy}") from None
+    except (PneuoptError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"{path}: holds no such result ({error}); {remedy}") from None
 
 
 class DamagedError(ValueError):
@@ -50,7 +111,11 @@ def encode(value: Any) -> Any:
     import pandas as pd
 
     if isinstance(value, pd.DataFrame):
-        return _encode_frame(value)
+        levels = [value.index.get_level_values(k) for k in range(value.index.nlevels)]
+        return {
+            "index": [_encode_column(level.name, level) for level in levels],
+            "columns": [_encode_column(name, column) for name, column in value.items()],
+        }
     if isinstance(value, Enum):
         return value.value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -61,28 +126,25 @@ def encode(value: Any) -> Any:
         return sorted(encode(v) for v in value)
     if isinstance(value, np.ndarray | Sequence) and not isinstance(value, str):
         return [encode(v) for v in value]
-    return _encode_scalar(value)
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"{type(value).__name__} is nothing that a result is saved with")
 
 
 def decode(kind: Any, data: Any, where: str = "result") -> Any:
-    """The value of a type, from what `encode` has made of it.
-
-    Parameters
-    ----------
-    kind : type, or what stands in annotations
-    where : str
-        What the message of an error begins with.
-
-    Raises
-    ------
-    DamagedError
-        If the data are not of that kind; the values' own checks may raise an `InputError`.
-    """
+    """The value of a type, or of an annotation, from what `encode` has made of it; else a `DamagedError` at `where`."""
     import pandas as pd
 
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is float:
-        return _decode_number(data, where)
+        if isinstance(data, str):
+            _expect(data in _NONFINITE, where)
+            return _NONFINITE[data]
+        _expect(isinstance(data, int | float) and not isinstance(data, bool), where)
+        return float(data)
     if kind in _PLAIN_TYPES:
         _expect(type(data) in _PLAIN_TYPES[kind], where)
         return data
@@ -125,23 +187,6 @@ def _saved_fields(kind: Any) -> list[dataclasses.Field[Any]]:
     return [f for f in dataclasses.fields(kind) if f.metadata.get("saved", True)]
 
 
-def _encode_scalar(value: Any) -> Any:
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, float) and not math.isfinite(value):
-        return repr(value)
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    raise TypeError(f"{type(value).__name__} is nothing that a result is saved with")
-
-
-def _decode_number(data: Any, where: str) -> float:
-    if isinstance(data, str):
-        _expect(data in _NONFINITE, where)
-        return _NONFINITE[data]
-    _expect(isinstance(data, int | float) and not isinstance(data, bool), where)
-    return float(data)
-
-
 def _decode_union(kinds: tuple[Any, ...], data: Any, where: str) -> Any:
     """The first kind that the data are of; the last one's error where they are of none."""
     for kind in kinds[:-1]:
@@ -150,14 +195,6 @@ def _decode_union(kinds: tuple[Any, ...], data: Any, where: str) -> Any:
         except DamagedError:
             continue
     return decode(kinds[-1], data, where)
-
-
-def _encode_frame(frame: "pd.DataFrame") -> dict[str, Any]:
-    levels = [frame.index.get_level_values(k) for k in range(frame.index.nlevels)]
-    return {
-        "index": [_encode_column(level.name, level) for level in levels],
-        "columns": [_encode_column(name, column) for name, column in frame.items()],
-    }
 
 
 def _encode_column(name: Any, column: Any) -> list[Any]:
@@ -208,95 +245,9 @@ def _expect(condition: bool, where: str) -> None:
         raise DamagedError(where)
 
 
-FORMAT = 1
-"""Version of the file's layout: a file of another one is refused, not misread."""
-
-
-def write_result(path: str | Path, result: object) -> None:
-    """Write a result's file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written there.
-    """
-    content: dict[str, Any] = encode(result)
-    members = ",\n  ".join(f"{_to_json(name)}: {_to_json(value)}" for name, value in content.items())
-    head = f'"pneuopt": "{type(result).__name__}", "format": {FORMAT}, "sha256": "{_hash(content)}"'
-    write_text(path, f'{{{head}, "result": {{\n  {members}\n}}}}\n')
-
-
-def read_result(path: str | Path, kinds: dict[str, type]) -> Any:
-    """Read a result's file.
-
-    Parameters
-    ----------
-    kinds : dict of str to type
-        The results that it may hold, by name.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, is of another kind or version, or is not what was saved.
-    """
-    document, remedy = _read_json(path), "save the result again"
-    message = f"{path}: not a result that pneuopt has saved; give a file of `save`"
-    require(isinstance(document, dict) and {"pneuopt", "format", "sha256", "result"} <= document.keys(), message)
-    version = document["format"]
-    require(
-        version == FORMAT, f"{path}: has format {version!r}, this pneuopt reads {FORMAT}; install the one that wrote it"
-    )
-    check_names("result", [str(document["pneuopt"])], kinds, str(path))
-    whole = document["sha256"] == _hash(document["result"])
-    require(whole, f"{path}: was damaged or changed after it was saved; {remedy}")
-    try:
-        return decode(kinds[document["pneuopt"]], document["result"])
-    except DamagedError as error:
-        raise InputError(f"{path}: {error} is not as pneuopt saves it; {remedy}") from None
-    except (PneuoptError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"{path}: holds no such result ({error}); {remedy}") from None
-
-
-def _read_json(path: str | Path) -> Any:
-    try:
-        return json.loads(Path(path).read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
-    except (ValueError, RecursionError):  # no UTF-8, no JSON, or brackets without end
-        raise InputError(f"{path}: not a whole result file; save the result again") from None
-
-
 def _hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode("utf-8")).hexdigest()
 
 
 def _to_json(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
-
-
-class Shown(ABC):
-    """What prints, and shows in a notebook, as its report."""
-
-    @abstractmethod
-    def summary(self) -> Report:
-        """What there is to know, verdict first: print it, or take its `to_text(width)` or `to_html()`."""
-
-    def __repr__(self) -> str:
-        return self.summary().to_text()
-
-    def _repr_html_(self) -> str:
-        return self.summary().to_html()
-
-
-class Result(Shown):
-    """What a search or a certificate hands out: it prints, and it can be saved."""
-
-    def save(self, path: str | Path) -> None:
-        """Write all of it to a file of JSON text, whole or not at all; `load_result` reads it.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be written.
-        """
-        write_result(path, self)

@@ -1,9 +1,4 @@
-"""How a computation ended, in words that name the remedy, and how it reports on its way.
-
-`Progress`: what a long computation says on its way, to whoever has asked for it by `progress=`.
-
-Where a result comes from: versions and options, as text that goes with it.
-"""
+"""How a computation ended, in words that name the remedy; what it reports on its way; where a result comes from."""
 
 import functools
 import platform
@@ -123,13 +118,7 @@ class Progress(str):
 
 
 class ProgressReporter:
-    """Passes lines of text on as reports of a job, with the time since it was made.
-
-    Parameters
-    ----------
-    receive : callable or None
-        Takes a `Progress`; None: nobody listens.
-    """
+    """Passes lines of text on as reports of a job, with the time since it was made; None: nobody listens."""
 
     def __init__(self, receive: Callable[[Progress], None] | None, job: str) -> None:
         self._receive, self._job, self._begun = receive, job, time.perf_counter()
@@ -141,13 +130,7 @@ class ProgressReporter:
 
 
 def provenance(*options: object) -> dict[str, str]:
-    """The versions of Python and of the packages that computed a result, and the options that were used.
-
-    Parameters
-    ----------
-    *options : dataclass instances
-        Their repr is recorded.
-    """
+    """The versions of Python and of the packages that computed a result, and the repr of the options that were used."""
     return {
         "pneuopt": _version("pneuopt"),
         "casadi": _version("casadi"),

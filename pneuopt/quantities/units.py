@@ -1,11 +1,9 @@
 """Reading and writing numbers with units: "32 mm", "6 bar(g)", "2e-8 m^3/(s*Pa)"; SI inside.
 
 Units are read exactly (rational arithmetic), so "20 um" is the float 2e-05 and not its neighbour. A frequency in Hz, an
-angular frequency in rad/s and a rate in 1/s are three dimensions: nothing is converted by 2 pi behind one's back.
-
-The units that are known: a short list of our own loads fast, and keeps surprises out, "pt" as a pint, say.
-
-Products and quotients of unit texts: what a gain from volts to metres a second is measured in.
+angular frequency in rad/s and a rate in 1/s are three dimensions: nothing is converted by 2 pi behind one's back. The
+units that are known, at the end of the file, are a short list of our own: it loads fast, and keeps surprises out, "pt"
+as a pint, say.
 """
 
 import difflib
@@ -48,22 +46,10 @@ _READABLE_UNITS = {
 
 
 def read_value(text: str | float, unit: str, *, where: str = "") -> float:
-    """Read one number with its unit.
+    """Read one number with its unit in the SI unit `unit`; without one only where that is "1"; `where` begins an error.
 
-    Parameters
-    ----------
-    text : str or float
-        "32 mm"; a number without a unit only where `unit` is "1" ("0.3", 0.3 and "30 %" are the same).
-    unit : str
-        The SI unit to give it in. "Pa(a)" and "Pa(g)" are pressure levels, which need bar(a), kPa(g), ...;
-        "Pa" is a pressure difference, which refuses them.
-    where : str
-        What the message of an error begins with: file, key.
-
-    Raises
-    ------
-    UnitError
-        If the number or the unit is missing or unknown, or of another dimension.
+    "Pa(a)" and "Pa(g)" are pressure levels, which need bar(a), kPa(g), ...; "Pa" is a pressure difference, which
+    refuses them.
 
     Examples
     --------
@@ -76,26 +62,22 @@ def read_value(text: str | float, unit: str, *, where: str = "") -> float:
         require(free, f'{_place_prefix(where)}{text!r} has no unit; write "{number} {_example_unit(unit)}"', UnitError)
         unit_text = "1"
     factor, offset = _exact_conversion(unit_text, unit, where)
-    value = _convert(number, factor, offset, where)
-    _check_vacuum(value, _split_level(unit)[1], text, where)
-    _check_absolute_zero(value, unit_text, text, where)
+    try:
+        value = float(number) if "inf" in number else float(Fraction(number) * factor + offset)
+    except OverflowError:
+        told = f"{_place_prefix(where)}{number} is larger than any number that is measured"
+        raise UnitError(told) from None
+    floor = {"a": 0.0, "g": -_gauge_zero.get()}.get(_split_level(unit)[1], -math.inf)
+    message = f"{_place_prefix(where)}{text!r} lies below vacuum; check (a) and (g)"
+    require(value >= floor or value == -math.inf, message, UnitError)
+    # a temperature on a scale of its own, as degC, lies above 0 K; in K it may be a difference
+    message = f"{_place_prefix(where)}{text!r} lies below absolute zero, -273.15 degC; check sign and unit"
+    require(value >= 0 or not _parse_unit(_split_level(unit_text)[0]).offset, message, UnitError)
     return value
 
 
 def read_si(text: str | float, *, where: str = "") -> float:
-    """Read one number in the SI unit of its own dimension, where no other is known; gauge levels become absolute.
-
-    Parameters
-    ----------
-    text : str or float
-        "5 kg"; a pressure has to be a level, "6.3 bar(g)".
-    where : str
-        What the message of an error begins with.
-
-    Raises
-    ------
-    UnitError
-        If the number cannot be read, or a pressure does not say whether it is absolute or gauge.
+    """Read one number in the SI unit of its own dimension; a pressure has to be a level, and gauge becomes absolute.
 
     Examples
     --------
@@ -106,7 +88,8 @@ def read_si(text: str | float, *, where: str = "") -> float:
     base = _split_level(unit_text or "1")[0]
     if _parse_unit(base, where).dimension == _parse_unit("Pa").dimension:
         return read_value(text, "Pa(a)", where=where)
-    return read_value(text, _base_unit(base), where=where)
+    powers = _parse_unit(base).dimension
+    return read_value(text, "*".join(f"{name}**({power})" for name, power in powers) or "1", where=where)
 
 
 @contextmanager
@@ -127,25 +110,7 @@ def count_gauge_from(pressure: float) -> Iterator[None]:
 
 
 def si_conversion(unit_text: str, unit: str, *, where: str = "") -> tuple[float, float]:
-    """Find the factor and offset that bring a column of raw numbers to SI: ``si = factor * raw + offset``.
-
-    Parameters
-    ----------
-    unit_text : str
-        The column's unit: "mm", "bar(g)".
-    unit : str
-        The SI unit wanted, as for `read_value`.
-    where : str
-        What the message of an error begins with.
-
-    Returns
-    -------
-    factor, offset : float
-
-    Raises
-    ------
-    UnitError
-        If the unit is unknown or of another dimension, or a level does not say whether it is absolute or gauge.
+    """Find factor and offset that bring a column of raw numbers to SI: ``si = factor * raw + offset``.
 
     Examples
     --------
@@ -187,15 +152,6 @@ def is_unit(text: str) -> bool:
 def write_value(value: float, unit: str, digits: int = 6) -> str:
     """Write an SI number with a unit that reads well; `read_value` reads it back to the digits given.
 
-    Parameters
-    ----------
-    value : float
-        In `unit`.
-    unit : str
-        SI unit.
-    digits : int
-        Significant digits.
-
     Examples
     --------
     >>> write_value(0.032, "m"), write_value(701325.0, "Pa(a)"), write_value(0.3, "1")
@@ -207,6 +163,28 @@ def write_value(value: float, unit: str, digits: int = 6) -> str:
     factor, offset = _exact_conversion(shown, unit, "")
     number = float((Fraction(value) - offset) / factor) if math.isfinite(value) else value
     return f"{number:.{digits}g}" + ("" if unit == "1" else f" {shown}")
+
+
+def unit_ratio(numerator: str, denominator: str) -> str:
+    """Divide two unit texts and simplify; a level such as "Pa(a)" counts as a difference.
+
+    Examples
+    --------
+    >>> unit_ratio("V", "m/s"), unit_ratio("V", "m/s*s"), unit_ratio("1", "Pa(g)")
+    ('V*s/m', 'V/m', '1/Pa')
+    """
+    powers = _unit_powers(difference_unit(numerator))
+    for name, power in _unit_powers(difference_unit(denominator)).items():
+        powers[name] = powers.get(name, 0) - power
+    above = [_unit_factor(n, k) for n, k in powers.items() if k > 0]
+    below = [_unit_factor(n, -k) for n, k in powers.items() if k < 0]
+    divisor = "*".join(below) if len(below) < 2 else f"({'*'.join(below)})"
+    return ("*".join(above) or "1") + (f"/{divisor}" if below else "")
+
+
+def difference_unit(unit: str) -> str:
+    """The unit of a difference: a pressure level loses its mark, "Pa(g)" becomes "Pa"."""
+    return re.sub(r"\([ag]\)", "", unit)
 
 
 class _UnitScale(NamedTuple):
@@ -241,9 +219,11 @@ def _exact_conversion(unit_text: str, unit: str, where: str) -> tuple[Fraction, 
     (base, level), (target, target_level) = _split_level(unit_text), _split_level(unit)
     source, goal = _parse_unit(base, where), _parse_unit(target, where)
     if source.dimension != goal.dimension:
-        raise UnitError(
-            f"{_place_prefix(where)}unit {unit_text!r} does not measure {unit!r}; {_remedy(source, goal, unit)}"
-        )
+        rates = [_parse_unit(rate).dimension for rate in ("Hz", "rad/s", "1/s")]
+        remedy = f'write for instance "{_example_unit(unit)}"'
+        if source.dimension in rates and goal.dimension in rates:
+            remedy = f"write it in {unit} (1 Hz is 2 pi rad/s; pneuopt does not choose for you)"
+        raise UnitError(f"{_place_prefix(where)}unit {unit_text!r} does not measure {unit!r}; {remedy}")
     if target_level and not level:
         raise UnitError(
             f"{_place_prefix(where)}a pressure level in {unit_text!r} may be absolute or gauge; "
@@ -258,31 +238,9 @@ def _exact_conversion(unit_text: str, unit: str, where: str) -> tuple[Fraction, 
     return source.factor / goal.factor, (source.offset - goal.offset + shift) / goal.factor
 
 
-def _convert(number: str, factor: Fraction, offset: Fraction, where: str) -> float:
-    try:
-        return float(number) if "inf" in number else float(Fraction(number) * factor + offset)
-    except OverflowError:
-        raise UnitError(f"{_place_prefix(where)}{number} is larger than any number that is measured") from None
-
-
 def _split_level(unit_text: str) -> tuple[str, str]:
     match = _PRESSURE_LEVEL.fullmatch(unit_text)
     return (match[1], match[2]) if match else (unit_text, "")
-
-
-def _check_vacuum(value: float, level: str, text: str | float, where: str) -> None:
-    floor = {"a": 0.0, "g": -_gauge_zero.get()}.get(level, -math.inf)
-    require(
-        value >= floor or value == -math.inf,
-        f"{_place_prefix(where)}{text!r} lies below vacuum; check (a) and (g)",
-        UnitError,
-    )
-
-
-def _check_absolute_zero(value: float, unit_text: str, text: str | float, where: str) -> None:
-    """Refuse a temperature on a scale of its own, as degC, below 0 K; in K it may be a difference."""
-    message = f"{_place_prefix(where)}{text!r} lies below absolute zero, -273.15 degC; check sign and unit"
-    require(value >= 0 or not _parse_unit(_split_level(unit_text)[0]).offset, message, UnitError)
 
 
 def _parse_unit(unit_text: str, where: str = "") -> _UnitScale:
@@ -317,18 +275,6 @@ def _registry() -> Any:
     return registry
 
 
-def _base_unit(unit_text: str) -> str:
-    powers = _parse_unit(unit_text).dimension
-    return "*".join(f"{name}**({power})" for name, power in powers) or "1"
-
-
-def _remedy(source: _UnitScale, goal: _UnitScale, unit: str) -> str:
-    rates = [_parse_unit(rate).dimension for rate in ("Hz", "rad/s", "1/s")]
-    if source.dimension in rates and goal.dimension in rates:
-        return f"write it in {unit} (1 Hz is 2 pi rad/s; pneuopt does not choose for you)"
-    return f'write for instance "{_example_unit(unit)}"'
-
-
 def _example_unit(unit: str) -> str:
     return {"Pa(a)": "bar(a)", "Pa(g)": "bar(g)", "1": "%"}.get(unit, unit)
 
@@ -341,6 +287,26 @@ def _suggest_unit(unit_text: str) -> str:
 
 def _place_prefix(where: str) -> str:
     return f"{where}: " if where else ""
+
+
+def _unit_factor(name: str, power: int) -> str:
+    return name if power == 1 else f"{name}^{power}"
+
+
+def _unit_powers(unit: str) -> dict[str, int]:
+    powers: dict[str, int] = {}
+    rest = "*" + unit.replace(" ", "")
+    while rest:
+        match = re.match(r"([*/])(?:\(([^()]*)\)|([^\W\d_]+|%|1)(?:\^(-?\d+))?)", rest)
+        if match is None:
+            raise UnitError(f"cannot read the unit {unit!r}; write it like 'V*s/m' or 'm^3/(s*Pa)'")
+        sign = 1 if match[1] == "*" else -1
+        factors = _unit_powers(match[2]) if match[2] else {match[3]: int(match[4] or 1)}
+        for name, power in factors.items():
+            if name != "1":
+                powers[name] = powers.get(name, 0) + sign * power
+        rest = rest[match.end() :]
+    return powers
 
 
 UNIT_DEFINITIONS = """
@@ -402,45 +368,3 @@ cm^2 cm^3 l N*s/m V*s/m 1/s m^3/(s*Pa) % count kg*m^2 N*m rev N*m*s/rad newton v
 Pa(a) Pa(g) kPa(a) kPa(g) MPa(a) MPa(g) bar(a) bar(g) mbar(a) mbar(g) psi(a) psi(g)
 """
 """The units that a message may suggest."""
-
-
-def unit_ratio(numerator: str, denominator: str) -> str:
-    """Divide two unit texts and simplify; a level such as "Pa(a)" counts as a difference.
-
-    Examples
-    --------
-    >>> unit_ratio("V", "m/s"), unit_ratio("V", "m/s*s"), unit_ratio("1", "Pa(g)")
-    ('V*s/m', 'V/m', '1/Pa')
-    """
-    powers = _unit_powers(difference_unit(numerator))
-    for name, power in _unit_powers(difference_unit(denominator)).items():
-        powers[name] = powers.get(name, 0) - power
-    above = [_unit_factor(n, k) for n, k in powers.items() if k > 0]
-    below = [_unit_factor(n, -k) for n, k in powers.items() if k < 0]
-    divisor = "*".join(below) if len(below) < 2 else f"({'*'.join(below)})"
-    return ("*".join(above) or "1") + (f"/{divisor}" if below else "")
-
-
-def difference_unit(unit: str) -> str:
-    """The unit of a difference: a pressure level loses its mark, "Pa(g)" becomes "Pa"."""
-    return re.sub(r"\([ag]\)", "", unit)
-
-
-def _unit_factor(name: str, power: int) -> str:
-    return name if power == 1 else f"{name}^{power}"
-
-
-def _unit_powers(unit: str) -> dict[str, int]:
-    powers: dict[str, int] = {}
-    rest = "*" + unit.replace(" ", "")
-    while rest:
-        match = re.match(r"([*/])(?:\(([^()]*)\)|([^\W\d_]+|%|1)(?:\^(-?\d+))?)", rest)
-        if match is None:
-            raise UnitError(f"cannot read the unit {unit!r}; write it like 'V*s/m' or 'm^3/(s*Pa)'")
-        sign = 1 if match[1] == "*" else -1
-        factors = _unit_powers(match[2]) if match[2] else {match[3]: int(match[4] or 1)}
-        for name, power in factors.items():
-            if name != "1":
-                powers[name] = powers.get(name, 0) + sign * power
-        rest = rest[match.end() :]
-    return powers

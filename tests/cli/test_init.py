@@ -19,7 +19,7 @@ from pneuopt.files.keys import KeyRow, list_keys
 from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_study
 from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning
-from pneuopt.logs.guess import Question
+from pneuopt.logs.columns import Question
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import InputError

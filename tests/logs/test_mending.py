@@ -85,7 +85,7 @@ def test_several_rows_are_counted(tmp_path: Path) -> None:
 
 def test_a_misspelt_column_is_taken_for_its_channel(tmp_path: Path) -> None:
     path = write(tmp_path, [LINES[0].replace("position", "postion"), *LINES[1:]])
-    with pytest.raises(LogError, match="looks like the channel 'position'"):
+    with pytest.raises(LogError, match="'position'"):
         read_log(path)
     mended = mend_log(path)
     assert mended.changes == ("column 'postion [mm]' is read as the channel 'position'",)
@@ -98,7 +98,7 @@ def test_a_decimal_comma_is_no_fault(tmp_path: Path) -> None:
 
 
 def test_two_recordings_in_a_file_are_not_mended(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="300 of 600 rows would be left out"):
+    with pytest.raises(LogError, match="300 of 600 rows"):
         mend_log(write(tmp_path, [*LINES, *LINES[1:]]))
 
 

@@ -1,4 +1,4 @@
-"""Entries that a key takes, and the words of `read_table` for those that it does not take, which all files share."""
+"""Entries that a key takes; the words for those that it does not take, which all files share, are in test_messages."""
 
 from enum import Enum
 from typing import Any
@@ -48,32 +48,6 @@ READ = {
     "own": (7, (7, "f.toml: [part] own", "V")),
     "inner": ({"gain": "1 mV"}, {"gain": 1e-3}),
 }
-REFUSED = [
-    ({"nam": "left"}, "f.toml: [part]: unknown key 'nam'; did you mean 'name'?"),
-    ({"name": 3}, "f.toml: [part] name must be text, got 3; write name = \"left\""),
-    ({"softly": 1}, "f.toml: [part] softly must be true or false, got 1"),
-    ({"shape": "sin"}, "f.toml: [part]: unknown shape 'sin'; did you mean 'sine'?"),
-    ({"shape": ["sine"]}, "f.toml: [part] shape must be text, got ['sine']"),
-    ({"shapes": "sine"}, "f.toml: [part] shapes must be a list, got 'sine'"),
-    ({"shapes": ["sin"]}, "f.toml: [part] shapes: unknown shape 'sin'; did you mean 'sine'?"),
-    ({"count": True}, "f.toml: [part] count must be a whole number, got True"),
-    ({"count": 1}, "f.toml: [part] count must be from 2 to 9, got 1"),
-    ({"count": 10}, "f.toml: [part] count must be from 2 to 9, got 10"),
-    ({"seed": -1}, "f.toml: [part] seed must be at least 0, got -1"),
-    ({"weight": 0}, "f.toml: [part] weight must be positive, got 0"),
-    ({"weight": float("inf")}, "f.toml: [part] weight"),
-    ({"share": "100 %"}, "f.toml: [part] share must be above 0 and below 1, got 100 %"),
-    ({"delay": "2 ms"}, "f.toml: [part] delay: '2 ms' is no number of samples; write delay = \"1 sample\""),
-    ({"limits": ["1 V"]}, "f.toml: [part] limits must be a list of 2, got ['1 V']; write limits = [\"-5 V\", \"5 V\"]"),
-    ({"limits": ["1 V", "2 m"]}, "f.toml: [part] limits: unit 'm' does not measure 'V'"),
-    ({"move": {"speed": "1 m/s"}}, 'f.toml: [part] move has no distance; write distance = "..."'),
-    ({"move": "1 m"}, "f.toml: [part] move: unit 'm' does not measure 'V'"),
-    ({"moves": []}, "f.toml: [part] moves must be a list of 1 to 9, got []"),
-    ({"moves": ["1 V", {}]}, 'f.toml: [part] moves 2 has no distance; write distance = "..."'),
-    ({"inner": {"gian": 1}}, "f.toml: [part] inner: unknown key 'gian'; did you mean 'gain'?"),
-    ({"inner": {"gain": "1 A"}}, "f.toml: [part] inner gain: unit 'A' does not measure 'V'"),
-    ({"inner": 3}, "f.toml: [part] inner must be a table, got 3"),
-]  # fmt: skip
 
 
 def read(entries: dict[str, Any], **options: Any) -> dict[str, Any]:
@@ -90,13 +64,6 @@ def test_an_entry_is_read_as_its_key_declares_it(name: str) -> None:
     entry, value = READ[name]
     value = ({"distance": 3.0, "speed": None}, {"distance": 1.0, "speed": 1e-3}) if name == "moves" else value
     assert read({name: entry})[name] == value
-
-
-@pytest.mark.parametrize(("entries", "said"), REFUSED)
-def test_what_a_key_does_not_take_is_refused_by_its_place(entries: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError) as error:
-        read(entries)
-    assert str(error.value).startswith(said)
 
 
 def test_a_required_key_is_asked_for_with_what_it_may_say() -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import stat
 from io import StringIO
 from pathlib import Path
@@ -34,10 +35,6 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
         write_text(path, "half of it \ud800")
     assert path.read_bytes() == b"after\n"
     assert [p.name for p in tmp_path.iterdir()] == ["out.toml"]
-    with pytest.raises(InputError, match="the folder does not exist; make it first"):
-        write_text(tmp_path / "none" / "out.toml", "")
-    with pytest.raises(InputError, match="is a folder; name a file in it"):
-        write_text(tmp_path, "")
 
 
 def test_records_are_plain_json(tmp_path: Path) -> None:
@@ -66,14 +63,10 @@ def test_outputs_are_refused_before_the_work(tmp_path: Path) -> None:
     given = tmp_path / "drive.toml"
     given.touch()
     check_output_paths([tmp_path / "fit.toml", None, tmp_path / "fit.json"], [given])
-    with pytest.raises(InputError, match=r"drive\.toml: is an input of this command"):
-        check_output_paths([tmp_path / "." / "drive.toml"], [given])
-    with pytest.raises(InputError, match="named for two outputs"):
-        check_output_paths([tmp_path / "a", tmp_path / "a"], [given])
-    with pytest.raises(InputError, match="the folder does not exist"):
-        check_output_paths([tmp_path / "none" / "a"], [given])
-    with pytest.raises(InputError, match="is a folder"):
-        check_output_paths([tmp_path], [given])
+    taken, folder = [tmp_path / "a", tmp_path / "a"], [tmp_path]
+    for outputs in ([tmp_path / "." / "drive.toml"], taken, [tmp_path / "none" / "a"], folder):
+        with pytest.raises(InputError, match=re.escape(str(outputs[0]))):
+            check_output_paths(outputs, [given])
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links, modes and pipes are POSIX")
@@ -104,18 +97,12 @@ def test_a_pipe_and_a_device_are_never_replaced(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     (tmp_path / "null").symlink_to("/dev/null")
     for path in (pipe, tmp_path / "null", Path("/dev/null")):
-        with pytest.raises(InputError, match="is a pipe or a device, no file; name a file"):
+        with pytest.raises(InputError, match=re.escape(str(path))):
             write_text(path, "x")
-        with pytest.raises(InputError, match="is a pipe or a device, no file; name a file"):
+        with pytest.raises(InputError, match=re.escape(str(path))):
             check_output_paths([path], [])
     assert stat.S_ISFIFO(pipe.lstat().st_mode)
     assert stat.S_ISCHR(Path("/dev/null").lstat().st_mode)
-
-
-@pytest.mark.parametrize(("name", "said"), [("x" * 300, "File name too long"), ("a\0b", r"a\\x00b: cannot be written")])
-def test_a_name_that_no_file_can_have_is_refused_before_the_work(name: str, said: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=said):
-        check_output_paths([tmp_path / name], [])
 
 
 def test_a_name_of_250_characters_is_written(tmp_path: Path) -> None:
@@ -131,7 +118,7 @@ def test_a_write_protected_file_is_left_alone(tmp_path: Path, monkeypatch: pytes
     path.write_text("kept")
     allowed = os.access
     monkeypatch.setattr(os, "access", lambda p, mode: Path(p) != path.resolve() and allowed(p, mode))  # root may all
-    with pytest.raises(InputError, match="is write-protected; choose another name, or unlock it"):
+    with pytest.raises(InputError, match=r"fit\.toml"):
         write_text(path, "lost")
     assert path.read_text() == "kept"
 
@@ -144,7 +131,7 @@ def test_a_disk_that_is_full_leaves_the_old_file_and_no_other(tmp_path: Path, mo
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError, match="cannot be written \\(No space left on device\\)"):
+    with pytest.raises(InputError, match="No space left on device"):
         write_text(path, "lost")
     assert [p.read_text() for p in tmp_path.iterdir()] == ["kept"]
 
@@ -160,35 +147,34 @@ def test_text_in_a_table_is_no_formula() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text",
     [
-        (b"a = " + b"[" * 3000 + b"]" * 3000, "too many brackets in brackets"),
-        (b"a = " + b"9" * 5000, "not valid TOML"),
-        (b"#" * (MAX_TOML_BYTES + 1), "is larger than 128 KiB"),
-        (b"a = \xff", "not a text file in UTF-8"),
-        (b"a = 1\na = 2", "not valid TOML"),
-        (b"a = 1979-99-99", "not valid TOML"),
+        b"a = " + b"[" * 3000 + b"]" * 3000,
+        b"a = " + b"9" * 5000,
+        b"#" * (MAX_TOML_BYTES + 1),
+        b"a = \xff",
+        b"a = 1\na = 2",
+        b"a = 1979-99-99",
     ],
+    ids=["nested", "long number", "large", "encoding", "twice", "date"],
 )
-def test_toml_that_a_parser_chokes_on_is_refused_in_one_line(text: bytes, said: str, tmp_path: Path) -> None:
+def test_toml_that_a_parser_chokes_on_is_refused_in_one_line(text: bytes, tmp_path: Path) -> None:
     path = tmp_path / "drive.toml"
     path.write_bytes(text)
-    with pytest.raises(InputError, match=said) as refused:
+    with pytest.raises(InputError) as refused:
         read_toml(path)
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < len(str(path)) + 300
 
 
 def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
-    for path, said in [(tmp_path, "cannot be read"), (Path("a\0b"), r"a\\x00b: cannot be read")]:
-        with pytest.raises(InputError, match=said):
+    for path in (tmp_path, Path("a\0b"), Path("x" * 300)):
+        with pytest.raises(InputError):
             read_toml(path)
-    with pytest.raises(InputError, match="File name too long"):
-        read_toml("x" * 300)
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "pipe")
         for path in (tmp_path / "pipe", Path("/dev/zero")):
-            with pytest.raises(InputError, match="is a pipe or a device; give the name of a file"):
+            with pytest.raises(InputError, match=re.escape(str(path))):
                 read_source(path, 10, "")
 
 
@@ -202,7 +188,7 @@ def test_a_file_that_moves_or_changes_during_a_command_is_read_once(tmp_path: Pa
         path.unlink()
         with read_once():  # a part of the command sees what the command has read
             assert read_toml_source(path) == b"a = 1"
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError):
         read_toml_source(path)
     with read_once(sources):  # another process
         assert read_toml_source(path) == b"a = 1"
