@@ -1,12 +1,8 @@
 """The commands `pneuopt init | check | identify | tune | certify | export | ...`, as `pneuopt --help` has them.
 
-Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 70 an
-error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated. Each command imports what it
-needs, so that `--help` waits for no heavy import.
-
-What `pneuopt --help` says of each command in a line, and the examples and pointers below a command's own help.
-
-Options that several commands have.
+First their help and the options that several have, then the commands. Each imports what it needs, so that `--help`
+waits for no heavy import. Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never
+settles), 2 bad input, 70 an error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated.
 """
 
 from collections.abc import Callable

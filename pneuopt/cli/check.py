@@ -53,13 +53,7 @@ def run_check(
 
 
 def _new_places(folder: Path, logs: Sequence[Path]) -> dict[Path, Path]:
-    """Where each mended log goes; no file that is there already is written over.
-
-    Raises
-    ------
-    InputError
-        If two logs have one name, or there is such a file.
-    """
+    """Where each mended log goes; no file that is there already is written over."""
     places: dict[Path, Path] = {}
     for log in logs:
         place = folder / f"{log.stem}.csv"

@@ -32,23 +32,7 @@ NO_CERTIFICATE = CertificateCheck(False, ("its gains were not written by pneuopt
 def run_export(
     fit: Path, tuned: Path, to: str, folder: Path, name: str, uncertified: bool, force: bool, span: str = ""
 ) -> int:
-    """Write the files and say which; returns the exit status.
-
-    Parameters
-    ----------
-    fit, tuned : Path
-    to : str
-        A `Language`, a `Block`, whose settings are shown, too, or "fmu", the plant.
-    folder : Path
-        Made where it is missing.
-    name : str
-    uncertified : bool
-        Whether gains without a certificate may be written.
-    force : bool
-        Whether old files may be replaced.
-    span : str
-        Of the process value as a block scales it, with its unit; "" for what the references take.
-    """
+    """Export as a `Language`, as a `Block`, which is also shown, or the plant, "fmu"; returns the exit status."""
     languages, blocks = {kind.value: kind for kind in Language}, {kind.value: kind for kind in Block}
     _check_form(to, [*languages, *blocks, FMU])
     scaled = Block.ROCKWELL.value

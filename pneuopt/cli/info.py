@@ -1,7 +1,4 @@
-"""`pneuopt info`: what is installed, the compiler and its cache, a self-check and the speed.
-
-The command `keys`: what stands in which file, and in what --json writes.
-"""
+"""`pneuopt info`, what is installed and how fast it is, and `pneuopt keys`, what stands in the files."""
 
 import difflib
 import os
@@ -98,13 +95,7 @@ def run_outputs(markdown: bool) -> int:
 
 
 def find_keys(word: str | None) -> Sequence[KeyRow]:
-    """Rows of the list by a word: of a file, a section, a key or its meaning; those with that very name come first.
-
-    Raises
-    ------
-    InputError
-        If there is no such row.
-    """
+    """Rows of the list by a word: of a file, a section, a key or its meaning; those with that very name come first."""
     rows = list_keys()
     if word is None:
         return rows

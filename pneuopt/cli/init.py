@@ -1,7 +1,4 @@
-"""The command `init`: the first files of a new user, each whole or not at all, none over an old one.
-
-`pneuopt init --run`: a run of moves to play, from whose log a drive is identified.
-"""
+"""`pneuopt init`: the first files of a new user, none over an old one; with --run, moves to play and to log."""
 
 import os
 import sys
@@ -64,21 +61,7 @@ class Asker:
 
 
 def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], log: Path | None, force: bool) -> int:
-    """Write the files and say which.
-
-    Parameters
-    ----------
-    kind : str, optional
-        Without it, as the log's channels say.
-    folder : Path
-        Made where it is missing.
-    parts : mapping of str to str or None
-        "size", "cylinder" and "valve" of the catalogue.
-    log : Path, optional
-        Whose sidecar is filled.
-    force : bool
-        Whether old files may be replaced; without it those that stand beside another log's sidecar are kept.
-    """
+    """Write the files of a kind of drive, by default the one that the log's channels show; returns the exit status."""
     table = None if log is None else read_table(log, read_bytes(log))
     guessed = None if table is None or kind is not None else _guess_kind(table)
     message = f"say what drives the load: pneuopt init KIND, one of {', '.join(first_kinds())}"
@@ -119,13 +102,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
 
 
 def write_files(files: Mapping[Path, str], force: bool) -> None:
-    """Write files, all or none: an old one with another text is refused, unless forced.
-
-    Raises
-    ------
-    InputError
-        Before the first is written, if one of them may not or cannot be.
-    """
+    """Write files, all or none: an old one with another text is refused, unless forced."""
     for path, text in files.items():
         is_new = force or not path.exists() or (path.is_file() and path.read_bytes() == text.encode())
         require(is_new, f"{path}: is there already, and stays as it is; --force replaces it, -o names another folder")
@@ -245,20 +222,7 @@ class RunOptions:
 
 
 def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, unused: Mapping[str, object]) -> int:
-    """Write the run's files and say what it is for, how long it takes and what to log.
-
-    Parameters
-    ----------
-    drive : Path
-        The drive's file.
-    folder : Path
-        Made where it is missing.
-    options : RunOptions
-    force : bool
-        Whether old files may be replaced.
-    unused : mapping of str to object
-        Options of `pneuopt init` that have no sense here, by their names; None where they are not given.
-    """
+    """Write a run's files, and show how long it takes and what to log; `unused` are options that it does not take."""
     given = ", ".join(n for n, value in unused.items() if value is not None)
     require(not given, f"--run reads the drive from its file: leave out {given}")
     model, parameters = read_drive(drive)

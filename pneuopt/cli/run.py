@@ -1,14 +1,10 @@
-"""`run_guarded`: the last that stands between a command and the user: streams that fail, signals, unforeseen errors.
+"""`run_guarded`: runs the command line and survives streams that fail, signals and unforeseen errors.
 
-It imports nothing but the standard library, so that it listens from the first moment on.
-
-Ctrl-C, SIGTERM and the closing of the terminal: a command ends soon, with the best so far, and its files whole.
-
-The first signal raises KeyboardInterrupt, after which a command only writes what it has. A second one within
-`PATIENCE` changes nothing, for many press twice; a later one ends the process at once. Where the main thread is in
-foreign code that hears no signal, another thread ends the process after `PATIENCE`.
-
-How a command ends: the exit statuses of `pneuopt`, which scripts may rely on.
+It imports nothing but the standard library, so that it listens from the first moment on. By Ctrl-C, SIGTERM or the
+closing of the terminal a command ends soon, with the best so far, and its files whole: the first signal raises
+KeyboardInterrupt, after which a command only writes what it has. A second one within `PATIENCE` changes nothing, for
+many press twice; a later one ends the process at once. Where the main thread is in foreign code that hears no signal,
+another thread ends the process after `PATIENCE`.
 """
 
 import errno
@@ -41,13 +37,7 @@ if TYPE_CHECKING:
 
 
 def run_guarded(load: Callable[[], Callable[[], object]]) -> NoReturn:
-    """Run the command line and end the process; never a traceback.
-
-    Parameters
-    ----------
-    load : callable
-        Imports the command line and returns it.
-    """
+    """Run the command line that `load` imports, and end the process; never with a traceback."""
     streams = _guard_streams()
     listen_to_signals()
     status = _run(load)
@@ -61,12 +51,7 @@ def run_guarded(load: Callable[[], Callable[[], object]]) -> NoReturn:
 
 
 class LastingFile(io.FileIO):
-    """A stream that may fail: what cannot be written is dropped and the reason kept, so that the work is not lost.
-
-    Attributes
-    ----------
-    error : OSError or None
-    """
+    """A stream that may fail: what cannot be written is dropped and the reason kept, so that the work is not lost."""
 
     error: OSError | None = None
 

@@ -1,7 +1,4 @@
-"""What the commands share: their input, and the files they write once everything is computed.
-
-The terminal: a progress line, reports in colour, and the files that were written.
-"""
+"""What the commands share: the files they read, those they write once everything is computed, and the terminal."""
 
 import hashlib
 import math
@@ -54,12 +51,7 @@ INTERRUPTED_STEM = "interrupted"
 
 @dataclass(frozen=True)
 class Outputs:
-    """The files that are wanted; `check` refuses early those that could not be written.
-
-    Attributes
-    ----------
-    output, json, plot, report : Path or None
-    """
+    """The files that are wanted; `check` refuses early those that could not be written."""
 
     output: Path | None
     json: Path | None
@@ -93,28 +85,6 @@ def finish(
 
     Each file is tried, whatever becomes of the others. An interrupted command draws no figures, and replaces no file:
     its own stand beside those that are there.
-
-    Parameters
-    ----------
-    outputs : Outputs
-    writers : mapping of Path to callable
-        How to write each file but the JSON and the figures.
-    tables : mapping of str to object
-        What the JSON file holds.
-    status : Status or None
-    figures : callable, optional
-        Draws the figures, by the name that is added to the path of the first, which has none.
-    report : Report, optional
-        What is shown of the result.
-    page : callable, optional
-        Makes the page that --report writes; of an interrupted command without figures.
-    hints : sequence of str
-        What may come next, a command a line; shown where the command has met what was asked.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
     """
     ended = {"status": {"code": status.code.value, "message": status.message}} if status else {}
     if outputs.json is not None:
@@ -139,14 +109,7 @@ def finish(
 
 
 def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], list[InputError]]:
-    """Try to write each file, with no interruption within; those that are written, and why others are not.
-
-    Parameters
-    ----------
-    writers : mapping of Path to callable
-    beside : bool
-        Whether a file that is there already stays, and the new one gets a name of its own.
-    """
+    """Try to write each file without interruption; `beside` one that is there already, under a name of its own."""
     written, failures = list[Path](), list[InputError]()
     with without_interruption():
         for path, write in writers.items():
@@ -262,20 +225,7 @@ def make_console(*, error: bool = False) -> Console:
 
 @contextmanager
 def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
-    """Show the latest report and the time: in one line of a terminal, elsewhere in a line every few seconds.
-
-    Parameters
-    ----------
-    label : str
-        Shown until there is a report.
-    quiet : bool
-        Show nothing.
-
-    Yields
-    ------
-    callable
-        Takes a line of text.
-    """
+    """Yield a function that shows a line of news and the time: in place on a terminal, else every few seconds."""
     console = make_console(error=True)
     if quiet:
         yield lambda _: None

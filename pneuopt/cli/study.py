@@ -1,14 +1,6 @@
-"""`pneuopt study`: a loop certified over a grid of parameters or other cases; a front is in `study_front`.
+"""`pneuopt study`: a loop over a grid or other cases, a front between two requirements, or which tolerances matter.
 
-`pneuopt study` with a [pareto]: a loop tuned along a front between two requirements.
-
-The pages that `pneuopt study --report` writes: of cases, of a sensitivity, and of a Pareto front.
-
-`pneuopt study` with a [sensitivity]: which tolerances matter for a design.
-
-What a study shows: its cases, or the designs of a front.
-
-How the cases of a study are computed and kept, as the options of `pneuopt study` say it.
+`run_study` chooses; then how cases are computed and kept, the three kinds of study, and what they share on the screen.
 """
 
 import math
@@ -106,240 +98,12 @@ if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure
 
 
-def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
-    """Tune a loop along a front between two requirements; returns the exit status."""
-    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning)
-    front_spec = read_pareto(study, bound_units(task.loop))
-    first, second, until = _front_requirements(study, front_spec, task)
-    free = task.parameters.free_names
-    require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
-    with progress("finding the front's ends", quiet=quiet) as report_progress:
-        front = pareto_front(
-            task.loop,
-            task.references,
-            parameters,
-            minimise=(first, second),
-            subject_to=[q for q in task.specification.limits if metric_name(q) != metric_name(second)],
-            scenarios=task.scenarios(parameters),
-            points=front_spec.points,
-            until=until,
-            max_steps=task.max_steps,
-            progress=report_progress,
-        )
-    front, known = _convert_to_percent(front, first, second), metric_units(task.loop)
-    pair, gains = (
-        {metric_name(q): known[metric_name(q)] for q in (first, second)},
-        {n: parameters[n].unit for n in front if n in free},
-    )
-    verdict, status = _front_verdict(front, pair)
-    report = lead_report(verdict, status) + report_front(front, pair, gains)
-    writers: Writers = {}
-    if outputs.output is not None:
-        claimed = {f"claimed {n}": unit for n, unit in pair.items()}
-        units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
-        writers[outputs.output] = table_writer(outputs.output, front, units)
-    hashes = file_hashes(study.path, study.drive, study.tuning)
-    tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}, "provenance": hashes}
-    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_front, front, pair)
-    page = partial(front_page, study, report, drawn, pair)
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    return status
-
-
-def _front_requirements(
-    study: Study, front_spec: Pareto, task: Tuning
-) -> tuple[Requirement, Requirement, float | None]:
-    """The two requirements, the second one bounded where the front begins, and its bound where the front ends."""
-    where = f"{study.path}: [pareto]"
-    given = {metric_name(q): q for q in (*task.specification.weights, *task.specification.limits)}
-    first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
-    ends = {"lower": front_spec.lower, "upper": front_spec.upper}
-    begin, end = ("lower", "upper") if second.metric.sense is Sense.AT_LEAST else ("upper", "lower")
-    start, until = ends[begin], ends[end]
-    loosest = second if start is None else construct_at(lambda: with_user_limit(second, start), f"{where} {begin}")
-    if until is not None:
-        tightest = construct_at(lambda: with_user_limit(second, until), f"{where} {end}")
-        side, unit = "below" if end == "lower" else "above", bound_units(task.loop)[front_spec.between[1]]
-        ends_at, begins_at = (write_value(user_limit(q) or math.inf, unit) for q in (tightest, loosest))
-        message = f"{where} {end}, {ends_at}, is not {side} the {begins_at} that {study.tuning} allows under [limits]"
-        require(upper_limit(tightest) < upper_limit(loosest), message)
-    return first, loosest, until
-
-
-def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, where: str) -> Requirement:
-    """The requirement of the tuning, with its bound; else one without a bound."""
-    kind: Any = REQUIREMENTS_BY_KEY[key]
-    if kind.__name__ in given:
-        return given[kind.__name__]
-    require(kind is not StepEnvelope, f"{where}: the tuning has no bounds for step_envelope; add them under [limits]")
-    plain: Requirement = SettlingTime(task.specification.band) if kind is SettlingTime else kind()
-    return plain
-
-
-def _front_verdict(front: "pd.DataFrame", pair: Mapping[str, str]) -> tuple[str, int]:
-    """How many designs are not certified, and the exit status."""
-    interrupted = int((front["error"] == INTERRUPTED_CASE).sum())
-    failed = int((front["error"] != "").sum()) - interrupted
-    parts = [f"{count} {what}" for count, what in ((interrupted, "interrupted"), (failed, "not certified")) if count]
-    status = EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if failed else EXIT_SUCCESS
-    one = " (one is best by both)" if len(front) == 1 and not parts else ""
-    what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
-    return f"{what}: {', '.join(parts) or 'all certified'}{one}", status
-
-
-def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":
-    """The front with figures as the metrics are shown, overshoot in percent."""
-    factors = {c: q.metric.factor for q in (first, second) for c in (metric_name(q), f"claimed {metric_name(q)}")}
-    factors["limit"] = second.metric.factor
-    return front.assign(**{c: factor * front[c] for c, factor in factors.items() if factor != 1})
-
-
 Design: TypeAlias = tuple[ClosedLoop, ParameterSet]
 """The loop of all cases, and its parameters."""
 
 
-def case_page(
-    study: Study,
-    report: Report,
-    draw: Callable[[], "Figure"],
-    axes: Mapping[str, str],
-    metrics: Mapping[str, str],
-    design: Design,
-) -> Page:
-    """The page of a study's cases; a map of one or two axes, or how other cases are distributed."""
-    alt = f"{', '.join(metrics)} over {' and '.join(axes)}, a cell or a point a case; what failed is marked."
-    if study.cases:
-        alt = f"Share of the cases that keep a bound, over the bound: {', '.join(metrics)}."
-    drawn = draw if study.cases or len(axes) <= MAX_MAP_AXES else None
-    shared = None if study.tune else design
-    return study_page(_page_source(study), report, drawn, what="Cases", alt=alt, design=shared)
-
-
-def front_page(study: Study, report: Report, draw: Callable[[], "Figure"], pair: Mapping[str, str]) -> Page:
-    """The page of a Pareto front."""
-    first, second = pair
-    alt = f"{first} of certified designs over {second}; limits at which none was certified are marked."
-    return study_page(_page_source(study), report, draw, what="Pareto front", alt=alt)
-
-
-def sensitivity_page(study: Study, report: Report, draw: Callable[[], "Figure"], design: Design) -> Page:
-    """The page of a study that asks which tolerances matter."""
-    alt = "Share of a metric's variance that each parameter brings, by itself and with others, as bars with intervals."
-    return study_page(_page_source(study), report, draw, what="Sensitivity", alt=alt, design=design)
-
-
-def _page_source(study: Study) -> Source:
-    """The title of a study's page, its hashes and warnings."""
-    files = (study.path, study.drive, study.tuning)
-    warnings = (*describe_status(read_fit(study.drive)), *describe_status(study.tuning))
-    title = f"Study of {study.drive.name} with {study.tuning.name}"
-    return Source(title, file_hashes(*files), warnings)
-
-
-def report_cases(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> Report:
-    """A study, a row a case; of many the worst, by the first metric; then the reasons of those that failed.
-
-    Parameters
-    ----------
-    table : DataFrame
-        A column an axis and a metric, and "error".
-    axes, metrics : mapping of str to str
-        The columns, and their units.
-    """
-    first = next(iter(metrics))
-    ordered = table.sort_values(first, ascending=larger_is_better(first), na_position="first", kind="stable")
-    shown, rows = table if len(table) <= MAX_CASE_ROWS else ordered.head(MAX_CASE_ROWS), []
-    for row in shown.to_dict(orient="records"):
-        figures = [metric_cell(m, row[m]) for m in metrics]
-        if row["error"]:
-            figures = ["failed" if row["error"] != INTERRUPTED_CASE else INTERRUPTED_CASE] + [""] * (len(metrics) - 1)
-        rows.append((*(format_number(row[n], 6) for n in axes), *figures))
-    heads = (f"{n}\n[{unit}]" if unit not in ("", "1") else n for n, unit in {**axes, **metrics}.items())
-    lines = []
-    if len(shown) < len(table):
-        lines.append(f"the {len(shown)} worst of {len(table)} cases by {first}; -o FILE writes all")
-    reasons = table["error"][~table["error"].isin(["", INTERRUPTED_CASE])].value_counts()
-    for reason, count in list(reasons.items())[:MAX_FAILURE_REASONS]:
-        lines.append(f"failed ({count} of {len(table)}): {reason}")
-    return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
-
-
-def report_checks(checks: "pd.DataFrame") -> Report:
-    """The certified cases of a batch: the largest difference a metric, and the cases in which lanes are refuted.
-
-    Parameters
-    ----------
-    checks : DataFrame
-        Of a `BatchEvaluation`.
-    """
-    rows = [(str(m), format_number(float(own["difference"].max()), 2)) for m, own in checks.groupby("metric")]
-    lines = [
-        Line(f"{row['case']}: {row['metric']} is {row['batch']:.6g} in the lanes, {row['certified']:.6g} certified")
-        for row in checks[~checks["agrees"]].head(MAX_FAILURE_REASONS).to_dict(orient="records")
-    ]
-    table = (
-        (Table((Column("metric"), Column("largest difference\nfrom the certificate")), tuple(rows)),) if rows else ()
-    )
-    left = "margins, stick-slip events and what comes after the horizon are not in the lanes: leave out batch for them"
-    return Report((*table, *lines, Line(left)))
-
-
-def report_front(table: "pd.DataFrame", requirements: Mapping[str, str], gains: Mapping[str, str]) -> Report:
-    """A front, a row a design, of those that are not certified the limit; then the reasons.
-
-    Parameters
-    ----------
-    table : DataFrame
-        A column a requirement and a gain, "limit" and "error".
-    requirements, gains : mapping of str to str
-        The two requirements, the limited one last, and the gains, with their units.
-    """
-    first, second = requirements
-    shown = dict(list(gains.items())[:MAX_GAIN_COLUMNS])
-    relation, rows = ">=" if larger_is_better(second) else "<=", []
-    for row in table.to_dict(orient="records"):
-        figures = [format_number(row[n], 4) for n in (first, second)]
-        if row["error"]:
-            word = INTERRUPTED_CASE if row["error"] == INTERRUPTED_CASE else "failed"
-            figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {format_number(row['limit'], 4)}"]
-        rows.append((*figures, *(_format_gain(row[n]) for n in shown)))
-    heads = [_narrow_heading(n, unit) for n, unit in {**requirements, **shown}.items()]
-    lines = [f"{len(shown)} of {len(gains)} gains; -o FILE writes all"] if len(shown) < len(gains) else []
-    failed = table[~table["error"].isin(["", INTERRUPTED_CASE])].to_dict(orient="records")
-    lines += [f"failed ({second} {relation} {format_number(row['limit'], 4)}): {row['error']}" for row in failed]
-    return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
-
-
-def lead_report(verdict: str, status: int) -> Report:
-    """The verdict as a report."""
-    return Report((Line(verdict, Tone.BAD if status else Tone.GOOD),))
-
-
-def table_writer(path: Path, table: "pd.DataFrame", units: Mapping[str, str]) -> Callable[[Path], None]:
-    """What writes a table with units in its header: as Parquet where the file to be is called so, else as CSV."""
-    named = table.rename(columns={n: heading(n, unit) for n, unit in units.items()})
-    if path.suffix.lower() == PARQUET:
-        columns = {str(n): named[n].tolist() for n in named}
-        return partial(write_bytes, content=parquet_bytes(columns))
-    return partial(write_text, text=format_table(named))
-
-
-def heading(name: str, unit: str) -> str:
-    """A column's name with its unit, "SettlingTime [s]"."""
-    return f"{name} [{unit}]" if unit else name
-
-
-def _format_gain(value: float) -> str:
-    """Four digits, as gains are rounded, and no exponent where it is the longer one: 68130."""
-    return f"{float(format_number(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else format_number(value, 4)
-
-
-def _narrow_heading(column: str, unit: str) -> str:
-    """A heading in narrow lines, "Peak / Control / [V]" or "pid. / Kp / [V*s/m]"."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", column)
-    return words if unit in ("", "1") else f"{words}\n[{unit}]"
+# Columns of a study that tunes: its objective, and the word before the name of a gain that was found.
+OBJECTIVE, FOUND = "objective", "found"
 
 
 SO_FAR = "so_far"
@@ -348,22 +112,12 @@ SO_FAR = "so_far"
 
 @dataclass(frozen=True)
 class Computing:
-    """How the cases of a study are computed.
+    """How the cases of a study are computed."""
 
-    Attributes
-    ----------
-    executor : str
-        As for `open_executor`; empty: one process a CPU.
-    seconds, megabytes : float
-        What a case may take.
-    resume : bool
-        Whether there must be a journal of this study.
-    """
-
-    executor: str = ""
-    seconds: float = math.inf
+    executor: str = ""  # as for `open_executor`; empty: one process a CPU
+    seconds: float = math.inf  # what a case may take
     megabytes: float = math.inf
-    resume: bool = False
+    resume: bool = False  # whether there must be a journal of this study
 
     @contextmanager
     def open(self) -> Iterator[Executor | Processes]:
@@ -376,6 +130,18 @@ class Computing:
         require(here, f"--time-limit and --memory-limit hold in processes of this machine, not on {self.executor}")
         with open_executor(self.executor) as executor:
             yield replace(limits, count=executor.count) if isinstance(executor, Processes) else executor
+
+
+def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -> int:
+    """Compute what a study.toml asks for, a grid, other cases or a front; returns the exit status."""
+    study = read_study(file)
+    outputs.check([file, study.drive, study.tuning])
+    if study.sensitivity is not None:
+        return run_sensitivity(study, outputs, quiet, computing)
+    if study.pareto is None:
+        return run_cases(study, outputs, quiet, computing)
+    require(computing == Computing(), f"{file}: a front is one search after another: it takes no option of cases")
+    return run_front(study, outputs, quiet)
 
 
 @contextmanager
@@ -400,22 +166,6 @@ def keep_cases(
         for problem in (journal.problem, rows.problem if rows else ""):
             if problem:
                 warn(problem)
-
-
-# Columns of a study that tunes: its objective, and the word before the name of a gain that was found.
-OBJECTIVE, FOUND = "objective", "found"
-
-
-def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -> int:
-    """Compute what a study.toml asks for, a grid, other cases or a front; returns the exit status."""
-    study = read_study(file)
-    outputs.check([file, study.drive, study.tuning])
-    if study.sensitivity is not None:
-        return run_sensitivity(study, outputs, quiet, computing)
-    if study.pareto is None:
-        return run_cases(study, outputs, quiet, computing)
-    require(computing == Computing(), f"{file}: a front is one search after another: it takes no option of cases")
-    return run_front(study, outputs, quiet)
 
 
 def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
@@ -542,11 +292,6 @@ def tune_cell(sources: Mapping[str, bytes], drive: Path, tuning: Path, parameter
     """One cell of a study: the certified metrics of the gains tuned for it, the objective and the gains.
 
     The files are those that the study has read: in another process they may have moved.
-
-    Raises
-    ------
-    ConvergenceError
-        If no design is certified.
     """
     with read_once(sources):
         task = read_tuning(tuning, read_drive(drive)[0].system(), parameters)
@@ -697,3 +442,213 @@ def _join(found: Sensitivity, slopes: LocalSensitivity | None) -> "pd.DataFrame"
     table = found.table if slopes is None else found.table.join(slopes.table)
     named: dict[Hashable, str] = {"change": "local_change", "relative": "local_relative", "share": "local_share"}
     return table.rename(columns=named).reset_index()
+
+
+def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
+    """Tune a loop along a front between two requirements; returns the exit status."""
+    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
+    warn_of_status(study.tuning)
+    front_spec = read_pareto(study, bound_units(task.loop))
+    first, second, until = _front_requirements(study, front_spec, task)
+    free = task.parameters.free_names
+    require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
+    with progress("finding the front's ends", quiet=quiet) as report_progress:
+        front = pareto_front(
+            task.loop,
+            task.references,
+            parameters,
+            minimise=(first, second),
+            subject_to=[q for q in task.specification.limits if metric_name(q) != metric_name(second)],
+            scenarios=task.scenarios(parameters),
+            points=front_spec.points,
+            until=until,
+            max_steps=task.max_steps,
+            progress=report_progress,
+        )
+    front, known = _convert_to_percent(front, first, second), metric_units(task.loop)
+    pair, gains = (
+        {metric_name(q): known[metric_name(q)] for q in (first, second)},
+        {n: parameters[n].unit for n in front if n in free},
+    )
+    verdict, status = _front_verdict(front, pair)
+    report = lead_report(verdict, status) + report_front(front, pair, gains)
+    writers: Writers = {}
+    if outputs.output is not None:
+        claimed = {f"claimed {n}": unit for n, unit in pair.items()}
+        units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
+        writers[outputs.output] = table_writer(outputs.output, front, units)
+    hashes = file_hashes(study.path, study.drive, study.tuning)
+    tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}, "provenance": hashes}
+    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
+    drawn = partial(plot_front, front, pair)
+    page = partial(front_page, study, report, drawn, pair)
+    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
+    return status
+
+
+def _front_requirements(
+    study: Study, front_spec: Pareto, task: Tuning
+) -> tuple[Requirement, Requirement, float | None]:
+    """The two requirements, the second one bounded where the front begins, and its bound where the front ends."""
+    where = f"{study.path}: [pareto]"
+    given = {metric_name(q): q for q in (*task.specification.weights, *task.specification.limits)}
+    first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
+    ends = {"lower": front_spec.lower, "upper": front_spec.upper}
+    begin, end = ("lower", "upper") if second.metric.sense is Sense.AT_LEAST else ("upper", "lower")
+    start, until = ends[begin], ends[end]
+    loosest = second if start is None else construct_at(lambda: with_user_limit(second, start), f"{where} {begin}")
+    if until is not None:
+        tightest = construct_at(lambda: with_user_limit(second, until), f"{where} {end}")
+        side, unit = "below" if end == "lower" else "above", bound_units(task.loop)[front_spec.between[1]]
+        ends_at, begins_at = (write_value(user_limit(q) or math.inf, unit) for q in (tightest, loosest))
+        message = f"{where} {end}, {ends_at}, is not {side} the {begins_at} that {study.tuning} allows under [limits]"
+        require(upper_limit(tightest) < upper_limit(loosest), message)
+    return first, loosest, until
+
+
+def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, where: str) -> Requirement:
+    """The requirement of the tuning, with its bound; else one without a bound."""
+    kind: Any = REQUIREMENTS_BY_KEY[key]
+    if kind.__name__ in given:
+        return given[kind.__name__]
+    require(kind is not StepEnvelope, f"{where}: the tuning has no bounds for step_envelope; add them under [limits]")
+    plain: Requirement = SettlingTime(task.specification.band) if kind is SettlingTime else kind()
+    return plain
+
+
+def _front_verdict(front: "pd.DataFrame", pair: Mapping[str, str]) -> tuple[str, int]:
+    """How many designs are not certified, and the exit status."""
+    interrupted = int((front["error"] == INTERRUPTED_CASE).sum())
+    failed = int((front["error"] != "").sum()) - interrupted
+    parts = [f"{count} {what}" for count, what in ((interrupted, "interrupted"), (failed, "not certified")) if count]
+    status = EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if failed else EXIT_SUCCESS
+    one = " (one is best by both)" if len(front) == 1 and not parts else ""
+    what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
+    return f"{what}: {', '.join(parts) or 'all certified'}{one}", status
+
+
+def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":
+    """The front with figures as the metrics are shown, overshoot in percent."""
+    factors = {c: q.metric.factor for q in (first, second) for c in (metric_name(q), f"claimed {metric_name(q)}")}
+    factors["limit"] = second.metric.factor
+    return front.assign(**{c: factor * front[c] for c, factor in factors.items() if factor != 1})
+
+
+def case_page(
+    study: Study,
+    report: Report,
+    draw: Callable[[], "Figure"],
+    axes: Mapping[str, str],
+    metrics: Mapping[str, str],
+    design: Design,
+) -> Page:
+    """The page of a study's cases; a map of one or two axes, or how other cases are distributed."""
+    alt = f"{', '.join(metrics)} over {' and '.join(axes)}, a cell or a point a case; what failed is marked."
+    if study.cases:
+        alt = f"Share of the cases that keep a bound, over the bound: {', '.join(metrics)}."
+    drawn = draw if study.cases or len(axes) <= MAX_MAP_AXES else None
+    shared = None if study.tune else design
+    return study_page(_page_source(study), report, drawn, what="Cases", alt=alt, design=shared)
+
+
+def front_page(study: Study, report: Report, draw: Callable[[], "Figure"], pair: Mapping[str, str]) -> Page:
+    """The page of a Pareto front."""
+    first, second = pair
+    alt = f"{first} of certified designs over {second}; limits at which none was certified are marked."
+    return study_page(_page_source(study), report, draw, what="Pareto front", alt=alt)
+
+
+def sensitivity_page(study: Study, report: Report, draw: Callable[[], "Figure"], design: Design) -> Page:
+    """The page of a study that asks which tolerances matter."""
+    alt = "Share of a metric's variance that each parameter brings, by itself and with others, as bars with intervals."
+    return study_page(_page_source(study), report, draw, what="Sensitivity", alt=alt, design=design)
+
+
+def _page_source(study: Study) -> Source:
+    """The title of a study's page, its hashes and warnings."""
+    files = (study.path, study.drive, study.tuning)
+    warnings = (*describe_status(read_fit(study.drive)), *describe_status(study.tuning))
+    title = f"Study of {study.drive.name} with {study.tuning.name}"
+    return Source(title, file_hashes(*files), warnings)
+
+
+def report_cases(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> Report:
+    """A study, a row a case; of many the worst, by the first metric; then the reasons of those that failed."""
+    first = next(iter(metrics))
+    ordered = table.sort_values(first, ascending=larger_is_better(first), na_position="first", kind="stable")
+    shown, rows = table if len(table) <= MAX_CASE_ROWS else ordered.head(MAX_CASE_ROWS), []
+    for row in shown.to_dict(orient="records"):
+        figures = [metric_cell(m, row[m]) for m in metrics]
+        if row["error"]:
+            figures = ["failed" if row["error"] != INTERRUPTED_CASE else INTERRUPTED_CASE] + [""] * (len(metrics) - 1)
+        rows.append((*(format_number(row[n], 6) for n in axes), *figures))
+    heads = (f"{n}\n[{unit}]" if unit not in ("", "1") else n for n, unit in {**axes, **metrics}.items())
+    lines = []
+    if len(shown) < len(table):
+        lines.append(f"the {len(shown)} worst of {len(table)} cases by {first}; -o FILE writes all")
+    reasons = table["error"][~table["error"].isin(["", INTERRUPTED_CASE])].value_counts()
+    for reason, count in list(reasons.items())[:MAX_FAILURE_REASONS]:
+        lines.append(f"failed ({count} of {len(table)}): {reason}")
+    return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
+
+
+def report_checks(checks: "pd.DataFrame") -> Report:
+    """The certified cases of a batch: the largest difference a metric, and the cases in which lanes are refuted."""
+    rows = [(str(m), format_number(float(own["difference"].max()), 2)) for m, own in checks.groupby("metric")]
+    lines = [
+        Line(f"{row['case']}: {row['metric']} is {row['batch']:.6g} in the lanes, {row['certified']:.6g} certified")
+        for row in checks[~checks["agrees"]].head(MAX_FAILURE_REASONS).to_dict(orient="records")
+    ]
+    table = (
+        (Table((Column("metric"), Column("largest difference\nfrom the certificate")), tuple(rows)),) if rows else ()
+    )
+    left = "margins, stick-slip events and what comes after the horizon are not in the lanes: leave out batch for them"
+    return Report((*table, *lines, Line(left)))
+
+
+def report_front(table: "pd.DataFrame", requirements: Mapping[str, str], gains: Mapping[str, str]) -> Report:
+    """A front, a row a design, of those that are not certified the limit; then the reasons."""
+    first, second = requirements
+    shown = dict(list(gains.items())[:MAX_GAIN_COLUMNS])
+    relation, rows = ">=" if larger_is_better(second) else "<=", []
+    for row in table.to_dict(orient="records"):
+        figures = [format_number(row[n], 4) for n in (first, second)]
+        if row["error"]:
+            word = INTERRUPTED_CASE if row["error"] == INTERRUPTED_CASE else "failed"
+            figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {format_number(row['limit'], 4)}"]
+        rows.append((*figures, *(_format_gain(row[n]) for n in shown)))
+    heads = [_narrow_heading(n, unit) for n, unit in {**requirements, **shown}.items()]
+    lines = [f"{len(shown)} of {len(gains)} gains; -o FILE writes all"] if len(shown) < len(gains) else []
+    failed = table[~table["error"].isin(["", INTERRUPTED_CASE])].to_dict(orient="records")
+    lines += [f"failed ({second} {relation} {format_number(row['limit'], 4)}): {row['error']}" for row in failed]
+    return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
+
+
+def lead_report(verdict: str, status: int) -> Report:
+    """The verdict as a report."""
+    return Report((Line(verdict, Tone.BAD if status else Tone.GOOD),))
+
+
+def table_writer(path: Path, table: "pd.DataFrame", units: Mapping[str, str]) -> Callable[[Path], None]:
+    """What writes a table with units in its header: as Parquet where the file to be is called so, else as CSV."""
+    named = table.rename(columns={n: heading(n, unit) for n, unit in units.items()})
+    if path.suffix.lower() == PARQUET:
+        columns = {str(n): named[n].tolist() for n in named}
+        return partial(write_bytes, content=parquet_bytes(columns))
+    return partial(write_text, text=format_table(named))
+
+
+def heading(name: str, unit: str) -> str:
+    """A column's name with its unit, "SettlingTime [s]"."""
+    return f"{name} [{unit}]" if unit else name
+
+
+def _format_gain(value: float) -> str:
+    """Four digits, as gains are rounded, and no exponent where it is the longer one: 68130."""
+    return f"{float(format_number(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else format_number(value, 4)
+
+
+def _narrow_heading(column: str, unit: str) -> str:
+    """A heading in narrow lines, "Peak / Control / [V]" or "pid. / Kp / [V*s/m]"."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", column)
+    return words if unit in ("", "1") else f"{words}\n[{unit}]"

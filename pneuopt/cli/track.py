@@ -1,7 +1,4 @@
-"""`pneuopt track`: a drive's parameters over dated logs, and what its tuned loop is worth as they drift.
-
-`pneuopt next-experiment`: which run shrinks the asked confidence intervals most, as a CSV for the controller.
-"""
+"""`pneuopt track` and `pneuopt next-experiment`: how parameters drift over dated logs, and which run to log next."""
 
 import warnings
 from collections.abc import Sequence
@@ -55,27 +52,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """What `pneuopt track` is asked for.
+    """What `pneuopt track` is asked for."""
 
-    Attributes
-    ----------
-    tuned : Path or None
-        The design whose loss is predicted.
-    parameters : tuple of str
-        Empty: all that are free.
-    dates : str
-        One a log, with commas; empty: as the logs say.
-    drift : float
-        For the power calculation [1/week].
-    horizon : int
-        Logs for which the level holds.
-    """
-
-    tuned: Path | None
-    parameters: tuple[str, ...]
-    dates: str
-    drift: float
-    horizon: int
+    tuned: Path | None  # the design whose loss is predicted
+    parameters: tuple[str, ...]  # empty: all that are free
+    dates: str  # one a log, with commas; empty: as the logs say
+    drift: float  # for the power calculation [1/week]
+    horizon: int  # logs for which the level holds
 
 
 def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs: Outputs, quiet: bool = False) -> int:
@@ -139,31 +122,17 @@ _ALT = "What is played, the signals with limits as predicted, and each parameter
 
 @dataclass(frozen=True)
 class PlannedOptions:
-    """What a planned run may do, as the command line says it.
-
-    Attributes
-    ----------
-    duration, sample_time : str
-        With their units; an empty sample time is the controller's.
-    targets : tuple of str
-    limits, noise, start : tuple of str
-        "position=20 mm..180 mm", "position=20 um", "position=100 mm".
-    runs : int
-    mean : bool
-        Whether the mean deviation counts (`AOptimal`), not the joint region (`DOptimal`).
-    budget : float
-        CPU seconds.
-    """
+    """What a planned run may do, as the command line says it."""
 
     duration: str
-    sample_time: str
+    sample_time: str  # empty: the controller's
     targets: tuple[str, ...]
-    limits: tuple[str, ...]
-    noise: tuple[str, ...]
-    start: tuple[str, ...]
+    limits: tuple[str, ...]  # "position=20 mm..180 mm"
+    noise: tuple[str, ...]  # "position=20 um"
+    start: tuple[str, ...]  # "position=100 mm"
     runs: int
-    mean: bool
-    budget: float
+    mean: bool  # whether the mean deviation counts (`AOptimal`), not the joint region (`DOptimal`)
+    budget: float  # CPU seconds
 
 
 def run_next_experiment(

@@ -88,23 +88,11 @@ def run_certify(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, qui
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """A loop that is to be certified, the files that it comes from, and those that are to be written.
+    """A loop that is to be certified, the files that it comes from, and those that are to be written."""
 
-    Attributes
-    ----------
-    stored : StoredFit
-        The plant's file as read.
-    task : Tuning
-    parameters : ParameterSet
-        Of plant and controller, as given.
-    fit, tuning : Path
-    rig : Path or None
-    outputs : Outputs
-    """
-
-    stored: StoredFit
+    stored: StoredFit  # the plant's file as read
     task: Tuning
-    parameters: ParameterSet
+    parameters: ParameterSet  # of plant and controller, as given
     fit: Path
     tuning: Path
     rig: Path | None

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tomlkit.items import Table
@@ -39,9 +39,6 @@ from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.units import difference_unit, is_unit, read_unit, read_value, si_conversion, write_value
-
-if TYPE_CHECKING:
-    pass
 
 Entries = dict[str, str]
 Parts = dict[str, Entries]
@@ -71,25 +68,7 @@ class CertificateCheck:
 
 
 def check_certificate(fit: StoredFit, tuned: str | Path) -> CertificateCheck | None:
-    """Whether the certificate in a tuned.toml holds, and if not, what was changed.
-
-    Parameters
-    ----------
-    fit : StoredFit
-        The plant's file.
-    tuned : str or Path
-        A tuned.toml; or a tuning.toml, which has no certificate.
-
-    Returns
-    -------
-    CertificateCheck or None
-        None for a file that no tuning has written.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
+    """Whether the certificate in a tuned.toml holds, and if not, what was changed; None for a file without one."""
     table = read_toml(tuned).unwrap()
     if not any(name in table for name in TUNED_SECTIONS):
         return None
@@ -111,17 +90,7 @@ def check_certificate(fit: StoredFit, tuned: str | Path) -> CertificateCheck | N
 
 
 def checksum_section(table: Mapping[str, Any], path: str | Path, fit: StoredFit) -> Table:
-    """The section of the checksum for a tuned.toml's table.
-
-    Parameters
-    ----------
-    table : mapping
-        The file with its figures and its status.
-    path : str or Path
-        Where it is to stand.
-    fit : StoredFit
-        The plant's file.
-    """
+    """The [checksum] of a tuned.toml's table, which has its figures and status and is to stand at `path`."""
     parts = _describe(table, path, fit)
     tables = {n: toml_table({"hash": _digest(own)[:16], **own}) for n, own in parts.items()}
     section = toml_table({"hash": _digest(parts), **tables})
@@ -266,15 +235,9 @@ def _other_parts(stored: Mapping[str, Any], parts: Parts) -> list[str]:
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writes a value of the checksum for its reader, in the unit that the files have it in.
+    """Writes a value of the checksum for its reader, in the unit that the files have it in."""
 
-    Parameters
-    ----------
-    tuned, fit : mapping
-        The tables of the files.
-    """
-
-    tuned: Mapping[str, Any]
+    tuned: Mapping[str, Any]  # both as parsed
     fit: Mapping[str, Any]
 
     def compare(self, name: str, was: str, now: str) -> str:

@@ -53,18 +53,7 @@ Option = tuple[str, str]
 
 @cache
 def drive_keys(name: str) -> Mapping[str, Key]:
-    """The sections of a drive's file with all keys that any drive of the kind may have.
-
-    Parameters
-    ----------
-    name : str
-        Of `DRIVE_KINDS`.
-
-    Returns
-    -------
-    mapping of str to Key
-        The condition of a key says under which options there is such a parameter.
-    """
+    """The sections with all keys that a drive of the kind may have; a key's condition says under which options."""
     kind = DRIVE_KINDS[name]
     sections: dict[str, dict[str, Key]] = {section: dict(keys) for section, keys in kind.sections.items()}
     for alias in kind.aliases:
@@ -207,22 +196,12 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
 
 @dataclass(frozen=True, eq=False)
 class StoredFit:
-    """A fit.toml, or the drive.toml that it was made from, parsed once for all that a command needs of it.
-
-    Attributes
-    ----------
-    path : Path
-    drive : Drive
-    parameters : ParameterSet
-        All of `drive.system().parameters`.
-    toml : mapping
-        The whole file as parsed; the properties read what a fit has written into it, and raise `InputError` for what
-        pneuopt does not write so.
-    """
+    """A fit.toml, or the drive.toml that it was made from, parsed once for all that a command needs of it."""
 
     path: Path
     drive: Drive
-    parameters: ParameterSet
+    parameters: ParameterSet  # all of `drive.system().parameters`
+    # as parsed; the properties raise `InputError` for what pneuopt does not write so
     toml: Mapping[str, Any]
 
     @property
@@ -337,13 +316,7 @@ def ambient_pressure(parameters: ParameterSet) -> float:
 
 
 def read_status(path: str | Path) -> Status | None:
-    """How the fit or the tuning in a file ended; None for a file that no result has written.
-
-    Raises
-    ------
-    InputError
-        If the status is none that pneuopt writes.
-    """
+    """How the fit or the tuning in a file ended; None for a file that no result has written."""
     return stored_status(read_toml(path).unwrap(), path)
 
 

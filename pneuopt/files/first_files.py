@@ -52,29 +52,8 @@ def first_files(
 ) -> dict[str, str]:
     """The texts of the files, by their names within a folder.
 
-    Parameters
-    ----------
-    name : str
-        Of a kind of drive.
-    known : ParameterSet
-        Values of the drive's parameters that are known, of a catalogue; each has its source.
-    columns : mapping of str to str
-        What the sidecar states, by channel: '"t [ms]"'; none: the log's header says it.
-    log : str
-        The log's file name.
-    sample_time : float
-        Of the controller [s].
-    counts_from_zero : bool
-        Whether a log shows a command from 0 to twice the usual limit about a centre between, which is then estimated.
-    source : sequence of str
-        Lines at the drive's top that say where its values come from.
-    doubts : sequence of str
-        What the sidecar states without being sure: lines at its top.
-
-    Raises
-    ------
-    UnknownNameError
-        If there are no first files for that kind.
+    `columns` is what the sidecar states by channel ('"t [ms]"'), `doubts` what it states without being sure; with
+    `counts_from_zero` the command goes from 0 to twice the usual limit about a centre that is estimated.
     """
     check_names("kind", [name], first_kinds(), "init")
     others = {sidecar_name(other) for other in _OTHER_FILES}

@@ -31,26 +31,15 @@ _SIGNAL_WORDS = {"command": "command", "measured": "measured", "difference": "me
 
 @dataclass(frozen=True)
 class KeyRow:
-    """A key in the list.
-
-    Attributes
-    ----------
-    file, section, name : str
-        The name within its section, "smoothing.corner"; empty for the section itself.
-    key : Key
-    unit, usual : str
-        As text; of drives that differ, each with its kind.
-    kinds : tuple of str
-        The kinds of drive that have it; empty where all have it that have the section.
-    """
+    """A key in the list."""
 
     file: str
     section: str
-    name: str
+    name: str  # within its section, "smoothing.corner"; empty for the section itself
     key: Key
-    unit: str
+    unit: str  # as text; of drives that differ, each with its kind
     usual: str
-    kinds: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()  # the kinds of drive that have it; empty where all have it that have the section
 
     @property
     def full_name(self) -> str:
@@ -171,16 +160,7 @@ _VALUE: dict[str, Any] = {"type": ["number", "string"]}
 
 
 def json_schema(title: str, sections: Mapping[str, Key], results: Iterable[str] = ()) -> dict[str, Any]:
-    """The schema of a file (draft 7).
-
-    Parameters
-    ----------
-    title : str
-    sections : mapping of str to Key
-        What stands at the file's top.
-    results : iterable of str
-        Sections that a command adds, about which nothing is said.
-    """
+    """The schema (draft 7) of a file with these sections, and with others, `results`, that a command adds."""
     schema = _describe_table(table("", sections))
     schema["properties"] |= {name: {"type": "object"} for name in results}
     return {"$schema": "http://json-schema.org/draft-07/schema#", "title": title, **schema}
@@ -259,36 +239,20 @@ _NO_BREAK = "\N{NO-BREAK SPACE}"
 
 @dataclass(frozen=True)
 class Template:
-    """What a new file says.
+    """What a new file says."""
 
-    Attributes
-    ----------
-    title : tuple of str
-        Lines of comment at its top.
-    sections : mapping of str to Key
-        Its keys.
-    stated : mapping of str to str
-        Text of what it states, by full name; a name with dots of its own as '"load.mass"'.
-    repeated : mapping of str to sequence of mapping
-        Of a section that stands there several times, what each states.
-    units : mapping of str to str
-        What the words in braces of a unit stand for.
-    examples : mapping of str to str
-        For comments: text of a key by its full name, where neither its default nor its own example would do.
-    names : mapping of str to str
-        For comments: an entry in place of one that the user names, by the table's full name: '"load.mass" = "30 %"'.
-    schema : str
-        Where the file's schema is; the first line says it to editors.
-    """
-
-    title: Sequence[str]
-    sections: Mapping[str, Key]
+    title: Sequence[str]  # lines of comment at its top
+    sections: Mapping[str, Key]  # its keys
+    # text of what it states, by full name; a name with dots of its own as '"load.mass"'
     stated: Mapping[str, str] = field(default_factory=dict)
+    # of a section that stands there several times, what each states
     repeated: Mapping[str, Sequence[Mapping[str, str]]] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)  # what the words in braces of a unit stand for
+    # for comments: text of a key by its full name, where neither its default nor its own example would do
     examples: Mapping[str, str] = field(default_factory=dict)
+    # for comments: an entry in place of one that the user names, by the table's full name: '"load.mass" = "30 %"'
     names: Mapping[str, str] = field(default_factory=dict)
-    schema: str = ""
+    schema: str = ""  # where the file's schema is; the first line says it to editors
 
     def render(self) -> str:
         """The file's text."""

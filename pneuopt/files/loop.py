@@ -77,23 +77,7 @@ def bound_units(loop: ClosedLoop) -> dict[str, str]:
 
 
 def read_bound(key: str, given: Any, unit: str, where: str) -> float:
-    """Read a requirement's bound.
-
-    Parameters
-    ----------
-    key : str
-    given : object
-        As written: "5 %", "150 N", 1.4, "2 l(ANR)".
-    unit : str
-        Of `bound_units`.
-    where : str
-        What the message of an error begins with.
-
-    Raises
-    ------
-    UnitError
-        If it cannot be read.
-    """
+    """Read a requirement's bound, "5 %", 1.4 or "2 l(ANR)", in a unit of `bound_units`."""
     if REQUIREMENTS_BY_KEY[key].metric.unit.endswith(NORMAL_VOLUME):
         normal = isinstance(given, str) and given.strip().endswith(NORMAL_VOLUME)
         require(normal, f'{where}: {given!r}: air is counted at 20 degC and 100 kPa (ANR): "2 l(ANR)"', UnitError)
@@ -220,22 +204,7 @@ def read_draw(given: Mapping[str, Any], where: str) -> Draw:
 
 
 def read_spreads(entries: Mapping[str, Any], where: str, parameters: ParameterSet) -> dict[str, Spread]:
-    """Read by which fraction, or between which values, each pattern of parameters spreads.
-
-    Parameters
-    ----------
-    entries : mapping
-        Names or patterns to "30 %", or to ["3 kg", "7 kg"].
-    where : str
-        What the message of an error begins with.
-    parameters : ParameterSet
-        Gives the units.
-
-    Raises
-    ------
-    InputError
-        If a name is unknown, or a value cannot be read.
-    """
+    """Read by which fraction, "30 %", or between which values, ["3 kg", "7 kg"], each pattern of names spreads."""
     return {
         pattern: _read_spread(given, pattern, where, parameters)
         for pattern, given in _flatten(entries, parameters).items()
@@ -325,24 +294,7 @@ METHOD_SECTION = table(
 
 
 def read_method(entries: Mapping[str, Any], where: str) -> Method | None:
-    """Read a tuning method.
-
-    Parameters
-    ----------
-    entries : mapping
-        "kind", a key of `METHODS`, and options of that class: numbers, or lists of them. Empty: no method.
-    where : str
-        What the message of an error begins with.
-
-    Returns
-    -------
-    Method or None
-        None: the loop decides.
-
-    Raises
-    ------
-    InputError
-        Or its kind; the message names the key.
+    """Read a tuning method; None, so that the loop decides, of an empty section.
 
     Examples
     --------
@@ -572,17 +524,7 @@ FIRST_PARAMETERS: Mapping[str, str] = {
 
 
 def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping[str, Key]:
-    """All sections of a tuning.toml with all their keys.
-
-    Parameters
-    ----------
-    command, measured : str
-        Units of the loop's signals; by default these words stand for them.
-
-    Returns
-    -------
-    mapping of str to Key
-    """
+    """All sections of a tuning.toml with all their keys, for signals of these units."""
     signal = SensedSignal(Quantity("measured", measured), {}, SAMPLE_TIME)
     parts = {
         "pid": _pid_keys(command, measured),
@@ -635,29 +577,7 @@ _GAIN_CORRECTIONS: Mapping[Form, Mapping[str, str]] = {
 def read_loop_sections(
     table: TuningSections, plant: System, path: str | Path, centre: float = 0.0
 ) -> tuple[ClosedLoop, ParameterSet]:
-    """The loop of a tuning's sections.
-
-    Parameters
-    ----------
-    table : mapping of str to mapping
-        The sections; others than `LOOP_SECTIONS` are not read.
-    plant : System
-    path : str or Path
-        What the messages of errors begin with.
-    centre : float
-        Of the plant's valve [the command's unit]; limits in the file are those of the wire, the loop's are about it.
-
-    Returns
-    -------
-    loop : ClosedLoop
-    parameters : ParameterSet
-        Those of its controller, sensor and dither, the free ones within finite bounds.
-
-    Raises
-    ------
-    InputError
-        Or its kind; the message names file, section and key.
-    """
+    """The loop and its parameters; limits in the file are those of the wire, the loop's are about `centre`."""
     loop = _loop(table, plant, path)
     return loop, _parameters(table, loop, path, centre)
 

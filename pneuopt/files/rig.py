@@ -59,25 +59,7 @@ RIG_KEYS: Mapping[str, Key] = {
 
 
 def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
-    """Read the rig around a loop; its dry friction sticks and slips, its sensors stand in for the loop's own.
-
-    Parameters
-    ----------
-    path : str or Path
-        A rig.toml.
-    drive : Drive
-    loop : ClosedLoop
-        Of that drive. Where the file has no sensors, the loop's own is taken.
-
-    Returns
-    -------
-    Rig
-
-    Raises
-    ------
-    InputError
-        Or its kind; the message names file, section and key.
-    """
+    """Read the rig around a loop; its dry friction sticks and slips, its sensors stand in for the loop's own."""
     sections = read_toml(path).unwrap()
     check_sections(RIG_KEYS, sections, path)
     own = construct_at(lambda: replace(loop, plant=stick_slip_drive(drive).system(), sensor=None), str(path))

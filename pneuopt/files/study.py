@@ -65,44 +65,16 @@ SENSITIVITY_KEY = table(
 
 @dataclass(frozen=True)
 class CaseSource:
-    """What the reader of a section needs beside it.
+    """What the reader of a section needs beside it."""
 
-    Attributes
-    ----------
-    where : str
-        What messages begin with.
-    folder : Path
-        To which files are relative.
-    drive : Path
-    parameters : ParameterSet
-        The nominal values.
-    """
-
-    where: str
-    folder: Path
+    where: str  # what messages begin with
+    folder: Path  # to which files are relative
     drive: Path
-    parameters: ParameterSet
+    parameters: ParameterSet  # the nominal values
 
 
 def read_study_cases(study: "Study", parameters: ParameterSet) -> Cases:
-    """Read the cases that a study's file asks for in place of a grid.
-
-    Parameters
-    ----------
-    study : Study
-        With `cases`.
-    parameters : ParameterSet
-        The nominal values.
-
-    Returns
-    -------
-    dict of str to dict of str to float
-
-    Raises
-    ------
-    InputError
-        The message names file, section and key.
-    """
+    """Read the cases that a study's file asks for in place of a grid."""
     ((kind, given),) = study.cases.items()
     source = CaseSource(f"{study.path}: [{kind}]", study.path.parent, study.drive, parameters)
     try:
@@ -115,42 +87,16 @@ def read_study_cases(study: "Study", parameters: ParameterSet) -> Cases:
 
 @dataclass(frozen=True)
 class SensitivityTask:
-    """What a [sensitivity] asks for.
+    """What a [sensitivity] asks for."""
 
-    Attributes
-    ----------
-    spreads : mapping
-        As for `samples`.
-    count, seed : int
-    local : bool
-        Whether derivatives at the design are asked for, too.
-    """
-
-    spreads: SampleSpreads
+    spreads: SampleSpreads  # as for `samples`
     count: int
     seed: int
-    local: bool
+    local: bool  # whether derivatives at the design are asked for, too
 
 
 def read_sensitivity(study: "Study", parameters: ParameterSet) -> SensitivityTask:
-    """Read the [sensitivity] of a study.
-
-    Parameters
-    ----------
-    study : Study
-        With `sensitivity`.
-    parameters : ParameterSet
-        The nominal values.
-
-    Returns
-    -------
-    SensitivityTask
-
-    Raises
-    ------
-    InputError
-        The message names file, section and key.
-    """
+    """Read the [sensitivity] of a study."""
     entries, where = dict(study.sensitivity or {}), f"{study.path}: [sensitivity]"
     read = read_table(SENSITIVITY_KEY.keys, entries, where, partial=True)
     count, entries = read["count"], {n: entry for n, entry in entries.items() if n not in read}
@@ -263,64 +209,34 @@ STUDY_KEYS: Mapping[str, Key] = {
 
 @dataclass(frozen=True)
 class Study:
-    """What a study.toml says.
-
-    Attributes
-    ----------
-    path, drive, tuning : Path
-        The file itself, and those that it names, which are relative to its folder.
-    axes : mapping of str to list, or to mapping with from, to and steps
-        As written; `read_axes` reads them.
-    band : float or None
-        Half width of the settling band, a fraction of the step; None: as the tuning says.
-    show : tuple of str
-        The metrics on screen and in the figure.
-    cases : mapping of str to mapping
-        In place of axes, the section that says which cases there are, by its name: as written; `read_study_cases`
-        reads it.
-    pareto : mapping of str to object, optional
-        A front is asked for in place of a grid: as written; `read_pareto` reads it.
-    tune : bool
-        Whether each cell of the grid is tuned, from the gains of its neighbours, and not only certified.
-    batch : bool
-        Whether the cases run many at once in SIMD lanes (`evaluate_batch`), and only the worst and a share are
-        certified.
-    sensitivity : mapping of str to object, optional
-        It is asked which tolerances matter: as written; `read_sensitivity` reads it.
-    """
+    """What a study.toml says."""
 
     path: Path
-    drive: Path
+    drive: Path  # relative to the file's folder, as is the tuning
     tuning: Path
-    axes: Mapping[str, Any]
-    band: float | None
-    show: tuple[str, ...]
+    axes: Mapping[str, Any]  # as written; `read_axes` reads them
+    band: float | None  # half width of the settling band, a fraction of the step; None: as the tuning says
+    show: tuple[str, ...]  # the metrics on screen and in the figure
+    # a front is asked for in place of a grid: as written; `read_pareto` reads it
     pareto: Mapping[str, Any] | None = None
+    # whether each cell of the grid is tuned, from the gains of its neighbours, and not only certified
     tune: bool = False
+    # in place of axes, the section that says which cases there are, as written; `read_study_cases` reads it
     cases: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    # whether the cases run many at once in SIMD lanes (`evaluate_batch`), and only the worst and a share are certified
     batch: bool = False
+    # it is asked which tolerances matter: as written; `read_sensitivity` reads it
     sensitivity: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
 class SweptAxis:
-    """A parameter and its values.
-
-    Attributes
-    ----------
-    name : str
-    points : tuple of float
-        Its values [SI]
-    unit : str
-        In which the first one is written.
-    factor, offset : float
-        ``SI = factor * number + offset``.
-    """
+    """A parameter and its values."""
 
     name: str
-    points: tuple[float, ...]
-    unit: str
-    factor: float
+    points: tuple[float, ...]  # its values [SI]
+    unit: str  # in which the first one is written
+    factor: float  # ``SI = factor * number + offset``
     offset: float
 
     def in_axis_unit(self, values: ArrayLike) -> NDArray[np.float64]:
@@ -330,39 +246,17 @@ class SweptAxis:
 
 @dataclass(frozen=True)
 class Pareto:
-    """A front between two requirements.
+    """A front between two requirements."""
 
-    Attributes
-    ----------
-    between : tuple of str
-        Their keys, as in a tuning.toml; the second is limited step by step.
-    points : int
-    lower, upper : float or None
-        From where to where the second one goes, in the SI unit of its bound; None: as the tuning and the drive allow.
-    """
-
-    between: tuple[str, str]
+    between: tuple[str, str]  # their keys, as in a tuning.toml; the second is limited step by step
     points: int
+    # from where to where the second one goes, in the SI unit of its bound; None: as the tuning and the drive allow
     lower: float | None
     upper: float | None
 
 
 def read_study(path: str | Path) -> Study:
-    """Read a study; the files that it names are not opened.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Study
-
-    Raises
-    ------
-    InputError
-        UnitError, UnknownNameError or other; the message names file, section and key.
-    """
+    """Read a study; the files that it names are not opened."""
     path, sections = Path(path), read_toml(path).unwrap()
     check_sections(STUDY_KEYS, sections, path)
     metrics, given = (
@@ -403,22 +297,7 @@ def read_study(path: str | Path) -> Study:
 
 
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
-    """Read a study's axes in the units of the parameters.
-
-    Parameters
-    ----------
-    study : Study
-    parameters : ParameterSet
-
-    Returns
-    -------
-    tuple of SweptAxis
-
-    Raises
-    ------
-    InputError
-        If a parameter is unknown, or a value cannot be read.
-    """
+    """Read a study's axes in the units of the parameters."""
     check_names("parameter", study.axes, parameters, f"{study.path}: [axes]")
     with count_gauge_from(ambient_pressure(parameters)):
         axes = tuple(
@@ -442,24 +321,7 @@ def swept_axes(parameters: ParameterSet, cases: Mapping[str, Mapping[str, float]
 
 
 def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
-    """Read the front that a study asks for.
-
-    Parameters
-    ----------
-    study : Study
-        With `pareto`.
-    units : mapping of str to str
-        Of `bound_units`.
-
-    Returns
-    -------
-    Pareto
-
-    Raises
-    ------
-    InputError
-        If a requirement is unknown or there twice, or a value cannot be read.
-    """
+    """Read the front that a study asks for."""
     given, where = study.pareto or {}, f"{study.path}: [pareto]"
     plain = {n: key for n, key in STUDY_KEYS["pareto"].keys.items() if n not in ("lower", "upper")}
     read = read_table(plain, given, where, partial=True)

@@ -55,40 +55,22 @@ TUNED_SECTIONS = ("certified", "wire", "status", "provenance", "checksum")
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """A tuning.toml as read: the loop, its references and parameters, what is asked of it, and how it is tuned.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-    references : tuple of Reference
-    parameters : ParameterSet
-        "pid.*", "dither.*", "sensor.*", "feedforward.*", the compensators'; the free ones within finite bounds.
-    specification : Specification
-        Objective and limits, checked; without terms of an objective where the file only describes a loop.
-    scenarios : callable
-        It maps the nominal parameters to the plants and tolerances beside them.
-    validation_scenarios : callable
-        It maps them to other plants and tolerances from the same boxes, on which a design is validated.
-    method : Method, optional
-        None: the first that suits the loop.
-    max_steps : float
-        Steps of the simulations that are refused as too many.
-    accept : tuple of Defect
-        Defects with which a design is certified all the same.
-    centre : float
-        What is on the wire to the valve while the loop's command is zero [the command's unit].
-    """
+    """A tuning.toml as read: the loop, its references and parameters, what is asked of it, and how it is tuned."""
 
     loop: ClosedLoop
     references: tuple[Reference, ...]
+    # "pid.*", "dither.*", "sensor.*", "feedforward.*", the compensators'; the free ones within finite bounds
     parameters: ParameterSet
+    # objective and limits, checked; without terms of an objective where the file only describes a loop
     specification: Specification
+    # it maps the nominal parameters to the plants and tolerances beside them
     scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
+    # it maps them to other plants and tolerances from the same boxes, on which a design is validated
     validation_scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
-    method: Method | None = None
-    max_steps: float = MAX_STEPS
-    accept: tuple[Defect, ...] = ()
-    centre: float = 0.0
+    method: Method | None = None  # None: the first that suits the loop
+    max_steps: float = MAX_STEPS  # steps of the simulations that are refused as too many
+    accept: tuple[Defect, ...] = ()  # defects with which a design is certified all the same
+    centre: float = 0.0  # what is on the wire to the valve while the loop's command is zero [the command's unit]
 
     @property
     def wire(self) -> dict[str, str]:
@@ -139,26 +121,7 @@ def read_tuning_table(
 
 
 def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
-    """Read [scenarios]: corners and samples of the plant, and tolerances of the gains, in one mapping.
-
-    Parameters
-    ----------
-    table : mapping
-        The section, by kind: names or patterns to "30 %", or to ["3 kg", "7 kg"]; under samples also count, and seed.
-    where : str
-        The file.
-    parameters : ParameterSet
-        The nominal values.
-
-    Returns
-    -------
-    mapping of str to mapping
-
-    Raises
-    ------
-    InputError
-        The message names file, section and key.
-    """
+    """Read [scenarios]: corners and samples of the plant, and tolerances of the gains, in one mapping."""
     return {name: values for part in _read_kinds(table, where, parameters, None) for name, values in part.items()}
 
 
@@ -245,13 +208,7 @@ def _read_kind(
 
 
 def read_references(entries: Any, loop: ClosedLoop, path: str | Path) -> tuple[Reference, ...]:
-    """Read the [[reference]] sections, in the units of the loop's signals.
-
-    Raises
-    ------
-    InputError
-        Or its kind; the message names file, section and key.
-    """
+    """Read the [[reference]] sections, in the units of the loop's signals."""
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
     require(several, f"{path}: write each reference as a section of its own, [[reference]]")
     require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
@@ -277,15 +234,7 @@ _REFERENCE_KINDS: Mapping[str, _Kind] = {"step": _STEP, "move": _MOVE, "moves": 
 
 
 def move_paths(entries: Any, old: Path, new: Path) -> None:
-    """Rewrite the tables that [[reference]] sections name, beside a file in one folder, for a file in another.
-
-    Parameters
-    ----------
-    entries : list of dict
-        Of a TOML document, changed in place.
-    old, new : Path
-        The folders.
-    """
+    """Rewrite the tables that [[reference]] sections name, beside a file in one folder, for a file in another."""
     if old.resolve() == new.resolve():
         return
     for entry in entries:
@@ -395,15 +344,7 @@ def read_path(path: str | Path, *, channel: str | None = None, **settings: Any) 
 
 
 def read_path_of(measured: str, path: str | Path, **settings: Any) -> MotionPath:
-    """The path that a loop shall follow, from the column of its measured signal's reference, or of the signal itself.
-
-    Parameters
-    ----------
-    measured : str
-        The loop's measured signal.
-    path, **settings
-        As for `read_path`.
-    """
+    """The path that a loop shall follow: the column of its measured signal's reference, or of the signal itself."""
     return _make_path(path, read_log(path).trajectory, (f"{measured}_reference", measured), settings)
 
 

@@ -35,20 +35,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Source:
-    """What a page says beside its result.
-
-    Attributes
-    ----------
-    title : str
-    hashes : mapping of str to str
-        Of the files that the provenance does not name, "sha256[drive.toml]".
-    warnings : tuple of str
-        What was said before or beside the result.
-    """
+    """What a page says beside its result."""
 
     title: str
+    # of the files that the provenance does not name, "sha256[drive.toml]"
     hashes: Mapping[str, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # what was said before or beside the result
 
 
 def fit_page(
@@ -61,23 +53,7 @@ def fit_page(
     findings: Sequence[LogFinding] = (),
     trial: Report | None = None,
 ) -> Page:
-    """The page of a fit.
-
-    Parameters
-    ----------
-    source : Source
-    result : IdentificationResult
-    experiments : sequence of Experiment
-        Those that it was made from; figures are drawn where they are given.
-    model : drive, System or ClosedLoop, optional
-        For the friction map and held-out logs.
-    held_out : sequence of Experiment
-        Logs that the fit has not seen, to be predicted; needs the model.
-    findings : sequence of LogFinding
-        What the log doctor found.
-    trial : Report, optional
-        What became of it when logs were simulated with it and fitted again.
-    """
+    """The page of a fit: its logs are drawn, `held_out` ones predicted by the model; `trial` is of simulated logs."""
     system = None if model is None else as_runnable(model)
     marks = result.estimates["mark"]
     biased = [str(n) for n, mark in marks.items() if mark == Mark.BIAS_POSSIBLE]
@@ -122,17 +98,7 @@ def refusal_page(
 def prediction_page(
     source: Source, table: "pd.DataFrame", runs: Sequence[Trajectory], experiments: Sequence[Experiment]
 ) -> Page:
-    """The page of logs that are predicted in open loop.
-
-    Parameters
-    ----------
-    source : Source
-    table : DataFrame
-        Of `validate`.
-    runs : sequence of Trajectory
-        The prediction of each log.
-    experiments : sequence of Experiment
-    """
+    """The page of logs that are predicted in open loop."""
     verdict = Line("the prediction diverges, or there is nothing to compare it with", Tone.BAD)
     if len(table) and table["nrmse"].notna().all():
         worst = table.reset_index().sort_values("nrmse").iloc[-1]

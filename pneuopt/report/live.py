@@ -1,6 +1,6 @@
-"""`live_script`: what moves in a page, a closed loop in JavaScript with sliders; a page is whole without it.
+"""`live_script`: a closed loop in JavaScript with sliders; a page is whole without it.
 
-`RestFinder`: what a page needs to find the rest, or steady motion, that a slider changes.
+`RestFinder` prepares how the script finds the rest, or steady motion, that a slider changes.
 """
 
 import json
@@ -45,18 +45,11 @@ class RestFinder:
     """The residuals of a loop that vanish where it rests, or moves steadily, before a reference.
 
     A page solves them by Newton's method; `is_singular` says when it could not.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-    reference : Step
-    parameters : ParameterSet
-        Every parameter of the loop, as designed.
     """
 
     loop: ClosedLoop
     reference: Step
-    parameters: ParameterSet
+    parameters: ParameterSet  # every parameter of the loop, as designed
 
     @cached_property
     def start(self) -> Array:
@@ -155,20 +148,6 @@ def live_script(
 
     Where a parameter moves the rest, or steady motion, at which a response begins (a load's force, a supply's
     pressure), the script finds it anew; it has no slider where the script could not.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : sequence of Reference
-        Steps that begin at rest or in steady motion are offered, with their disturbances.
-    parameters : ParameterSet
-        Every parameter of the loop.
-    band : float
-        Half width of the settling band, a fraction of the step.
-    limits : mapping of str to float, optional
-        Of `metric_limits`.
-    certified : DataFrame, optional
-        Metrics of the references, one a column, in their order; a limit is watched where the script agrees with them.
     """
     loop = add_disturbances(loop, references)
     steps = {k: r for k, r in enumerate(references) if isinstance(r, Step)}
