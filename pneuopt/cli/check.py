@@ -109,15 +109,10 @@ def _read_all(
             check_logs(system, log, parameters)
             found.append(log)
         except InputError as error:
-            errors.append(f"{error}{_name_unread(log)}")
+            unread = ", ".join(log.source.unread) if log.source else ""  # the missing channel may be one of them
+            told = f"; columns that are not read: {unread}; a sidecar's [columns] says which channel a column is"
+            errors.append(f"{error}{told if unread else ''}")
     return found, errors
-
-
-def _name_unread(log: Experiment) -> str:
-    """The columns among which the missing channel may be."""
-    unread = log.source.unread if log.source else ()
-    remedy = "a sidecar's [columns] says which channel a column is"
-    return f"; columns that are not read: {', '.join(unread)}; {remedy}" if unread else ""
 
 
 def _page(drive: Path, logs: Sequence[Path], found: Checkup, errors: Sequence[str]) -> Page:

@@ -18,7 +18,7 @@ from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.output import read_toml_source, write_bytes
+from pneuopt.quantities.output import read_toml_source
 from pneuopt.quantities.units import difference_unit, read_value
 
 FMU = "fmu"  # the form that is the plant, not the controller
@@ -40,21 +40,24 @@ def run_export(
     stored, task, parameters = read_fit_and_tuning(fit, tuned)
     unit = task.loop.feedback.unit
     measured_span = read_value(span, difference_unit(unit), where="--pv-span") if span else None
-    origin = [*_certificate_lines(stored, tuned, uncertified), *_source_lines(fit, tuned)]
+    sums = {path: hashlib.sha256(read_toml_source(path)).hexdigest() for path in (fit, tuned)}
+    origin = _certificate_lines(stored, tuned, uncertified)
+    origin += [f"from {tuned.name}, sha256 {sums[tuned]}", f"plant {fit.name}, sha256 {sums[fit]}"]
     given = (task.loop, parameters)
+    files: Mapping[str, str | bytes]
     if to == FMU:
-        return _write_fmu(folder / f"{name}.fmu", export_fmu(task.loop.plant, parameters, name=name), force)
-    if to in languages:
+        files = {f"{name}.fmu": export_fmu(task.loop.plant, parameters, name=name)}
+    elif to in languages:
         files = export_controller(*given, languages[to], name=name, centre=task.centre, origin=origin)
     else:
         block = blocks[to]
         files = export_settings(
             *given, block, task.references, name=name, centre=task.centre, origin=origin, measured_span=measured_span
         )
-    placed = {folder / file: text for file, text in files.items()}
+    placed = {folder / file: content for file, content in files.items()}
     write_files(placed, force)
     if to in blocks:
-        typer.echo("".join(files.values()))
+        typer.echo("".join(map(str, files.values())))
     show_output_files(make_console(), list(placed))
     return EXIT_SUCCESS
 
@@ -69,19 +72,6 @@ def _check_form(to: str, forms: Sequence[str]) -> None:
     meant = word if word in forms else MAKERS.get(word, to)
     require(to in forms or meant == to, f"{lead}; it is called {meant!r} here")
     check_names("form", [to], forms, "export --to")
-
-
-def _write_fmu(path: Path, content: bytes, force: bool) -> int:
-    """Write the plant as an FMU, whole or not at all."""
-    told = "is there already, and stays as it is; --force replaces it, -o names another folder"
-    require(force or not path.exists(), f"{path}: {told}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        require(False, f"{path.parent}: the folder cannot be made ({error.strerror}); name another with -o")
-    write_bytes(path, content)
-    show_output_files(make_console(), [path])
-    return EXIT_SUCCESS
 
 
 def _certificate_lines(fit: StoredFit, tuned: Path, uncertified: bool) -> list[str]:
@@ -106,9 +96,3 @@ def _metric_lines(metrics: Any) -> list[str]:
         shown = [f"{n} {known[n]:.4g}" for n in SHOWN_METRICS if isinstance(known.get(n), int | float)]
         lines += [f"{step}: {', '.join(shown)}"] if shown else []
     return lines
-
-
-def _source_lines(fit: Path, tuned: Path) -> list[str]:
-    """Which files the gains and the plant come from."""
-    sums = {path: hashlib.sha256(read_toml_source(path)).hexdigest() for path in (fit, tuned)}
-    return [f"from {tuned.name}, sha256 {sums[tuned]}", f"plant {fit.name}, sha256 {sums[fit]}"]

@@ -30,7 +30,7 @@ from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.table import Table, read_bytes
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.output import check_output_paths, write_text
+from pneuopt.quantities.output import check_output_paths, write_bytes
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import read_value, write_value
 
@@ -72,7 +72,9 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     check_names("kind", [name], first_kinds(), "init")
     known, source = _read_catalogue(name, parts)
     ask = Asker(sys.stdin.isatty() and sys.stdout.isatty())
-    guess = LogGuess((), (), SAMPLE_TIME) if table is None else _guess_log(table, name, ask)
+    guess = LogGuess((), (), SAMPLE_TIME)
+    if table is not None:
+        guess = guess_log(table, first_channels(name), ask, has_centre=name == _PNEUMATIC)
     unused = unused_channels(name)
     columns = {c.channel: "false" if c.channel in unused else c.entry for c in guess.columns}
     least, most = SAMPLE_TIMES
@@ -101,10 +103,11 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     return EXIT_SUCCESS
 
 
-def write_files(files: Mapping[Path, str], force: bool) -> None:
+def write_files(files: Mapping[Path, str | bytes], force: bool) -> None:
     """Write files, all or none: an old one with another text is refused, unless forced."""
-    for path, text in files.items():
-        is_new = force or not path.exists() or (path.is_file() and path.read_bytes() == text.encode())
+    contents = {path: text.encode() if isinstance(text, str) else text for path, text in files.items()}
+    for path, content in contents.items():
+        is_new = force or not path.exists() or (path.is_file() and path.read_bytes() == content)
         require(is_new, f"{path}: is there already, and stays as it is; --force replaces it, -o names another folder")
     for parent in dict.fromkeys(path.parent for path in files):
         try:
@@ -112,12 +115,8 @@ def write_files(files: Mapping[Path, str], force: bool) -> None:
         except OSError as error:
             require(False, f"{parent}: the folder cannot be made ({error.strerror}); name another with -o")
     check_output_paths(files, [])
-    for path, text in files.items():
-        write_text(path, text)
-
-
-def _guess_log(table: Table, kind: str, ask: Asker) -> LogGuess:
-    return guess_log(table, first_channels(kind), ask, has_centre=kind == _PNEUMATIC)
+    for path, content in contents.items():
+        write_bytes(path, content)
 
 
 def _guess_kind(table: Table) -> str:

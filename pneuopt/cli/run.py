@@ -43,7 +43,10 @@ def run_guarded(load: Callable[[], Callable[[], object]]) -> NoReturn:
     status = _run(load)
     command_is_over()
     stopped = interruption_status()
-    lost = _flush(streams)
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    errors = [raw.error for raw in streams if raw.fileno() == 1]
+    lost = next((e for e in errors if e is not None and e.errno != errno.EPIPE), None)  # EPIPE: its reader just left
     if lost is not None and status == 0 and stopped is None:
         _say(f"error: standard output cannot be written ({lost.strerror}); the files that were asked for are written")
         status = EXIT_OUTPUT_LOST
@@ -76,7 +79,12 @@ def _run(load: Callable[[], Callable[[], object]]) -> int:
         if interruption_status() is not None:  # foreign code that turns an interruption into an error of its own
             _say("interrupted: no file was left half-written")
         else:
-            _report_unforeseen(error)
+            frames = traceback.extract_tb(error.__traceback__)
+            place = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+            reason = " ".join(f"{type(error).__name__}{place}: {error}".split()).removesuffix(":")
+            file = _write_details(error)
+            where = f"the details are in {file}; please send it" if file else "run it again with a folder to write to"
+            _say(f"error: unforeseen, a bug of pneuopt: {reason[:SHOWN_REASON]}; {where}")
             return EXIT_UNFORESEEN
     return 0
 
@@ -101,24 +109,6 @@ def _guard_streams() -> list[LastingFile]:
         setattr(sys, name, text)
         guarded.append(raw)
     return guarded
-
-
-def _flush(streams: list[LastingFile]) -> OSError | None:
-    """Write out what is buffered; returns why standard output is lost, but not where its reader just left."""
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    errors = [raw.error for raw in streams if raw.fileno() == 1]
-    return next((e for e in errors if e is not None and e.errno != errno.EPIPE), None)
-
-
-def _report_unforeseen(error: BaseException) -> None:
-    """One line, and a file with the details."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
-    reason = " ".join(f"{type(error).__name__}{place}: {error}".split()).removesuffix(":")
-    file = _write_details(error)
-    where = f"the details are in {file}; please send it" if file else "run it again with a folder to write to"
-    _say(f"error: unforeseen, a bug of pneuopt: {reason[:SHOWN_REASON]}; {where}")
 
 
 def _write_details(error: BaseException) -> Path | None:
@@ -238,10 +228,6 @@ def _watch(heard: socket.socket, _wake: socket.socket) -> None:
     """Wait for a signal; end the process if its main thread has not heard it in time."""
     while (received := heard.recv(1)) and not sys.is_finalizing():
         time.sleep(PATIENCE)
-        if _State.number is None and received[0] in _numbers():
+        ends = {number for number in signal.Signals if signal.getsignal(number) is _interrupt}
+        if _State.number is None and received[0] in ends:
             end_at_once(128 + received[0])
-
-
-def _numbers() -> set[int]:
-    """The signals that end a command here."""
-    return {number for number in signal.Signals if signal.getsignal(number) is _interrupt}

@@ -95,7 +95,8 @@ def finish(
         drawn, missed = _draw(outputs.plot, figures)
         written, failures = written + drawn, failures + missed
     if page is not None and outputs.report is not None:
-        paged, missed = write_files({outputs.report: partial(_write_page, page, not interrupted)}, beside=interrupted)
+        writers = {outputs.report: lambda path: write_page(path, page(), draws=not interrupted)}
+        paged, missed = write_files(writers, beside=interrupted)
         written, failures = written + paged, failures + missed
     if report is not None:
         show_report(make_console(), report)
@@ -120,10 +121,6 @@ def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], 
             except InputError as error:
                 failures.append(error)
     return written, failures
-
-
-def _write_page(make: Callable[[], Page], draws: bool, path: Path) -> None:
-    write_page(path, make(), draws=draws)
 
 
 def _draw(path: Path, figures: Figures) -> tuple[list[Path], list[InputError]]:

@@ -102,7 +102,7 @@ Design: TypeAlias = tuple[ClosedLoop, ParameterSet]
 """The loop of all cases, and its parameters."""
 
 
-# Columns of a study that tunes: its objective, and the word before the name of a gain that was found.
+# columns of a study that tunes: its objective, and the word before the name of a gain that was found
 OBJECTIVE, FOUND = "objective", "found"
 
 
@@ -318,14 +318,12 @@ def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
     """How many cases are certified, fail, never settle or break with their neighbours, and the exit status."""
     settling = table[[c for c in table if _metric_name(c) == "SettlingTime"]]
     good = table["error"] == ""
-    counts = {
-        "interrupted": int((table["error"] == INTERRUPTED_CASE).sum()),
-        "failed": int((~good & (table["error"] != INTERRUPTED_CASE)).sum()),
-        "never settle": int((good & settling.isna().any(axis=1)).sum()),
-        "break with their neighbours": int((good & table["breaks"]).sum()) if "breaks" in table else 0,
-    }
-    parts = [f"{count} {what}" for what, count in counts.items() if count]
-    status = EXIT_INTERRUPTED if counts["interrupted"] else EXIT_FAILURE if parts else EXIT_SUCCESS
+    parts, status = _count_failures(
+        table["error"],
+        "failed",
+        never_settle=int((good & settling.isna().any(axis=1)).sum()),
+        break_with_their_neighbours=int((good & table["breaks"]).sum()) if "breaks" in table else 0,
+    )
     each = f", each the worst of {references} references" if references > 1 else ""
     return f"{len(table)} cases{each}: {', '.join(parts) or 'all settle'}", status
 
@@ -378,6 +376,7 @@ def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Comp
     band, slopes = study.band or task.specification.band, None
     if asked.local:  # at once, as it refuses metrics without a slope
         slopes = local_sensitivity(task.loop, task.references, parameters, asked.spreads, metrics=study.show, band=band)
+    labels = [step.label for step in task.references]
     count = asked.count * (len(axis_labels(parameters, asked.spreads)) + 2)
     certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
     with (
@@ -389,26 +388,31 @@ def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Comp
             certify,
             parameters,
             asked.spreads,
-            figures=_figures(study, task),
+            figures=[n if len(labels) == 1 else f"{n}[{label}]" for label in labels for n in study.show],
             count=asked.count,
             seed=asked.seed,
             executor=executor,
             progress=report_progress,
             journal=journal,
         )
-    status = _write(study, outputs, found, slopes, (task.loop, parameters))
+    status = _finish_sensitivity(study, outputs, found, slopes, (task.loop, parameters))
     if journal is not None and status != EXIT_INTERRUPTED:
         journal.delete()
     return status
 
 
-def _write(study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSensitivity | None, design: Design) -> int:
+def _finish_sensitivity(
+    study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSensitivity | None, design: Design
+) -> int:
     """Show and write what was found; returns the exit status."""
-    verdict, status = _verdict(found.cases)
+    parts, status = _count_failures(found.cases["error"], "failed")
+    verdict = f"{len(found.cases)} points: {', '.join(parts) or 'all certified'}"
     report = lead_report(verdict, status) + found.summary()
     writers: Writers = {}
     if outputs.output is not None:
-        writers[outputs.output] = table_writer(outputs.output, _join(found, slopes), {})
+        named: dict[Hashable, str] = {"change": "local_change", "relative": "local_relative", "share": "local_share"}
+        table = found.table if slopes is None else found.table.join(slopes.table).rename(columns=named)
+        writers[outputs.output] = table_writer(outputs.output, table.reset_index(), {})
     tables: dict[str, Any] = {"verdict": verdict, "shares": records(found.table), "figures": records(found.figures)}
     if slopes is not None:
         report += slopes.summary()
@@ -420,28 +424,6 @@ def _write(study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSens
     page = partial(sensitivity_page, study, report, drawn, design)
     finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
     return status
-
-
-def _figures(study: Study, task: Tuning) -> list[str]:
-    """The columns of the metrics that are shown, one a reference."""
-    labels = [step.label for step in task.references]
-    return [n if len(labels) == 1 else f"{n}[{label}]" for label in labels for n in study.show]
-
-
-def _verdict(cases: "pd.DataFrame") -> tuple[str, int]:
-    """How many points were certified, and the exit status."""
-    interrupted = int((cases["error"] == INTERRUPTED_CASE).sum())
-    failed = int((cases["error"] != "").sum()) - interrupted
-    parts = [f"{n} {what}" for n, what in ((interrupted, "interrupted"), (failed, "failed")) if n]
-    status = EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if failed else EXIT_SUCCESS
-    return f"{len(cases)} points: {', '.join(parts) or 'all certified'}", status
-
-
-def _join(found: Sensitivity, slopes: LocalSensitivity | None) -> "pd.DataFrame":
-    """A row a metric and axis: the shares, and what the slopes say beside them."""
-    table = found.table if slopes is None else found.table.join(slopes.table)
-    named: dict[Hashable, str] = {"change": "local_change", "relative": "local_relative", "share": "local_share"}
-    return table.rename(columns=named).reset_index()
 
 
 def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
@@ -465,12 +447,15 @@ def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
             max_steps=task.max_steps,
             progress=report_progress,
         )
-    front, known = _convert_to_percent(front, first, second), metric_units(task.loop)
-    pair, gains = (
-        {metric_name(q): known[metric_name(q)] for q in (first, second)},
-        {n: parameters[n].unit for n in front if n in free},
-    )
-    verdict, status = _front_verdict(front, pair)
+    factors = {c: q.metric.factor for q in (first, second) for c in (metric_name(q), f"claimed {metric_name(q)}")}
+    factors["limit"], known = second.metric.factor, metric_units(task.loop)
+    front = front.assign(**{c: factor * front[c] for c, factor in factors.items() if factor != 1})  # as shown, in %
+    pair = {metric_name(q): known[metric_name(q)] for q in (first, second)}
+    gains = {n: parameters[n].unit for n in front if n in free}
+    parts, status = _count_failures(front["error"], "not certified")
+    one = " (one is best by both)" if len(front) == 1 and not parts else ""
+    what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
+    verdict = f"{what}: {', '.join(parts) or 'all certified'}{one}"
     report = lead_report(verdict, status) + report_front(front, pair, gains)
     writers: Writers = {}
     if outputs.output is not None:
@@ -516,22 +501,12 @@ def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, 
     return plain
 
 
-def _front_verdict(front: "pd.DataFrame", pair: Mapping[str, str]) -> tuple[str, int]:
-    """How many designs are not certified, and the exit status."""
-    interrupted = int((front["error"] == INTERRUPTED_CASE).sum())
-    failed = int((front["error"] != "").sum()) - interrupted
-    parts = [f"{count} {what}" for count, what in ((interrupted, "interrupted"), (failed, "not certified")) if count]
-    status = EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if failed else EXIT_SUCCESS
-    one = " (one is best by both)" if len(front) == 1 and not parts else ""
-    what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
-    return f"{what}: {', '.join(parts) or 'all certified'}{one}", status
-
-
-def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":
-    """The front with figures as the metrics are shown, overshoot in percent."""
-    factors = {c: q.metric.factor for q in (first, second) for c in (metric_name(q), f"claimed {metric_name(q)}")}
-    factors["limit"] = second.metric.factor
-    return front.assign(**{c: factor * front[c] for c, factor in factors.items() if factor != 1})
+def _count_failures(errors: "pd.Series", word: str, **others: int) -> tuple[list[str], int]:
+    """How many cases were interrupted and how many failed, which is called so, with other counts; the exit status."""
+    interrupted = int((errors == INTERRUPTED_CASE).sum())
+    counts = {"interrupted": interrupted, word: int((errors != "").sum()) - interrupted, **others}
+    parts = [f"{count} {what.replace('_', ' ')}" for what, count in counts.items() if count]
+    return parts, EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if parts else EXIT_SUCCESS
 
 
 def case_page(

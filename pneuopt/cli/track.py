@@ -47,8 +47,6 @@ from pneuopt.shooting.least_squares import LeastSquares
 if TYPE_CHECKING:
     from datetime import date
 
-    import pandas as pd
-
 
 @dataclass(frozen=True)
 class TrackOptions:
@@ -82,7 +80,7 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
             outlook = predict_loss(found, task.loop, task.references, own, task.specification)
     writers: Writers = {}
     if outputs.output is not None:
-        writers[outputs.output] = partial(_write_history, table=found.history)
+        writers[outputs.output] = partial(write_text, text=format_table(found.history.reset_index()))
     tables = {"drift": records(found.table), "history": records(found.history), "provenance": file_hashes(drive)}
     shown = found.summary()
     if outlook is not None:
@@ -111,10 +109,6 @@ def _read_dates(logs: Sequence[Path], given: str) -> "list[str | date]":
     dates: list[str | date] = [text.strip() for text in given.split(",")]
     require(len(dates) == len(logs), f"--dates has {len(dates)} dates for {len(logs)} logs; give one a log")
     return dates
-
-
-def _write_history(path: Path, table: "pd.DataFrame") -> None:
-    write_text(path, format_table(table.reset_index()))
 
 
 _ALT = "What is played, the signals with limits as predicted, and each parameter's interval now and afterwards."

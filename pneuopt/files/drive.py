@@ -58,8 +58,12 @@ def drive_keys(name: str) -> Mapping[str, Key]:
     sections: dict[str, dict[str, Key]] = {section: dict(keys) for section, keys in kind.sections.items()}
     for alias in kind.aliases:
         sections[alias.section][alias.key] = alias.as_key()
-    for whole, (parameter, condition) in _find_parameters(kind).items():
+    variants, found = list(_build_variants(kind)), dict[str, Parameter]()
+    for variant in variants:
+        found = {**variant.parameters, **found}
+    for whole, parameter in found.items():
         section, _, key = whole.partition(".")
+        condition = _describe_condition(whole, kind, variants)
         sections.setdefault(section, {})[key] = parameter_key(parameter, condition)
     tables = {section: table(SECTION_MEANINGS.get(section, ""), keys) for section, keys in sections.items()}
     return {"drive": table("the kind of drive", {"kind": KIND_KEY}, required=True), **tables}
@@ -77,15 +81,6 @@ class _DriveOptions(NamedTuple):
     changed: Option | None
     value: Any
     parameters: ParameterSet
-
-
-def _find_parameters(kind: DriveKind) -> dict[str, tuple[Parameter, str]]:
-    """Each parameter of any drive of the kind, and under which options the drive has it."""
-    variants = list(_build_variants(kind))
-    found: dict[str, Parameter] = {}
-    for variant in variants:
-        found = {**variant.parameters, **found}
-    return {n: (p, _describe_condition(n, kind, variants)) for n, p in found.items()}
 
 
 def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
@@ -133,7 +128,8 @@ def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOpt
             )
             if not all(has.values()):
                 own = "" if name.startswith(f"{section}.") else f"[{section}] "
-                parts.append(f"{own}{key} = {' or '.join(_word(value) for value, there in has.items() if there)}")
+                words = (f'"{v}"' if isinstance(v, str) else str(v).lower() for v, there in has.items() if there)
+                parts.append(f"{own}{key} = {' or '.join(words)}")
     return " and ".join(parts)
 
 
@@ -157,10 +153,6 @@ def _has_by_value(name: str, option: Option, key: Key, variants: Sequence[_Drive
     for variant, _ in changed:
         has[variant.value] = has.get(variant.value, False) or name in variant.parameters
     return has
-
-
-def _word(value: bool | str) -> str:
-    return f'"{value}"' if isinstance(value, str) else str(value).lower()
 
 
 FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
@@ -351,8 +343,11 @@ def write_fit(path: str | Path, source: str | Path, result: IdentificationResult
     """
     document, (drive, given) = read_toml(source), read_drive(source)
     for alias in DRIVE_KINDS[drive.kind].aliases:
-        if any(n in given and result.parameters[n] != given[n] for n in (alias.parameter, *alias.uses)):
-            given = _without_alias(document, alias, drive, given)
+        # what an alias says is wrong once its parameter, or one that it is converted by, is estimated
+        is_wrong = any(n in given and result.parameters[n] != given[n] for n in (alias.parameter, *alias.uses))
+        section: Any = document.get(alias.section, {})
+        if is_wrong and section.pop(alias.key, None) is not None:
+            given |= drive.system().parameters.select([alias.parameter])
     if AMBIENT_PRESSURE in given and result.parameters[AMBIENT_PRESSURE].value != given.value(AMBIENT_PRESSURE):
         _write_absolute(document, given)
     for name, found in result.parameters.items():
@@ -360,7 +355,9 @@ def write_fit(path: str | Path, source: str | Path, result: IdentificationResult
             write_parameter(document, name, found, given[name])
     rows = result.estimates.to_dict(orient="index")
     document["estimates"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
-    document["covariance"] = toml_table(_covariance_rows(result.covariance))
+    covariance = result.covariance
+    known = [n for n in covariance.index if np.isfinite(covariance.to_dict()[n][n])]  # the others have none
+    document["covariance"] = toml_table({str(n): covariance.loc[n, known].to_list() for n in known})
     document["agreement"] = toml_table(_agreement_rows(result.fit))
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
     if result.verdict is not None:
@@ -395,46 +392,20 @@ def _agreement_rows(fit: "pd.DataFrame") -> dict[str, Any]:
     }
 
 
-def _covariance_rows(covariance: "pd.DataFrame") -> dict[str, list[float]]:
-    """The rows of a covariance, without the parameters that have none."""
-    known = [n for n in covariance.index if np.isfinite(covariance.to_dict()[n][n])]
-    return {str(n): covariance.loc[n, known].to_list() for n in known}
-
-
-def _without_alias(document: tomlkit.TOMLDocument, alias: Alias, drive: Drive, given: ParameterSet) -> ParameterSet:
-    """Drop an alias from the file: once the parameter, or one that it is converted by, is estimated, it is wrong."""
-    section: Any = document.get(alias.section, {})
-    if alias.key not in section:
-        return given
-    section.remove(alias.key)
-    return given | drive.system().parameters.select([alias.parameter])
-
-
 def _read_parameters(system: System, kind: DriveKind, sections: Sections, places: FileLocations) -> ParameterSet:
     defaults = system.parameters
     _check_keys(defaults, kind, sections, places)
     entries = {f"{s}.{k}": v for s, said in sections.items() for k, v in said.items() if f"{s}.{k}" in defaults}
-    with count_gauge_from(_read_ambient_pressure(entries, defaults, places)):
-        return _read_entries(system, kind, sections, entries, places)
 
+    def read(name: str) -> Parameter:
+        return read_parameter(entries[name], defaults[name], _parameter_place(name, places))
 
-def _read_ambient_pressure(entries: Mapping[str, Any], defaults: ParameterSet, places: FileLocations) -> float:
-    """What the file's gauge pressures count from [Pa]: the drive's ambient pressure, else the standard atmosphere."""
-    if AMBIENT_PRESSURE not in entries:
-        return ambient_pressure(defaults)
-    where = _parameter_place(AMBIENT_PRESSURE, places)
-    return read_parameter(entries[AMBIENT_PRESSURE], defaults[AMBIENT_PRESSURE], where).value
-
-
-def _read_entries(
-    system: System, kind: DriveKind, sections: Sections, entries: dict[str, Any], places: FileLocations
-) -> ParameterSet:
-    defaults, edits = system.parameters, dict[str, Parameter]()
-    _check_hardware(system, entries, places)
-    for alias in kind.aliases:
-        entries |= _read_alias(alias, sections, entries, defaults, places)
-    for name, entry in entries.items():
-        edits[name] = read_parameter(entry, defaults[name], _parameter_place(name, places))
+    zero = read(AMBIENT_PRESSURE).value if AMBIENT_PRESSURE in entries else ambient_pressure(defaults)
+    with count_gauge_from(zero):
+        _check_hardware(system, entries, places)
+        for alias in kind.aliases:
+            entries |= _read_alias(alias, sections, entries, defaults, places)
+        edits = {name: read(name) for name in entries}
     return defaults | ParameterSet({name: edits[name] for name in defaults if name in edits})
 
 

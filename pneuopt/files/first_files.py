@@ -14,7 +14,7 @@ from pneuopt.dynamics.system import System
 from pneuopt.evaluation.moves import ExcitationRun
 from pneuopt.files.drive import FIT_SECTIONS, default_parameters, drive_keys
 from pneuopt.files.keys import Template, json_schema
-from pneuopt.files.loop import signal_units, tuning_keys
+from pneuopt.files.loop import signal_units_of, tuning_keys
 from pneuopt.files.outputs import output_schema
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
@@ -25,7 +25,6 @@ from pneuopt.models.catalog import CATALOGUE_SOURCE
 from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.keys import Key
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.units import write_value
 
@@ -111,8 +110,8 @@ def _drive_template(kind: DriveKind, first: FirstFiles, values: ParameterSet, so
         section, _, key = name.partition(".")
         declared = sections[section].keys[key]
         if declared.source != DEFAULT_WIDTH:  # a stated width is not chosen by the logs any more
-            keys = {**sections[section].keys, key: _with_source(declared, p)}
-            sections[section] = replace(sections[section], keys=keys)
+            declared = replace(declared, source="catalogue") if p.source == CATALOGUE_SOURCE else declared
+            sections[section] = replace(sections[section], keys={**sections[section].keys, key: declared})
             stated[name] = _value_text(p, free=True) if name in first.unknowns else _value_text(p)
     title = (
         f"A {kind.name} drive: its hardware. Put in what you know; what is free is identified from logs:",
@@ -121,10 +120,6 @@ def _drive_template(kind: DriveKind, first: FirstFiles, values: ParameterSet, so
         *source,
     )
     return Template(title, sections, stated, schema=_schema_path("drive"))
-
-
-def _with_source(key: Key, parameter: Parameter) -> Key:
-    return replace(key, source="catalogue" if parameter.source == CATALOGUE_SOURCE else key.source)
 
 
 def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, counts_from_zero: bool) -> Template:
@@ -159,7 +154,7 @@ def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, 
         tuning_keys(command, measured),
         stated,
         {"reference": steps},
-        signal_units(command, measured, _position_unit(loop)),
+        signal_units_of(loop),
         examples,
         _tuning_names(loop, first, values),
         _schema_path("tuning"),
@@ -238,11 +233,6 @@ def _sidecar_template(
     return Template(title, SIDECAR_KEYS, stated, names=names, schema=_schema_path("sidecar"))
 
 
-def _position_unit(loop: ClosedLoop) -> str:
-    units = {q.name: q.unit for q in loop.plant.outputs}
-    return "m" if loop.plant.axis is None else units.get(loop.plant.axis.position, "m")
-
-
 def _value_text(p: Parameter, *, free: bool = False, bounds: bool = False) -> str:
     """A parameter's value, or a table with its bounds where it is free."""
     value = _number_text(p.value, p.unit)
@@ -266,7 +256,11 @@ PLAYED_FILE, RUN_FILE = "moves.csv", "run.toml"  # not one name: run.toml would 
 
 def run_files(run: ExcitationRun, drive: str = "drive.toml") -> dict[str, str]:
     """The texts of both files, by their names; `drive` is the name of the drive's file."""
-    return {PLAYED_FILE: _play_file(run), RUN_FILE: "\n".join([*_head(run, drive), *_loop(run), *_moves(run)]) + "\n"}
+    columns = run.moves.trajectory(run.loop.pid.sample_time or 0.0)
+    rows = zip(columns.t.tolist(), columns["reference"].tolist(), columns["reference_speed"].tolist(), strict=True)
+    header = "time [s],position_reference [mm],speed_reference [m/s]"
+    played = "\n".join([header, *(f"{t:.9g},{1e3 * r:.9g},{v:.6g}" for t, r, v in rows)]) + "\n"
+    return {PLAYED_FILE: played, RUN_FILE: "\n".join([*_run_head(run, drive), *_run_sections(run)]) + "\n"}
 
 
 def logged_channels(run: ExcitationRun) -> tuple[str, ...]:
@@ -277,15 +271,7 @@ def logged_channels(run: ExcitationRun) -> tuple[str, ...]:
     return run.loop.command.name, run.loop.feedback.name, *axis.final_element.pushing
 
 
-def _play_file(run: ExcitationRun) -> str:
-    """Time, position and speed of the reference at each sample."""
-    columns = run.moves.trajectory(run.loop.pid.sample_time or 0.0)
-    rows = zip(columns.t.tolist(), columns["reference"].tolist(), columns["reference_speed"].tolist(), strict=True)
-    header = "time [s],position_reference [mm],speed_reference [m/s]"
-    return "\n".join([header, *(f"{t:.9g},{1e3 * r:.9g},{v:.6g}" for t, r, v in rows)]) + "\n"
-
-
-def _head(run: ExcitationRun, drive: str) -> list[str]:
+def _run_head(run: ExcitationRun, drive: str) -> list[str]:
     low, high = (write_value(x, "m", 3) for x in run.between)
     fast = write_value(run.fastest, "m/s", 3)
     trail = write_value(run.following_error, "m", 2)
@@ -303,7 +289,8 @@ def _head(run: ExcitationRun, drive: str) -> list[str]:
     return [f"# {line}" for part in text for line in textwrap.wrap(part, COMMENT_WIDTH, subsequent_indent="  ")]
 
 
-def _loop(run: ExcitationRun) -> Iterator[str]:
+def _run_sections(run: ExcitationRun) -> Iterator[str]:
+    """The lines of a run's loop and of its moves."""
     p, unit, loop = run.parameters, run.loop.command.unit, run.loop
     limits = (write_value(p.value(f"pid.{end}") + run.centre, unit) for end in ("lower", "upper"))
     gain = write_value(p.value("pid.Kp"), p["pid.Kp"].unit)
@@ -311,9 +298,6 @@ def _loop(run: ExcitationRun) -> Iterator[str]:
     yield f'sample_time = "{write_value(loop.pid.sample_time or 0.0, "s")}"'
     yield f'Kp = "{gain}"'
     yield "limits = [" + ", ".join(f'"{end}"' for end in limits) + "]"
-
-
-def _moves(run: ExcitationRun) -> Iterator[str]:
     moves: Sequence[Move] = run.moves.moves
     first = moves[0]
     shared = {"speed": ("m/s", run.fastest), "acceleration": ("m/s^2", first.acceleration), "at": ("s", first.at)}

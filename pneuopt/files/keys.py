@@ -47,6 +47,11 @@ class KeyRow:
         return ".".join(filter(None, [self.section, self.name]))
 
     @property
+    def heading(self) -> str:
+        """Full name, unit and default in one line."""
+        return f"{self.full_name}{f' [{self.unit}]' if self.unit else ''}{f' = {self.usual}' if self.usual else ''}"
+
+    @property
     def remarks(self) -> str:
         """Meaning, words, condition, kinds and source in one line."""
         words = "" if self.key.choices is None else ", ".join(f'"{word}"' for word in self.key.choices)
@@ -72,7 +77,9 @@ def list_keys() -> tuple[KeyRow, ...]:
     others = {"tuning.toml": tuning_keys(), "study.toml": STUDY_KEYS, "rig.toml": RIG_KEYS, "log.toml": SIDECAR_KEYS}
     rows = list(_drive_rows())
     for file, sections in others.items():
-        rows += [_row(file, name, key) for name, key in _merge_shared(sections)]
+        for name, key in _merge_shared(sections):
+            section, _, own = name.partition(".")
+            rows.append(KeyRow(file, section, own, key, describe_unit(key), describe_usual(key)))
     return tuple(rows)
 
 
@@ -89,7 +96,11 @@ def describe_usual(key: Key) -> str:
         return f"[{', '.join(describe_usual(Key('', usual=entry)) for entry in usual)}]"
     if isinstance(usual, int) and key.takes in (Takes.COUNT, Takes.SAMPLES):
         return str(usual)
-    return _describe_value(usual, key.unit)
+    try:
+        text = write_value(usual, key.unit)
+    except UnitError:  # of a signal that is not known yet
+        return f"{usual:g}"
+    return text if key.unit == "1" else f'"{text}"'
 
 
 def describe_unit(key: Key) -> str:
@@ -97,19 +108,6 @@ def describe_unit(key: Key) -> str:
     unit = key.unit.replace("{own}", "its own").replace("{signal}", "its own").replace("{column}", "the column's")
     unit = unit.format_map(_SIGNAL_WORDS)
     return "" if unit == "1" else unit
-
-
-def _describe_value(value: float, unit: str) -> str:
-    try:
-        text = write_value(value, unit)
-    except UnitError:  # of a signal that is not known yet
-        return f"{value:g}"
-    return text if unit == "1" else f'"{text}"'
-
-
-def _row(file: str, name: str, key: Key) -> KeyRow:
-    section, _, own = name.partition(".")
-    return KeyRow(file, section, own, key, describe_unit(key), describe_usual(key))
 
 
 def _merge_shared(sections: Mapping[str, Key]) -> Iterable[tuple[str, Key]]:
@@ -157,6 +155,7 @@ def _join(texts: Mapping[str, str]) -> str:
 
 
 _VALUE: dict[str, Any] = {"type": ["number", "string"]}
+_SPREAD: dict[str, Any] = {"type": ["number", "string", "array"]}
 
 
 def json_schema(title: str, sections: Mapping[str, Key], results: Iterable[str] = ()) -> dict[str, Any]:
@@ -187,10 +186,6 @@ def _describe_table(key: Key) -> dict[str, Any]:
     }
 
 
-def _describe_text(key: Key) -> dict[str, Any]:
-    return {"type": "string"} if key.choices is None else {"type": "string", "enum": list(key.choices)}
-
-
 def _describe_list(key: Key) -> dict[str, Any]:
     items = {"enum": list(key.choices)} if key.choices is not None else _describe_entry(key.of) if key.of else {}
     least, most = key.counts
@@ -203,30 +198,19 @@ def _describe_list(key: Key) -> dict[str, Any]:
     }
 
 
-def _describe_count(key: Key) -> dict[str, Any]:
-    bounds = {"minimum": key.least, "maximum": key.most}
-    return {"type": "integer", **{n: bound for n, bound in bounds.items() if abs(bound) < inf}}
-
-
-def _value_or_table(key: Key) -> dict[str, Any]:
-    return {"anyOf": [_VALUE, _describe_table(table("", key.keys or PARAMETER_KEYS))]}
-
-
-def _spread_or_table(key: Key) -> dict[str, Any]:
-    spread: dict[str, Any] = {"type": ["number", "string", "array"]}
-    return {"anyOf": [spread, _describe_table(table("", key.keys))]} if key.keys else spread
-
-
 _FORMS: Mapping[Takes, Callable[[Key], dict[str, Any]]] = {
     Takes.FLAG: lambda _: {"type": "boolean"},
-    Takes.TEXT: _describe_text,
-    Takes.COUNT: _describe_count,
+    Takes.TEXT: lambda key: {"type": "string"} | ({} if key.choices is None else {"enum": list(key.choices)}),
+    Takes.COUNT: lambda key: (
+        {"type": "integer"}
+        | {n: bound for n, bound in (("minimum", key.least), ("maximum", key.most)) if abs(bound) < inf}
+    ),
     Takes.SAMPLES: lambda _: {"type": ["integer", "string"]},
     Takes.NUMBER: lambda _: _VALUE,
-    Takes.PARAMETER: _value_or_table,
+    Takes.PARAMETER: lambda key: {"anyOf": [_VALUE, _describe_table(table("", key.keys or PARAMETER_KEYS))]},
     Takes.LIST: _describe_list,
     Takes.FLAG_OR_LIST: lambda _: {"type": ["boolean", "array"]},
-    Takes.SPREAD: _spread_or_table,
+    Takes.SPREAD: lambda key: {"anyOf": [_SPREAD, _describe_table(table("", key.keys))]} if key.keys else _SPREAD,
     Takes.AXIS: lambda _: {"type": ["array", "object"]},
     Takes.COLUMN: lambda key: {"anyOf": [{"type": ["string", "boolean"]}, _describe_table(table("", key.keys))]},
     Takes.TABLE: _describe_table,
@@ -285,17 +269,13 @@ class Template:
         """A key that is stated, or a comment with what is usual, or with an example."""
         usual = describe_usual(key)
         shown = text if text is not None else self._example_text(f"{section}.{name}", key)
-        unit = self._fill(key)
+        known = all(word in self.units for word in _words_of(key.unit))
+        unit = "" if key.unit == "1" else key.unit.format_map(self.units) if known else describe_unit(key)
         words = f"one of {', '.join(key.choices)}" if key.choices is not None else ""
         standing = f"default {usual}" if text is not None and usual and usual != text else "default" if usual else ""
         standing = "" if key.takes is Takes.TABLE or key.source.startswith(standing) else standing
         remarks = [key.meaning + (f" [{unit}]" if unit else ""), words, key.limits, key.condition, standing, key.source]
         yield from _line(f"{'' if text is not None else '# '}{name} = {shown}", "; ".join(filter(None, remarks)))
-
-    def _fill(self, key: Key) -> str:
-        """The unit of a key for this file's signals."""
-        known = all(word in self.units for word in _words_of(key.unit))
-        return "" if key.unit == "1" else key.unit.format_map(self.units) if known else describe_unit(key)
 
     def _example_text(self, name: str, key: Key) -> str:
         if name in self.examples:
@@ -306,19 +286,15 @@ class Template:
             return f"{{ {', '.join(inner)} }}"
         words = _words_of(key.unit)
         if words and all(word in self.units for word in words) and key.takes is not Takes.LIST:
-            return _value_example(key, key.unit.format_map(self.units))
+            unit = key.unit.format_map(self.units)
+            if key.usual is not None:
+                return f"{key.usual:g}" if unit == "1" else f'"{key.usual:g} {unit}"'
+            try:
+                read_value(key.example.strip('"'), unit)
+            except UnitError:
+                return "1" if unit == "1" else f'"1 {unit}"'
+            return key.example
         return describe_usual(key) or key.example or (f'"{next(iter(key.choices))}"' if key.choices else '""')
-
-
-def _value_example(key: Key, unit: str) -> str:
-    """The usual value in the unit of a signal; else the key's own example where it has that unit, or one unit."""
-    if key.usual is not None:
-        return f"{key.usual:g}" if unit == "1" else f'"{key.usual:g} {unit}"'
-    try:
-        read_value(key.example.strip('"'), unit)
-    except UnitError:
-        return "1" if unit == "1" else f'"1 {unit}"'
-    return key.example
 
 
 def _words_of(unit: str) -> list[str]:

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pneuopt.control.compensators import COMPENSATORS, Compensator
+from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.gain_schedule import SCHEDULED_GAINS, GainSchedule
@@ -261,13 +261,6 @@ REPLACED_METHODS = {
 }  # in files of older versions
 
 
-def _option_keys(name: str) -> dict[str, Key]:
-    """The options of a method that a file can state: numbers, and lists of them."""
-    meanings, condition = argument_meanings(METHODS[name]), f'with kind = "{name}"'
-    own = [f for f in fields(METHODS[name]) if isinstance(f.default, int | float | tuple)]
-    return {f.name: _option_key(f.default, meanings.get(f.name, ""), condition) for f in own}
-
-
 def _option_key(usual: Any, meaning: str = "", condition: str = "") -> Key:
     if isinstance(usual, tuple):
         return Key(meaning, Takes.LIST, usual=usual, condition=condition, of=_option_key(usual[0]))
@@ -276,8 +269,15 @@ def _option_key(usual: Any, meaning: str = "", condition: str = "") -> Key:
     return Key(meaning, Takes.COUNT, usual=usual, condition=condition, least=-MAX_OPTION, most=MAX_OPTION)
 
 
-METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {name: _option_keys(name) for name in METHODS}
-"""The options of each method."""
+METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {
+    name: {
+        f.name: _option_key(f.default, argument_meanings(kind).get(f.name, ""), f'with kind = "{name}"')
+        for f in fields(kind)
+        if isinstance(f.default, int | float | tuple)
+    }
+    for name, kind in METHODS.items()
+}
+"""The options of each method that a file can state: numbers, and lists of them."""
 
 
 def _join_options() -> dict[str, Key]:
@@ -481,6 +481,13 @@ def signal_units(command: str, measured: str, position: str = "m") -> dict[str, 
     }
 
 
+def signal_units_of(loop: ClosedLoop) -> dict[str, str]:
+    """The units that the words in braces stand for in a loop."""
+    axis, units = loop.plant.axis, {q.name: q.unit for q in loop.plant.outputs}
+    position = "m" if axis is None else units.get(axis.position, "m")
+    return signal_units(loop.command.unit, loop.feedback.unit, position)
+
+
 LIMIT_KEYS: Mapping[str, Key] = {**{n: limit_key(n) for n in REQUIREMENTS_BY_KEY}, NO_HUNTING_KEY: _NO_HUNTING}
 """What [limits] may hold."""
 TUNING_KEYS: Mapping[str, Key] = {
@@ -591,7 +598,8 @@ def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
     dither = _dither(table["dither"], f"{path}: [dither]") if "dither" in table else None
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
     lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
-    parts = tuple(_compensator(n, table[n], f"{path}: [{n}]") for n in COMPENSATORS if n in table)
+    chosen = {n: read_table(LOOP_KEYS[n], table[n], f"{path}: [{n}]", partial=True) for n in COMPENSATORS if n in table}
+    parts = tuple(construct_at(partial(COMPENSATORS[n], **own), f"{path}: [{n}]") for n, own in chosen.items())
     outer = PositionLoop() if PositionLoop.section in table else None
     schedule = _schedule(table["schedule"], plant, f"{path}: [schedule]") if "schedule" in table else None
     loop = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
@@ -601,18 +609,7 @@ def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
 def _pid(table: Mapping[str, Any], where: str) -> PID:
     keys = {n: key for n, key in LOOP_KEYS["pid"].items() if n != "limits"}  # their unit is the loop's
     read = read_table(keys, table, where, partial=True)
-    _check_gains(table, read["form"], where)
-    banded, resets = "dead_band" in table, "reset_ratio" in table
-    told = "reset_band is that of resets; write reset_ratio, too, 1 for the whole integral"
-    require(resets or "reset_band" not in table, f"{where} {told}")
-    unwinds = read["anti_windup"]
-    told = "Tt is back-calculation's; clamping has none; leave it out"
-    require("Tt" not in table or unwinds is AntiWindup.BACK_CALCULATION, f"{where} {told}")
-    made = partial(PID, read["sample_time"], "limits" in table, read["form"], read["delay"], banded, unwinds, resets)
-    return construct_at(made, where)
-
-
-def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
+    form: Form = read["form"]
     own, first = (*form.gains, *_SHARED_PID_KEYS), form.gains[0]
     for key in table:
         meant = _GAIN_CORRECTIONS[form].get(key)
@@ -620,6 +617,14 @@ def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
         require(meant is None, f"{where} {message}")
     require(first in table, f"{where} has no gain; write at least {first}")
     require("Tt" not in table or "limits" in table, f"{where} Tt unwinds the integral at limits; write limits, too")
+    banded, resets = "dead_band" in table, "reset_ratio" in table
+    told = "reset_band is that of resets; write reset_ratio, too, 1 for the whole integral"
+    require(resets or "reset_band" not in table, f"{where} {told}")
+    unwinds = read["anti_windup"]
+    told = "Tt is back-calculation's; clamping has none; leave it out"
+    require("Tt" not in table or unwinds is AntiWindup.BACK_CALCULATION, f"{where} {told}")
+    made = partial(PID, read["sample_time"], "limits" in table, form, read["delay"], banded, unwinds, resets)
+    return construct_at(made, where)
 
 
 def _dither(table: Mapping[str, Any], where: str) -> Dither:
@@ -664,17 +669,15 @@ def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedu
     return construct_at(lambda: GainSchedule(gains, low, high, load, axis.position), where)
 
 
-def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensator:
-    """A compensator, whose fields are choices of an enum."""
-    chosen = read_table(LOOP_KEYS[section], table, where, partial=True)
-    return construct_at(lambda: COMPENSATORS[section](**chosen), where)
-
-
 def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centre: float) -> ParameterSet:
     own = loop.controller.parameters
     read = _read_limits(table["pid"], own, centre, f"{path}: [pid] limits")
     for section in TUNABLE_SECTIONS:
-        read |= _section_parameters(table.get(section, {}), section, own, f"{path}: [{section}]")
+        entries, where, first = table.get(section, {}), f"{path}: [{section}]", len(section) + 1
+        keys = [n[first:] for n in own if n.startswith(f"{section}.") and n[first:] not in _LIMITS]
+        check_names("key", entries, (*LOOP_KEYS[section], *keys), where)
+        names = {k: f"{section}.{k}" for k in keys if k in entries}
+        read |= {name: read_parameter(entries[k], own[name], f"{where} {k}") for k, name in names.items()}
     read = _fault_values(read, loop, centre, f"{path}: [pid]")
     for name in (n for n, p in read.items() if p.free):
         section, _, key = name.partition(".")
@@ -696,16 +699,6 @@ def _fault_values(read: dict[str, Parameter], loop: ClosedLoop, centre: float, w
     require(whole, f"{where} fault_samples is a whole number of samples, 1 at least; the default is {FAULT_SAMPLES:g}")
     safe = read.get("pid.fault_output")
     return read | ({"pid.fault_output": replace(safe, value=safe.value - centre)} if safe else {})
-
-
-def _section_parameters(
-    entries: Mapping[str, Any], section: str, own: ParameterSet, where: str
-) -> dict[str, Parameter]:
-    keys = [n.removeprefix(f"{section}.") for n in own if n.startswith(f"{section}.")]
-    keys = [k for k in keys if k not in ("lower", "upper")]
-    check_names("key", entries, (*LOOP_KEYS[section], *keys), where)
-    names = {k: f"{section}.{k}" for k in keys if k in entries}
-    return {name: read_parameter(entries[k], own[name], f"{where} {k}") for k, name in names.items()}
 
 
 def _read_limits(entries: Mapping[str, Any], own: ParameterSet, centre: float, where: str) -> dict[str, Parameter]:

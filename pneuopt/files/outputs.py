@@ -89,14 +89,12 @@ def describe_member(member: Member) -> str:
     return f"{member.meaning}{': ' if own else ''}{own}{further}{optional}"
 
 
-def _schema(member: Member) -> dict[str, Any]:
-    return {"description": member.meaning, **_SCHEMAS[member.holds](member)}
-
-
 def _record(member: Member) -> dict[str, Any]:
     return {
         "type": "object",
-        "properties": {name: _schema(own) for name, own in member.members.items()},
+        "properties": {
+            name: {"description": own.meaning, **_SCHEMAS[own.holds](own)} for name, own in member.members.items()
+        },
         "required": [name for name, own in member.members.items() if not own.is_optional],
         "additionalProperties": _ANY if member.is_open else False,
     }

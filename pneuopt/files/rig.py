@@ -66,32 +66,25 @@ def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
     actuator = _read_numbers(
         sections.get("actuator", {}), RIG_KEYS["actuator"], Actuator(), loop.command.unit, f"{path}: [actuator]"
     )
-    encoder = _read_encoder(sections.get("encoder", {}), loop, f"{path}: [encoder]")
-    sensors = _read_sensors(sections.get("sensors", {}), loop, f"{path}: [sensors") or _own_sensors(loop)
+    units, usual = {q.name: q.unit for q in loop.plant.outputs}, Encoder()
+    sensors = _read_sensors(sections.get("sensors", {}), units, f"{path}: [sensors")
+    if isinstance(loop.sensor, Encoder):
+        usual, sensors = loop.sensor, sensors or {loop.sensor.position: Sensor()}
+    elif isinstance(loop.sensor, SensorLag):
+        sensors = sensors or {loop.feedback.name: Sensor(lag=loop.sensor.lag)}
+    if loop.plant.axis is not None:
+        usual = replace(usual, position=loop.plant.axis.position)
+    unit, where = units.get(usual.position, "m"), f"{path}: [encoder]"
+    encoder = _read_numbers(sections.get("encoder", {}), RIG_KEYS["encoder"], usual, unit, where)
+    sensors = sensors or {loop.feedback.name: Sensor()}
     return construct_at(lambda: Rig(own, sensors, actuator, encoder), str(path))
 
 
-def _read_sensors(entries: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Sensor]:
-    units = {q.name: q.unit for q in loop.plant.outputs}
+def _read_sensors(entries: Mapping[str, Any], units: Mapping[str, str], where: str) -> dict[str, Sensor]:
     check_names("output", entries, units, f"{where}]")
     for name, entry in entries.items():
         require(isinstance(entry, dict), f"{where}] must hold sections, [sensors.{name}]")
     return {n: _read_numbers(entry, _SENSOR, Sensor(), units[n], f"{where}.{n}]") for n, entry in entries.items()}
-
-
-def _read_encoder(entries: Mapping[str, Any], loop: ClosedLoop, where: str) -> Encoder:
-    axis = loop.plant.axis
-    usual = loop.sensor if isinstance(loop.sensor, Encoder) else Encoder()
-    usual = replace(usual, position=axis.position) if axis is not None else usual
-    unit = {q.name: q.unit for q in loop.plant.outputs}.get(usual.position, "m")
-    return _read_numbers(entries, RIG_KEYS["encoder"], usual, unit, where)
-
-
-def _own_sensors(loop: ClosedLoop) -> dict[str, Sensor]:
-    """The sensor of the loop as the rig's."""
-    if isinstance(loop.sensor, Encoder):
-        return {loop.sensor.position: Sensor()}
-    return {loop.feedback.name: Sensor(lag=loop.sensor.lag if isinstance(loop.sensor, SensorLag) else 0.0)}
 
 
 def _read_numbers(entries: Mapping[str, Any], section: Key, usual: Part, unit: str, where: str) -> Part:

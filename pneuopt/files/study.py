@@ -352,12 +352,8 @@ def _read_axis(name: str, entry: Any, unit: str, where: str) -> SweptAxis:
     if isinstance(entry, list):
         first, values = entry[0], [read_value(e, unit, where=where) for e in entry]
     else:
-        first, values = entry.get("from"), _read_range(entry, unit, where)
+        said = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
+        first, values = entry.get("from"), [float(v) for v in np.linspace(said["from"], said["to"], said["steps"])]
     written = read_unit(first, unit)
     factor, offset = si_conversion(written, unit, where=where)
     return SweptAxis(name, tuple(values), written, factor, offset)
-
-
-def _read_range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
-    said = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
-    return [float(v) for v in np.linspace(said["from"], said["to"], said["steps"])]

@@ -62,7 +62,12 @@ def write_tuned(
     for name in TUNED_SECTIONS:
         document.pop(name, None)
     move_paths(document.get("reference", []), Path(source).parent, Path(path).parent)
-    _write_gains(document, gains, source)
+    for section in TUNABLE_SECTIONS:
+        for key, entry in document.unwrap().get(section, {}).items():
+            if isinstance(entry, dict) and entry.get("free", False):
+                found = gains[f"{section}.{key}"]
+                given = read_parameter(entry, replace(found, free=True), f"{source}: [{section}] {key}")
+                write_parameter(document, f"{section}.{key}", replace(given, value=found.value), given)  # in its unit
     status: dict[str, Any] = {"code": result.status.code.value, "message": result.status.message}
     if result.status.converged:
         rows = result.certified.to_dict(orient="dict")
@@ -78,16 +83,6 @@ def write_tuned(
         _check_subject(document.unwrap(), path, stored, result, gains)
         document[CHECKSUM] = checksum_section(document.unwrap(), path, stored)
     write_text(path, tomlkit.dumps(document))
-
-
-def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:
-    """Write the tuned values of the free parameters into a document, in the units that the user gave them in."""
-    for section in TUNABLE_SECTIONS:
-        for key, entry in document.unwrap().get(section, {}).items():
-            if isinstance(entry, dict) and entry.get("free", False):
-                found = tuned[f"{section}.{key}"]
-                given = read_parameter(entry, replace(found, free=True), f"{source}: [{section}] {key}")
-                write_parameter(document, f"{section}.{key}", replace(given, value=found.value), given)
 
 
 def _check_subject(

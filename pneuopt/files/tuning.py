@@ -16,7 +16,7 @@ from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.rest_check import NoHunting
-from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, further, samples, tolerances
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios, corners, further, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.evaluation.tolerances import PLANT_COUNT
 from pneuopt.files.loop import (
@@ -128,11 +128,10 @@ def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSe
 def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
     """Draw plants from the boxes of [scenarios], others than `read_scenarios` gives, each with all that it varies."""
     kinds = [list(part.values()) for part in _read_kinds(table, where, parameters, PLANT_COUNT)]
-    return {f"new {k}": _merge_scenarios(own) for k, own in enumerate(zip(*kinds, strict=True), 1)}
-
-
-def _merge_scenarios(parts: Sequence[Mapping[str, float | Factor]]) -> dict[str, float | Factor]:
-    return {n: value for part in parts for n, value in part.items()}
+    return {
+        f"new {k}": {n: value for part in own for n, value in part.items()}
+        for k, own in enumerate(zip(*kinds, strict=True), 1)
+    }
 
 
 def _read_objective(table: TuningSections, loop: ClosedLoop, path: str | Path) -> dict[Requirement, float]:
@@ -260,7 +259,9 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: i
         require(key in kind.keys, message)
     for key in ("horizon",) if "disturbance" in entry and kind is _STEP else kind.needed:
         require(key in entry, f"{where} has no {key}")
-    known = _read_stated(kind.keys, entry, loop, where) | _circumstances(entry, loop, where)
+    known, outputs = _read_stated(kind.keys, entry, loop, where), {q.name: q.unit for q in loop.plant.outputs}
+    known["start"] = read_named(REFERENCE_KEYS["start"], entry.get("start", {}), outputs, f"{where} start")
+    known["disturbance"] = _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")
     if kind is _PATH:
         table = file.parent / known.pop("path")
         known = {"dwell": Move.dwell, **known}
@@ -292,13 +293,6 @@ def _chain_moves(each: Sequence[Mapping[str, Any]], settings: Mapping[str, Any])
     last = {"disturbance": settings.get("disturbance", {})}
     moves = [Move(**{**shared, **own, **(last if k == len(others) else {})}) for k, own in enumerate(others, 1)]
     return MoveSequence([Move(**{**begins, **shared, **first}), *moves])
-
-
-def _circumstances(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Any]:
-    """Read how the plant starts, and its disturbance."""
-    outputs = {q.name: q.unit for q in loop.plant.outputs}
-    begun = read_named(REFERENCE_KEYS["start"], entry.get("start", {}), outputs, f"{where} start")
-    return {"start": begun, "disturbance": _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")}
 
 
 def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:

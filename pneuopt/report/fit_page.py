@@ -26,7 +26,7 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, number_columns,
 from pneuopt.quantities.status import report_status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
-from pneuopt.report.page import Page, Picture, Section, data_section, provenance_section
+from pneuopt.report.page import Page, Picture, Section, data_section, log_hashes, provenance_section
 from pneuopt.report.tolerances import MIN_CORRELATED
 
 if TYPE_CHECKING:
@@ -59,17 +59,21 @@ def fit_page(
     biased = [str(n) for n, mark in marks.items() if mark == Mark.BIAS_POSSIBLE]
     doubts = [f"a model error may bias {join_names(biased)}: the intervals do not hold it"] if biased else []
     unknown = result.verdict.sentences if result.verdict else ()
+    runs = list(result.trajectories.values())
+    compared = (_comparison(runs, experiments, "fitted"),) if experiments and runs else ()
+    rows = result.fit.reset_index().to_dict(orient="records")
+    counted = {(str(row["log"]), str(row["channel"])): float(row["noise"]) for row in rows}
     sections = (
         _estimate_section(result),
-        _agreement_section(result, experiments),
+        Section("Agreement with the logs", (report_agreement(result.fit), *compared)),
         _held_out_section(result, system, held_out),
         _friction_section(result, system, experiments),
-        _residual_section(result, experiments),
+        Section("Residuals", (_residual_picture(runs, experiments),) if compared else ()),
         Section("Simulated and fitted again", () if trial is None else (trial,)),
         _finding_section(findings),
         _known_section(result),
-        data_section((*experiments, *held_out), noise=_counted_noise(result)),
-        provenance_section(result.provenance, {**source.hashes, **_hashes(held_out)}),
+        data_section((*experiments, *held_out), noise=counted),
+        provenance_section(result.provenance, {**source.hashes, **log_hashes(held_out)}),
     )
     warnings = tuple(dict.fromkeys((*unknown, *doubts, *source.warnings)))
     return Page(source.title, report_status(result.status), sections, warnings)
@@ -90,7 +94,7 @@ def refusal_page(
     sections = (
         Section("What shows it", tuple(pictures)),
         data_section(experiments),
-        provenance_section({}, {**_hashes(experiments), **source.hashes}),
+        provenance_section({}, {**log_hashes(experiments), **source.hashes}),
     )
     return Page(source.title, verdict, sections, source.warnings)
 
@@ -108,7 +112,7 @@ def prediction_page(
         Section("Agreement with the logs", (report_agreement(table), _comparison(runs, experiments, "predicted"))),
         Section("Residuals", (_residual_picture(runs, experiments),)),
         data_section(experiments),
-        provenance_section({}, {**_hashes(experiments), **source.hashes}),
+        provenance_section({}, {**log_hashes(experiments), **source.hashes}),
     )
     return Page(source.title, Report((verdict,)), sections, source.warnings)
 
@@ -136,12 +140,6 @@ def _known_section(result: IdentificationResult) -> Section:
     return Section("Known values", (Report((lead, Table(heads, rows))),) if rows else ())
 
 
-def _agreement_section(result: IdentificationResult, experiments: Sequence[Experiment]) -> Section:
-    runs = list(result.trajectories.values())
-    pictures = (_comparison(runs, experiments, "fitted"),) if experiments and runs else ()
-    return Section("Agreement with the logs", (report_agreement(result.fit), *pictures))
-
-
 def _held_out_section(
     result: IdentificationResult, system: System | ClosedLoop | None, held_out: Sequence[Experiment]
 ) -> Section:
@@ -165,11 +163,6 @@ def _friction_section(
     alt = "Friction force over speed: points that the logs imply, the fitted curve through them and its 95 % band."
     caption = "Friction over speed: what the logs imply (points), the fitted curve and its 95 % band."
     return Section("Friction", (Picture(partial(plot_friction, system, result, experiments), alt, caption),))
-
-
-def _residual_section(result: IdentificationResult, experiments: Sequence[Experiment]) -> Section:
-    runs = list(result.trajectories.values())
-    return Section("Residuals", (_residual_picture(runs, experiments),) if experiments and runs else ())
 
 
 def _residual_picture(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Picture:
@@ -202,15 +195,6 @@ def _finding_section(findings: Sequence[LogFinding]) -> Section:
 def _finding_picture(finding: LogFinding) -> Picture:
     alt = f"The signals of {finding.log or 'the log'} that show it: {finding.message}"
     return Picture(partial(plot_finding, finding), alt, f"What shows it: {finding.message}.")
-
-
-def _counted_noise(result: IdentificationResult) -> dict[tuple[str, str], float]:
-    rows = result.fit.reset_index().to_dict(orient="records")
-    return {(str(row["log"]), str(row["channel"])): float(row["noise"]) for row in rows}
-
-
-def _hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
-    return {f"sha256[{e.name}]": e.sha256 for e in experiments}
 
 
 def _names(experiments: Sequence[Experiment]) -> str:

@@ -7,7 +7,8 @@ import base64
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 
 from pneuopt.control.controller import Controller
 from pneuopt.control.loop import ClosedLoop, add_disturbances
-from pneuopt.control.pid import ParallelForm, to_series, to_standard
+from pneuopt.control.pid import to_series, to_standard
 from pneuopt.control.reference import Reference
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.evaluate import respond
@@ -161,6 +162,11 @@ def data_section(experiments: Sequence[Experiment], noise: Mapping[tuple[str, st
     return Section("Data", (Report((table, Table(own, tuple(channels)), *known, *remarks)),))
 
 
+def log_hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
+    """The hashes of logs, by their names in a provenance."""
+    return {f"{_HASH}{e.name}]": e.sha256 for e in experiments}
+
+
 def provenance_section(provenance: Mapping[str, str], hashes: Mapping[str, str]) -> Section:
     """What a result was computed from, by hash, and with which versions and options."""
     known = {**{n: v for n, v in provenance.items() if n.startswith(_HASH)}, **hashes}
@@ -207,7 +213,7 @@ def report_forms(controller: Controller, parameters: ParameterSet) -> Report:
     unit = unit_ratio(controller.command.unit, controller.pid_signal.unit)
     units = {"Kp": unit, "K": unit, "Ki": unit_ratio(unit, "s"), "Kd": unit_ratio(f"({unit})*s", "1"), "N": "1"}
     rows, refused = [], []
-    for (name, law), convert in zip(LAW_TEXTS.items(), (_as_given, to_standard, to_series), strict=True):
+    for (name, law), convert in zip(LAW_TEXTS.items(), (replace, to_standard, to_series), strict=True):
         try:
             gains = vars(convert(parallel))
         except InputError as error:
@@ -215,7 +221,8 @@ def report_forms(controller: Controller, parameters: ParameterSet) -> Report:
             continue
         if gains.get("Td") == 0:
             gains = {**gains, "N": math.nan} if "N" in gains else gains  # of no derivative there is no ratio
-        rows.append((name, *(_cell(n, value, units.get(n, "s")) for n, value in gains.items()), law.replace("~", TIED)))
+        written = {n: write_value(v, units.get(n, "s"), GAIN_DIGITS) for n, v in gains.items() if not math.isnan(v)}
+        rows.append((name, *(f"{n} {written.get(n, '-')}" for n in gains), law.replace("~", TIED)))
     return Report((Table(text_columns("form", "", "", "", "", "law"), tuple(rows)), *refused, Line(N_NOTE)))
 
 
@@ -251,14 +258,6 @@ def report_settings(controller: Controller, parameters: ParameterSet) -> Report:
     return Report((Line("; ".join(lines)), *([Table(text_columns("setting", "value"), rows)] if rows else [])))
 
 
-def _cell(name: str, value: float, unit: str) -> str:
-    return f"{name} -" if math.isnan(value) else f"{name} {write_value(value, unit, GAIN_DIGITS)}"
-
-
-def _as_given(gains: ParallelForm) -> ParallelForm:
-    return gains
-
-
 def simulate_responses(
     loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, before: ParameterSet | None = None
 ) -> list[Response]:
@@ -267,7 +266,10 @@ def simulate_responses(
     found = []
     for reference in references:
         run = _simulate_response(loop, reference, parameters)
-        earlier = None if before is None else _simulate_initial_response(loop, reference, before)
+        earlier = None
+        if before is not None:
+            with suppress(ConvergenceError, InputError):
+                earlier = _simulate_response(loop, reference, before)
         period, push = loop.dither_period(parameters), loop.plant.axis.force if loop.plant.axis else "N"
         found.append(Response(run, reference, loop.feedback.name, units, earlier, period, push))
     return found
@@ -334,13 +336,6 @@ def _simulate_response(loop: ClosedLoop, reference: Reference, parameters: Param
     others = {q.name: np.zeros(len(run)) for q in plant.inputs if q.name not in run}
     whole = run.with_columns({**others, loop.command.name: run["control"]})
     return run.with_columns({"friction.force": friction_force(plant, whole, parameters)})
-
-
-def _simulate_initial_response(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> Trajectory | None:
-    try:
-        return _simulate_response(loop, reference, parameters)
-    except (ConvergenceError, InputError):
-        return None
 
 
 def _open_loop(loop: ClosedLoop, parameters: ParameterSet, reference: Reference, run: Trajectory) -> Linearisation:

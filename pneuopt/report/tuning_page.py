@@ -31,6 +31,7 @@ from pneuopt.report.page import (
     Section,
     data_section,
     diagram_picture,
+    log_hashes,
     loop_figures,
     loop_pictures,
     provenance_section,
@@ -346,13 +347,9 @@ def summary_page(
         Section("Figures", tuple(pictures)),
         Section("Result", (details,)),
         *((data_section(experiments),) if experiments else ()),
-        provenance_section(dict(provenance or {}), {**source.hashes, **_hashes(experiments)}),
+        provenance_section(dict(provenance or {}), {**source.hashes, **log_hashes(experiments)}),
     )
     return Page(source.title, Report((first,) if is_line else ()), sections, source.warnings)
-
-
-def _hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
-    return {f"sha256[{e.name}]": e.sha256 for e in experiments if e.sha256}
 
 
 def tracking_picture(found: Tracking) -> Picture:
