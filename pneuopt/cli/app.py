@@ -203,7 +203,7 @@ def report_errors() -> Iterator[None]:
 
         show_sentence(make_console(error=True), sentence)
 
-    def print_warning(message: Warning | str, *_: object) -> None:  # each once, as soon as it comes
+    def print_warning(message: Warning | str, *_: object, **__: object) -> None:  # each once, as soon as it comes
         line = f"warning: {message}"
         if line not in printed:
             printed.add(line)

@@ -119,14 +119,11 @@ def format_markdown(rows: Sequence[KeyRow]) -> str:
     parts = []
     for file, own in groupby(rows, key=lambda row: row.file):
         parts.append(f"**{file}**: {FILE_MEANINGS[file]}\n\n| key | unit | default | |\n|---|---|---|---|")
-        parts[-1] += "".join(f"\n{_markdown_row(row)}" for row in own)
+        for row in own:
+            name = f"**[{row.section}]**" if (not row.name and row.key.keys) or row.key.others else f"`{row.full_name}`"
+            cells = [name, row.unit, row.usual and f"`{row.usual}`", row.remarks]
+            parts[-1] += "\n| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     return "\n\n".join(parts)
-
-
-def _markdown_row(row: KeyRow) -> str:
-    name = f"**[{row.section}]**" if (not row.name and row.key.keys) or row.key.others else f"`{row.full_name}`"
-    cells = [name, row.unit, row.usual and f"`{row.usual}`", row.remarks]
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def _show_entries(groups: Mapping[str, Sequence[tuple[str, str]]]) -> None:

@@ -228,7 +228,12 @@ def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, un
     speed = read_value(options.speed, "m/s", where="--speed") if options.speed else inf
     sample_time = read_value(options.sample_time, "s", where="--sample-time")
     require(sample_time > 0, f"--sample-time {options.sample_time}: give the controller's, such as 1ms")
-    between = _read_between(options.between) if options.between else None
+    between = None
+    if options.between:
+        low, dots, high = options.between.partition("..")
+        require(bool(dots), f"--between {options.between}: give both ends, as in 20mm..180mm")
+        between = read_value(low.strip(), "m", where="--between"), read_value(high.strip(), "m", where="--between")
+        require(between[0] < between[1], f"--between {options.between}: the first end must be below the second")
     run = excitation_run(model.system(), parameters, sample_time=sample_time, between=between, speed=speed)
     write_files({folder / name: text for name, text in run_files(run, drive.name).items()}, force)
     low, high, trail = (write_value(x, "m", 3) for x in (*run.between, run.following_error))
@@ -239,11 +244,3 @@ def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, un
     say(f"Log {', '.join(logged_channels(run))} at the controller's samples, from before the first move on, then")
     typer.echo(f"  pneuopt identify {drive} LOG -o fit.toml")
     return EXIT_SUCCESS
-
-
-def _read_between(text: str) -> tuple[float, float]:
-    low, dots, high = text.partition("..")
-    require(bool(dots), f"--between {text}: give both ends, as in 20mm..180mm")
-    first, last = (read_value(end.strip(), "m", where="--between") for end in (low, high))
-    require(first < last, f"--between {text}: the first end must be below the second")
-    return first, last

@@ -176,6 +176,11 @@ def add_to_stem(path: Path, name: str) -> Path:
     return path.with_stem(f"{path.stem}_{name}")
 
 
+def number_paths(path: Path, count: int) -> list[Path]:
+    """One file a run: run.csv, or run_1.csv, run_2.csv."""
+    return [path] if count == 1 else [add_to_stem(path, str(k)) for k in range(1, count + 1)]
+
+
 def write_csv(path: Path, run: Trajectory, columns: Columns) -> None:
     """Write a run as a log that can be read again."""
     header = ",".join(["time [s]", *(f"{name} [{unit}]" for name, unit in columns.values())])

@@ -592,7 +592,9 @@ def report_front(table: "pd.DataFrame", requirements: Mapping[str, str], gains: 
             word = INTERRUPTED_CASE if row["error"] == INTERRUPTED_CASE else "failed"
             figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {format_number(row['limit'], 4)}"]
         rows.append((*figures, *(_format_gain(row[n]) for n in shown)))
-    heads = [_narrow_heading(n, unit) for n, unit in {**requirements, **shown}.items()]
+    names = {n: re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", n) for n in (*requirements, *shown)}  # narrow lines
+    units = {**requirements, **shown}
+    heads = [name if units[n] in ("", "1") else f"{name}\n[{units[n]}]" for n, name in names.items()]
     lines = [f"{len(shown)} of {len(gains)} gains; -o FILE writes all"] if len(shown) < len(gains) else []
     failed = table[~table["error"].isin(["", INTERRUPTED_CASE])].to_dict(orient="records")
     lines += [f"failed ({second} {relation} {format_number(row['limit'], 4)}): {row['error']}" for row in failed]
@@ -621,9 +623,3 @@ def heading(name: str, unit: str) -> str:
 def _format_gain(value: float) -> str:
     """Four digits, as gains are rounded, and no exponent where it is the longer one: 68130."""
     return f"{float(format_number(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else format_number(value, 4)
-
-
-def _narrow_heading(column: str, unit: str) -> str:
-    """A heading in narrow lines, "Peak / Control / [V]" or "pid. / Kp / [V*s/m]"."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", column)
-    return words if unit in ("", "1") else f"{words}\n[{unit}]"

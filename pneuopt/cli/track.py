@@ -11,9 +11,9 @@ from pneuopt.cli.identify import read_experiments, read_free_drive
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
-    add_to_stem,
     file_hashes,
     finish,
+    number_paths,
     progress,
     warn,
     warn_of_status,
@@ -67,7 +67,10 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     system = model.system()
     check_names("parameter", options.parameters, parameters.free_names, f"{drive}: --parameter")
     experiments = read_experiments(logs, system, parameters, ())
-    dates = _read_dates(logs, options.dates)
+    dates: list[str | date] = [text.strip() for text in options.dates.split(",")] if options.dates else []
+    given = f"--dates has {len(dates)} dates for {len(logs)} logs; give one a log"
+    require(not options.dates or len(dates) == len(logs), given)
+    dates = dates or [find_date(path) for path in logs]
     task = read_tuning(options.tuned, system, parameters) if options.tuned else None
     warnings.filterwarnings("ignore", message="before the search")  # each log would say it again
     with progress("identifying", quiet=quiet) as report:
@@ -101,14 +104,6 @@ def _identify_alone(
     if not fit.status.converged:
         warn(f"{log.name}: {fit.status.verdict}; it does not count")
     return fit
-
-
-def _read_dates(logs: Sequence[Path], given: str) -> "list[str | date]":
-    if not given:
-        return [find_date(path) for path in logs]
-    dates: list[str | date] = [text.strip() for text in given.split(",")]
-    require(len(dates) == len(logs), f"--dates has {len(dates)} dates for {len(logs)} logs; give one a log")
-    return dates
 
 
 _ALT = "What is played, the signals with limits as predicted, and each parameter's interval now and afterwards."
@@ -173,9 +168,10 @@ def _writers(design: ExperimentDesign, output: Path | None) -> Writers:
     """A file a run, as `ExperimentDesign.write_csv` names them."""
     if output is None:
         return {}
-    several, unit = len(design.runs) > 1, design.units[design.channel]
-    places = [add_to_stem(output, str(k)) if several else output for k in range(1, len(design.runs) + 1)]
-    columns = {design.channel: (design.channel, unit)}
+    columns, places = (
+        {design.channel: (design.channel, design.units[design.channel])},
+        number_paths(output, len(design.runs)),
+    )
     return {place: partial(write_csv, run=run, columns=columns) for place, run in zip(places, design.runs, strict=True)}
 
 

@@ -154,6 +154,11 @@ class _Job:
             stays = f"{output} stays as it was" if output.exists() else f"{output} is not written"
             beside = f"; pneuopt export refuses {written[0]}, the best candidate" if written else ""
             show_sentence(console, f"{stays}, for no design is certified{beside}")
+        hints = [] if self.outputs.report is not None else ["with --report FILE.html: a page to hand on"]
+        if output is None:
+            hints = ["with -o tuned.toml: keeps the gains, for pneuopt export", *hints]
+        elif self.task.loop.pid.sample_time is not None:
+            hints = [f"pneuopt export {self.fit} {output} --to st    (for a PLC; or --help)", *hints]
         result = self._with_files(result)
         tables = _tables(result) | dict(compared or {}) | stats_and_provenance(result)
         status = finish(
@@ -163,7 +168,7 @@ class _Job:
             result.status,
             figures=self.view(result).figures,
             page=page,
-            hints=_hints(self.task, self.fit, self.outputs),
+            hints=hints,
         )
         if failures:
             raise failures[0]
@@ -192,15 +197,6 @@ def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, A
     design = (task.loop.controller, result.parameters, task.references, task.centre)
     exports = Report() if place is None else report_exports(*design, job.fit, place)
     return tuning_page(source, result, job.view(result), exports=exports, **told)
-
-
-def _hints(task: Tuning, fit: Path, outputs: Outputs) -> list[str]:
-    """What to do with a design: take it to a controller, and show it."""
-    told = [] if outputs.report is not None else ["with --report FILE.html: a page to hand on"]
-    if outputs.output is None:
-        return ["with -o tuned.toml: keeps the gains, for pneuopt export", *told]
-    command = f"pneuopt export {fit} {outputs.output} --to st    (for a PLC; or --help)"
-    return told if task.loop.pid.sample_time is None else [command, *told]
 
 
 def _compare_dither(

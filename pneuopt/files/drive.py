@@ -95,7 +95,8 @@ def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
         for base in bases if own_laws else bases[:1]:
             try:
                 options = base if option is None else {**base, option: value}
-                yield _DriveOptions(base, option, value, default_parameters(kind, _as_sections(options)))
+                sections = {s: {k: v for (own, k), v in options.items() if own == s} for s, _ in options}
+                yield _DriveOptions(base, option, value, default_parameters(kind, sections))
             except ModelError:  # options that exclude each other
                 continue
 
@@ -108,13 +109,6 @@ def _other_values(key: Key) -> Sequence[Any]:
     if key.takes in (Takes.FLAG, Takes.FLAG_OR_LIST):
         return [not key.usual]
     return [1] if key.takes is Takes.COUNT else ()
-
-
-def _as_sections(options: Mapping[Option, Any]) -> dict[str, dict[str, Any]]:
-    sections: dict[str, dict[str, Any]] = {}
-    for (section, key), value in options.items():
-        sections.setdefault(section, {})[key] = value
-    return sections
 
 
 def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOptions]) -> str:

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.compensators import COMPENSATORS, Compensator
 from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.gain_schedule import SCHEDULED_GAINS, GainSchedule
@@ -585,11 +585,6 @@ def read_loop_sections(
     table: TuningSections, plant: System, path: str | Path, centre: float = 0.0
 ) -> tuple[ClosedLoop, ParameterSet]:
     """The loop and its parameters; limits in the file are those of the wire, the loop's are about `centre`."""
-    loop = _loop(table, plant, path)
-    return loop, _parameters(table, loop, path, centre)
-
-
-def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
     wiring = {n: s for n, s in read_table(LOOP_KEYS["loop"], table.get("loop", {}), f"{path}: [loop]").items() if s}
     for section, first in FIRST_PARAMETERS.items():
         told = f"{path}: [{section}] has no {first}, without which it does nothing; write {first}"
@@ -599,11 +594,14 @@ def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
     lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
     chosen = {n: read_table(LOOP_KEYS[n], table[n], f"{path}: [{n}]", partial=True) for n in COMPENSATORS if n in table}
-    parts = tuple(construct_at(partial(COMPENSATORS[n], **own), f"{path}: [{n}]") for n, own in chosen.items())
+    parts: tuple[Compensator, ...] = tuple(
+        construct_at(partial(COMPENSATORS[n], **own), f"{path}: [{n}]") for n, own in chosen.items()
+    )
     outer = PositionLoop() if PositionLoop.section in table else None
     schedule = _schedule(table["schedule"], plant, f"{path}: [schedule]") if "schedule" in table else None
-    loop = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
-    return construct_at(lambda: loop(feedforward=lead, compensators=parts, outer=outer), str(path))
+    made = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
+    loop = construct_at(lambda: made(feedforward=lead, compensators=parts, outer=outer), str(path))
+    return loop, _parameters(table, loop, path, centre)
 
 
 def _pid(table: Mapping[str, Any], where: str) -> PID:

@@ -67,7 +67,13 @@ def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
         sections.get("actuator", {}), RIG_KEYS["actuator"], Actuator(), loop.command.unit, f"{path}: [actuator]"
     )
     units, usual = {q.name: q.unit for q in loop.plant.outputs}, Encoder()
-    sensors = _read_sensors(sections.get("sensors", {}), units, f"{path}: [sensors")
+    entries = sections.get("sensors", {})
+    check_names("output", entries, units, f"{path}: [sensors]")
+    for name, entry in entries.items():
+        require(isinstance(entry, dict), f"{path}: [sensors] must hold sections, [sensors.{name}]")
+    sensors = {
+        n: _read_numbers(entry, _SENSOR, Sensor(), units[n], f"{path}: [sensors.{n}]") for n, entry in entries.items()
+    }
     if isinstance(loop.sensor, Encoder):
         usual, sensors = loop.sensor, sensors or {loop.sensor.position: Sensor()}
     elif isinstance(loop.sensor, SensorLag):
@@ -78,13 +84,6 @@ def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
     encoder = _read_numbers(sections.get("encoder", {}), RIG_KEYS["encoder"], usual, unit, where)
     sensors = sensors or {loop.feedback.name: Sensor()}
     return construct_at(lambda: Rig(own, sensors, actuator, encoder), str(path))
-
-
-def _read_sensors(entries: Mapping[str, Any], units: Mapping[str, str], where: str) -> dict[str, Sensor]:
-    check_names("output", entries, units, f"{where}]")
-    for name, entry in entries.items():
-        require(isinstance(entry, dict), f"{where}] must hold sections, [sensors.{name}]")
-    return {n: _read_numbers(entry, _SENSOR, Sensor(), units[n], f"{where}.{n}]") for n, entry in entries.items()}
 
 
 def _read_numbers(entries: Mapping[str, Any], section: Key, usual: Part, unit: str, where: str) -> Part:

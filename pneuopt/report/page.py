@@ -8,7 +8,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 
 from pneuopt.control.controller import Controller
 from pneuopt.control.loop import ClosedLoop, add_disturbances
-from pneuopt.control.pid import to_series, to_standard
+from pneuopt.control.pid import ParallelForm, to_series, to_standard
 from pneuopt.control.reference import Reference
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.evaluate import respond
@@ -196,6 +196,7 @@ LAW_TEXTS = {
     "series": "K (1~+~1/(Ti~s)) (1~+~Td~s/(Tf~s~+~1))~e",
 }
 """The forms and their laws; no line ends at a tilde."""
+_CONVERSIONS: Mapping[str, Callable[[ParallelForm], object]] = {"standard (ISA)": to_standard, "series": to_series}
 EXPORTS = {
     "st": "a PLC (IEC 61131-3 structured text)",
     "c": "a microcontroller (C99, with a test)",
@@ -213,14 +214,14 @@ def report_forms(controller: Controller, parameters: ParameterSet) -> Report:
     unit = unit_ratio(controller.command.unit, controller.pid_signal.unit)
     units = {"Kp": unit, "K": unit, "Ki": unit_ratio(unit, "s"), "Kd": unit_ratio(f"({unit})*s", "1"), "N": "1"}
     rows, refused = [], []
-    for (name, law), convert in zip(LAW_TEXTS.items(), (replace, to_standard, to_series), strict=True):
+    for name, law in LAW_TEXTS.items():
         try:
-            gains = vars(convert(parallel))
+            gains = vars(_CONVERSIONS[name](parallel) if name in _CONVERSIONS else parallel)
         except InputError as error:
             refused.append(Line(str(error)))
             continue
         if gains.get("Td") == 0:
-            gains = {**gains, "N": math.nan} if "N" in gains else gains  # of no derivative there is no ratio
+            gains = {n: math.nan if n == "N" else v for n, v in gains.items()}  # of no derivative there is no ratio
         written = {n: write_value(v, units.get(n, "s"), GAIN_DIGITS) for n, v in gains.items() if not math.isnan(v)}
         rows.append((name, *(f"{n} {written.get(n, '-')}" for n in gains), law.replace("~", TIED)))
     return Report((Table(text_columns("form", "", "", "", "", "law"), tuple(rows)), *refused, Line(N_NOTE)))

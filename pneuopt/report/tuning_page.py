@@ -128,7 +128,11 @@ def write_report(
         require(model is None or parameters is not None, "a certificate holds no gains: give parameters with the loop")
         page = simulation_page(source, result, _view(model, steps, parameters, None, band))
     else:
-        page = summary_page(source, result.summary(), _pictures(result), (), getattr(result, "provenance", {}))
+        pictures = (tracking_picture(result),) if isinstance(result, Tracking) else ()
+        if isinstance(result, Sensitivity):
+            alt = "For each figure the share of its variance that each parameter brings, with its 95 % interval."
+            pictures = (Picture(partial(plot_sensitivity, result), alt, "Shares of the variance."),)
+        page = summary_page(source, result.summary(), pictures, (), getattr(result, "provenance", {}))
     write_page(path, page)
 
 
@@ -181,14 +185,6 @@ def _view(
     require(bool(steps), "a loop is drawn with its references: give both")
     earlier = None if before is None else model.complete(before)
     return LoopView(model, steps, model.complete(parameters), earlier, band)
-
-
-def _pictures(result: Shown) -> tuple[Picture, ...]:
-    """Of a result without a page of its own."""
-    if isinstance(result, Sensitivity):
-        alt = "For each figure the share of its variance that each parameter brings, with its 95 % interval."
-        return (Picture(partial(plot_sensitivity, result), alt, "Shares of the variance."),)
-    return (tracking_picture(result),) if isinstance(result, Tracking) else ()
 
 
 def tuning_page(
