@@ -46,7 +46,10 @@ def run_export(
     given = (task.loop, parameters)
     files: Mapping[str, str | bytes]
     if to == FMU:
-        files = {f"{name}.fmu": export_fmu(task.loop.plant, parameters, name=name)}
+        place = folder / f"{name}.fmu"
+        told = "is there already, and stays as it is; --force replaces it, -o names another folder"
+        require(force or not place.exists(), f"{place}: {told}")  # not even by the same one
+        files = {place.name: export_fmu(task.loop.plant, parameters, name=name)}
     elif to in languages:
         files = export_controller(*given, languages[to], name=name, centre=task.centre, origin=origin)
     else:

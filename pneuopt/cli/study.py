@@ -11,11 +11,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from pneuopt.cli.shared import (
     Outputs,
-    Writers,
     add_to_stem,
     describe_status,
     file_hashes,
@@ -48,7 +47,7 @@ from pneuopt.evaluation.requirements import (
     with_user_limit,
 )
 from pneuopt.evaluation.scenarios import axis_labels
-from pneuopt.files.drive import read_drive, read_fit
+from pneuopt.files.drive import StoredFit
 from pneuopt.files.loop import REQUIREMENTS_BY_KEY, bound_units
 from pneuopt.files.study import (
     Cases,
@@ -64,6 +63,7 @@ from pneuopt.files.study import (
 )
 from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning, read_tuning
+from pneuopt.models.declaration import Drive
 from pneuopt.plotting import plot_distribution, plot_front, plot_map, plot_sensitivity
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import format_table, read_once, records, write_bytes, write_text
@@ -98,10 +98,6 @@ if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure
 
 
-Design: TypeAlias = tuple[ClosedLoop, ParameterSet]
-"""The loop of all cases, and its parameters."""
-
-
 # columns of a study that tunes: its objective, and the word before the name of a gain that was found
 OBJECTIVE, FOUND = "objective", "found"
 
@@ -132,16 +128,69 @@ class Computing:
             yield replace(limits, count=executor.count) if isinstance(executor, Processes) else executor
 
 
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A study and what its files hold, read once; the parameters are those of plant and controller."""
+
+    study: Study
+    fit: StoredFit
+    task: Tuning
+    parameters: ParameterSet
+    outputs: Outputs
+    quiet: bool
+
+    def finish(
+        self,
+        verdict: str,
+        status: int,
+        report: Report,
+        tables: Mapping[str, Any],
+        written: "tuple[pd.DataFrame, Mapping[str, str]]",
+        draw: Callable[[], "Figure"],
+        page: tuple[str, str],
+        *,
+        is_drawn: bool = True,
+        has_design: bool = True,
+    ) -> int:
+        """Show and write what was found, the table with its units, and a page with its heading and the figure's words.
+
+        The page shows the figure if `is_drawn`, and the controller if all cases share it; returns the exit status.
+        """
+        study, output = self.study, self.outputs.output
+        hashes = file_hashes(study.path, study.drive, study.tuning)
+
+        def make_page() -> Page:
+            warnings = (*describe_status(self.fit), *describe_status(study.tuning))
+            source = Source(f"Study of {study.drive.name} with {study.tuning.name}", hashes, warnings)
+            design = (self.task.loop, self.parameters) if has_design else None
+            return study_page(source, report, draw if is_drawn else None, what=page[0], alt=page[1], design=design)
+
+        finish(
+            self.outputs,
+            {} if output is None else {output: table_writer(output, *written)},
+            {"verdict": verdict, **tables, "provenance": hashes},
+            Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None,
+            figures=lambda: {"": draw()},
+            report=Report((Line(verdict, Tone.BAD if status else Tone.GOOD),)) + report,
+            page=make_page,
+        )
+        return status
+
+
 def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -> int:
     """Compute what a study.toml asks for, a grid, other cases or a front; returns the exit status."""
     study = read_study(file)
     outputs.check([file, study.drive, study.tuning])
-    if study.sensitivity is not None:
-        return run_sensitivity(study, outputs, quiet, computing)
-    if study.pareto is None:
-        return run_cases(study, outputs, quiet, computing)
-    require(computing == Computing(), f"{file}: a front is one search after another: it takes no option of cases")
-    return run_front(study, outputs, quiet)
+    count = len(study.axes)
+    many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
+    require(outputs.plot is None or count <= MAX_MAP_AXES, many)
+    plain = study.pareto is None or computing == Computing()
+    require(plain, f"{file}: a front is one search after another: it takes no option of cases")
+    job = _Job(study, *read_fit_and_tuning(study.drive, study.tuning), outputs, quiet)
+    warn_of_status(study.tuning)
+    if study.pareto is not None:
+        return run_front(job)
+    return run_cases(job, computing) if study.sensitivity is None else run_sensitivity(job, computing)
 
 
 @contextmanager
@@ -168,21 +217,18 @@ def keep_cases(
                 warn(problem)
 
 
-def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
+def run_cases(job: _Job, computing: Computing) -> int:
     """Certify a loop over a grid or other cases; returns the exit status."""
-    file, count = study.path, len(study.axes)
-    many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
-    require(outputs.plot is None or count <= MAX_MAP_AXES, many)
-    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning)
-    (cases, axes), units = _read_cases(study, task, parameters), metric_units(task.loop)
+    study, task, parameters = job.study, job.task, job.parameters
+    (cases, axes), units = _read_cases(job), metric_units(task.loop)
     if any(SAMPLE_TIME_AXIS in values for values in cases.values()):
         parameters = with_sample_time(task.loop, parameters)
-    check_names("metric", study.show, units, f"{file}: [metrics] show")
+        job = replace(job, parameters=parameters)
+    check_names("metric", study.show, units, f"{study.path}: [metrics] show")
     column_units = partial(_column_unit, {axis.name: parameters[axis.name].unit for axis in axes}, task.loop)
     heads = partial(_cell_heading, column_units)
-    with keep_cases(study, outputs, len(cases), computing.resume, heads) as journal, computing.open() as executor:
-        table, checks = _compute_cases(study, task, parameters, (cases, axes), quiet, journal, executor)
+    with keep_cases(study, job.outputs, len(cases), computing.resume, heads) as journal, computing.open() as executor:
+        table, checks = _compute_cases(job, (cases, axes), journal, executor)
     verdict, status = _grid_verdict(table, len(task.references))
     if checks is not None:
         verdict, status = _batch_verdict(checks, verdict, status)
@@ -190,36 +236,35 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
     breaks = table["case"][table["breaks"]] if study.tune else ()
     flags = tuple(Line(f"{case}: breaks with its neighbours, also searched from their gains") for case in breaks)
-    report = lead_report(verdict, status) + report_cases(seen, written, metrics) + Report(flags)
+    report, tables = report_cases(seen, written, metrics) + Report(flags), {"cases": records(table)}
     if checks is not None:
-        report += report_checks(checks)
-    writers: Writers = {}
-    if outputs.output is not None:
-        writers[outputs.output] = table_writer(outputs.output, table, {str(c): column_units(str(c)) for c in table})
-    tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
-    tables |= {} if checks is None else {"checks": records(checks)}
-    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics)
-    page = partial(case_page, study, report, drawn, written, metrics, (task.loop, parameters))
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    if journal is not None and stopped is None:
+        report, tables = report + report_checks(checks), tables | {"checks": records(checks)}
+    alt = f"{', '.join(metrics)} over {' and '.join(written)}, a cell or a point a case; what failed is marked."
+    if study.cases:
+        alt = f"Share of the cases that keep a bound, over the bound: {', '.join(metrics)}."
+    job.finish(
+        verdict,
+        status,
+        report,
+        tables,
+        (table, {str(c): column_units(str(c)) for c in table}),
+        partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics),
+        ("Cases", alt),
+        is_drawn=bool(study.cases) or len(axes) <= MAX_MAP_AXES,
+        has_design=not study.tune,
+    )
+    if journal is not None and status != EXIT_INTERRUPTED:
         journal.delete()
     return status
 
 
 def _compute_cases(
-    study: Study,
-    task: Tuning,
-    parameters: ParameterSet,
-    given: tuple[Cases, Sequence[SweptAxis]],
-    quiet: bool,
-    journal: Journal | None,
-    executor: Executor | Processes,
+    job: _Job, given: tuple[Cases, Sequence[SweptAxis]], journal: Journal | None, executor: Executor | Processes
 ) -> "tuple[pd.DataFrame, pd.DataFrame | None]":
     """A row a case; and of a batch the certificates of some of them."""
-    cases, axes = given
+    study, task, parameters, (cases, axes) = job.study, job.task, job.parameters, given
     if study.tune:
-        return _tune_cells(study, task, parameters, axes, quiet, journal, executor), None
+        return _tune_cells(job, axes, journal, executor), None
     band = study.band or task.specification.band
     if study.batch:
         left = [n for n in study.show if n not in LANE_METRICS]
@@ -227,7 +272,7 @@ def _compute_cases(
         require(not left, f"{study.path}: [metrics] show: {', '.join(left)} is not read off responses; {remedy}")
         alike = SAMPLE_TIME_AXIS not in parameters
         require(alike, f"{study.path}: [study] a batch has one sample time: leave out batch, or {SAMPLE_TIME_AXIS}")
-        with progress("running", quiet=quiet) as report_progress:
+        with progress("running", quiet=job.quiet) as report_progress:
             found = evaluate_batch(
                 task.loop,
                 task.references,
@@ -241,17 +286,18 @@ def _compute_cases(
             )
         return found.table, found.checks
     certify = partial(evaluate_at_sample_time, task.loop, task.references, band=band, max_steps=task.max_steps)
-    with progress("certifying", quiet=quiet) as report_progress:
+    with progress("certifying", quiet=job.quiet) as report_progress:
         table = sweep(certify, parameters, cases, executor=executor, progress=report_progress, journal=journal)
     return table, None
 
 
-def _read_cases(study: Study, task: Tuning, parameters: ParameterSet) -> tuple[Cases, tuple[SweptAxis, ...]]:
+def _read_cases(job: _Job) -> tuple[Cases, tuple[SweptAxis, ...]]:
     """The cases of a study, and the parameters in which they differ; a sample time can be named, but not spread."""
+    study, task, parameters = job.study, job.task, job.parameters
     if SAMPLE_TIME_AXIS in study.axes or ("table" in study.cases and task.loop.pid.sample_time is not None):
         parameters = with_sample_time(task.loop, parameters)
     if study.cases:
-        cases = read_study_cases(study, parameters)
+        cases = read_study_cases(study, job.fit, parameters)
         return cases, swept_axes(parameters, cases)
     axes = read_axes(study, parameters)
     try:
@@ -261,23 +307,17 @@ def _read_cases(study: Study, task: Tuning, parameters: ParameterSet) -> tuple[C
 
 
 def _tune_cells(
-    study: Study,
-    task: Tuning,
-    parameters: ParameterSet,
-    axes: Sequence[SweptAxis],
-    quiet: bool,
-    journal: Journal | None,
-    executor: Executor | Processes,
+    job: _Job, axes: Sequence[SweptAxis], journal: Journal | None, executor: Executor | Processes
 ) -> "pd.DataFrame":
     """Tune every cell of the grid, each from the gains of its neighbours: a row a cell, with metrics and gains."""
-    require(bool(task.specification.weights), f"{study.tuning}: has nothing to minimise; add [minimise]")
-    free = task.parameters.free_names
+    study, free = job.study, job.task.parameters.free_names
+    require(bool(job.task.specification.weights), f"{study.tuning}: has nothing to minimise; add [minimise]")
     require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
     points = {axis.name: axis.points for axis in axes}
-    with progress("tuning", quiet=quiet) as report_progress, read_once() as sources:
+    with progress("tuning", quiet=job.quiet) as report_progress, read_once() as sources:
         table = sweep_from_neighbours(
-            partial(tune_cell, sources, study.drive, study.tuning),
-            parameters,
+            partial(tune_cell, sources, job.fit.drive, study.tuning),
+            job.parameters,
             points,
             value=OBJECTIVE,
             starts={f"{FOUND} {n}": n for n in free},
@@ -288,13 +328,13 @@ def _tune_cells(
     return table.rename(columns={f"{FOUND} {n}": n for n in free})
 
 
-def tune_cell(sources: Mapping[str, bytes], drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
+def tune_cell(sources: Mapping[str, bytes], drive: Drive, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
     """One cell of a study: the certified metrics of the gains tuned for it, the objective and the gains.
 
-    The files are those that the study has read: in another process they may have moved.
+    The tuning is what the study has read: in another process it may have moved.
     """
     with read_once(sources):
-        task = read_tuning(tuning, read_drive(drive)[0].system(), parameters)
+        task = read_tuning(tuning, drive.system(), parameters)
     loop, own = loop_at_sample_time(task.loop, parameters)
     result = tune(
         loop,
@@ -367,10 +407,9 @@ def _cell_heading(unit: Callable[[str], str], column: str) -> str:
     return heading(name, unit(name))
 
 
-def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
+def run_sensitivity(job: _Job, computing: Computing) -> int:
     """Tell which tolerances matter for a design; returns the exit status."""
-    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning)
+    study, task, parameters = job.study, job.task, job.parameters
     asked, units = read_sensitivity(study, parameters), metric_units(task.loop)
     check_names("metric", study.show, units, f"{study.path}: [metrics] show")
     band, slopes = study.band or task.specification.band, None
@@ -380,9 +419,9 @@ def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Comp
     count = asked.count * (len(axis_labels(parameters, asked.spreads)) + 2)
     certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
     with (
-        keep_cases(study, outputs, count, computing.resume) as journal,
+        keep_cases(study, job.outputs, count, computing.resume) as journal,
         computing.open() as executor,
-        progress("certifying", quiet=quiet) as report_progress,
+        progress("certifying", quiet=job.quiet) as report_progress,
     ):
         found = sensitivity(
             certify,
@@ -395,46 +434,35 @@ def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Comp
             progress=report_progress,
             journal=journal,
         )
-    status = _finish_sensitivity(study, outputs, found, slopes, (task.loop, parameters))
+    status = _finish_sensitivity(job, found, slopes)
     if journal is not None and status != EXIT_INTERRUPTED:
         journal.delete()
     return status
 
 
-def _finish_sensitivity(
-    study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSensitivity | None, design: Design
-) -> int:
-    """Show and write what was found; returns the exit status."""
+def _finish_sensitivity(job: _Job, found: Sensitivity, slopes: LocalSensitivity | None) -> int:
+    """Show and write which tolerances matter; returns the exit status."""
     parts, status = _count_failures(found.cases["error"], "failed")
     verdict = f"{len(found.cases)} points: {', '.join(parts) or 'all certified'}"
-    report = lead_report(verdict, status) + found.summary()
-    writers: Writers = {}
-    if outputs.output is not None:
-        named: dict[Hashable, str] = {"change": "local_change", "relative": "local_relative", "share": "local_share"}
-        table = found.table if slopes is None else found.table.join(slopes.table).rename(columns=named)
-        writers[outputs.output] = table_writer(outputs.output, table.reset_index(), {})
-    tables: dict[str, Any] = {"verdict": verdict, "shares": records(found.table), "figures": records(found.figures)}
+    report, table = found.summary(), found.table
+    tables = {"shares": records(found.table), "figures": records(found.figures), "cases": records(found.cases)}
     if slopes is not None:
-        report += slopes.summary()
+        named: dict[Hashable, str] = {"change": "local_change", "relative": "local_relative", "share": "local_share"}
+        report, table = report + slopes.summary(), table.join(slopes.table).rename(columns=named)
         tables["slopes"] = records(slopes.table)
-    tables["cases"] = records(found.cases)
-    tables["provenance"] = file_hashes(study.path, study.drive, study.tuning)
-    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_sensitivity, found, slopes)
-    page = partial(sensitivity_page, study, report, drawn, design)
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    return status
+    alt = "Share of a metric's variance that each parameter brings, by itself and with others, as bars with intervals."
+    written, draw = (table.reset_index(), dict[str, str]()), partial(plot_sensitivity, found, slopes)
+    return job.finish(verdict, status, report, tables, written, draw, ("Sensitivity", alt))
 
 
-def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
+def run_front(job: _Job) -> int:
     """Tune a loop along a front between two requirements; returns the exit status."""
-    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning)
+    study, task, parameters = job.study, job.task, job.parameters
     front_spec = read_pareto(study, bound_units(task.loop))
     first, second, until = _front_requirements(study, front_spec, task)
     free = task.parameters.free_names
     require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
-    with progress("finding the front's ends", quiet=quiet) as report_progress:
+    with progress("finding the front's ends", quiet=job.quiet) as report_progress:
         front = pareto_front(
             task.loop,
             task.references,
@@ -456,19 +484,13 @@ def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
     one = " (one is best by both)" if len(front) == 1 and not parts else ""
     what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
     verdict = f"{what}: {', '.join(parts) or 'all certified'}{one}"
-    report = lead_report(verdict, status) + report_front(front, pair, gains)
-    writers: Writers = {}
-    if outputs.output is not None:
-        claimed = {f"claimed {n}": unit for n, unit in pair.items()}
-        units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
-        writers[outputs.output] = table_writer(outputs.output, front, units)
-    hashes = file_hashes(study.path, study.drive, study.tuning)
-    tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}, "provenance": hashes}
-    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_front, front, pair)
-    page = partial(front_page, study, report, drawn, pair)
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    return status
+    claimed = {f"claimed {n}": unit for n, unit in pair.items()}
+    units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
+    tables = {"designs": records(front), "units": {**pair, **gains}}
+    shown, draw = report_front(front, pair, gains), partial(plot_front, front, pair)
+    alt = "{} of certified designs over {}; limits at which none was certified are marked.".format(*pair)
+    page = ("Pareto front", alt)
+    return job.finish(verdict, status, shown, tables, (front, units), draw, page, has_design=False)
 
 
 def _front_requirements(
@@ -507,44 +529,6 @@ def _count_failures(errors: "pd.Series", word: str, **others: int) -> tuple[list
     counts = {"interrupted": interrupted, word: int((errors != "").sum()) - interrupted, **others}
     parts = [f"{count} {what.replace('_', ' ')}" for what, count in counts.items() if count]
     return parts, EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if parts else EXIT_SUCCESS
-
-
-def case_page(
-    study: Study,
-    report: Report,
-    draw: Callable[[], "Figure"],
-    axes: Mapping[str, str],
-    metrics: Mapping[str, str],
-    design: Design,
-) -> Page:
-    """The page of a study's cases; a map of one or two axes, or how other cases are distributed."""
-    alt = f"{', '.join(metrics)} over {' and '.join(axes)}, a cell or a point a case; what failed is marked."
-    if study.cases:
-        alt = f"Share of the cases that keep a bound, over the bound: {', '.join(metrics)}."
-    drawn = draw if study.cases or len(axes) <= MAX_MAP_AXES else None
-    shared = None if study.tune else design
-    return study_page(_page_source(study), report, drawn, what="Cases", alt=alt, design=shared)
-
-
-def front_page(study: Study, report: Report, draw: Callable[[], "Figure"], pair: Mapping[str, str]) -> Page:
-    """The page of a Pareto front."""
-    first, second = pair
-    alt = f"{first} of certified designs over {second}; limits at which none was certified are marked."
-    return study_page(_page_source(study), report, draw, what="Pareto front", alt=alt)
-
-
-def sensitivity_page(study: Study, report: Report, draw: Callable[[], "Figure"], design: Design) -> Page:
-    """The page of a study that asks which tolerances matter."""
-    alt = "Share of a metric's variance that each parameter brings, by itself and with others, as bars with intervals."
-    return study_page(_page_source(study), report, draw, what="Sensitivity", alt=alt, design=design)
-
-
-def _page_source(study: Study) -> Source:
-    """The title of a study's page, its hashes and warnings."""
-    files = (study.path, study.drive, study.tuning)
-    warnings = (*describe_status(read_fit(study.drive)), *describe_status(study.tuning))
-    title = f"Study of {study.drive.name} with {study.tuning.name}"
-    return Source(title, file_hashes(*files), warnings)
 
 
 def report_cases(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> Report:
@@ -599,11 +583,6 @@ def report_front(table: "pd.DataFrame", requirements: Mapping[str, str], gains: 
     failed = table[~table["error"].isin(["", INTERRUPTED_CASE])].to_dict(orient="records")
     lines += [f"failed ({second} {relation} {format_number(row['limit'], 4)}): {row['error']}" for row in failed]
     return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
-
-
-def lead_report(verdict: str, status: int) -> Report:
-    """The verdict as a report."""
-    return Report((Line(verdict, Tone.BAD if status else Tone.GOOD),))
 
 
 def table_writer(path: Path, table: "pd.DataFrame", units: Mapping[str, str]) -> Callable[[Path], None]:

@@ -168,10 +168,8 @@ def _writers(design: ExperimentDesign, output: Path | None) -> Writers:
     """A file a run, as `ExperimentDesign.write_csv` names them."""
     if output is None:
         return {}
-    columns, places = (
-        {design.channel: (design.channel, design.units[design.channel])},
-        number_paths(output, len(design.runs)),
-    )
+    places = number_paths(output, len(design.runs))
+    columns = {design.channel: (design.channel, design.units[design.channel])}
     return {place: partial(write_csv, run=run, columns=columns) for place, run in zip(places, design.runs, strict=True)}
 
 

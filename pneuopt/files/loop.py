@@ -5,7 +5,7 @@ Words in braces in a unit stand for the units of the loop's signals (`signal_uni
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from enum import Enum
 from functools import partial
@@ -593,14 +593,16 @@ def read_loop_sections(
     dither = _dither(table["dither"], f"{path}: [dither]") if "dither" in table else None
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
     lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
-    chosen = {n: read_table(LOOP_KEYS[n], table[n], f"{path}: [{n}]", partial=True) for n in COMPENSATORS if n in table}
-    parts: tuple[Compensator, ...] = tuple(
-        construct_at(partial(COMPENSATORS[n], **own), f"{path}: [{n}]") for n, own in chosen.items()
-    )
+    parts = list[Compensator]()
+    for section in (n for n in COMPENSATORS if n in table):
+        where = f"{path}: [{section}]"
+        kind: Callable[..., Compensator] = COMPENSATORS[section]
+        chosen = read_table(LOOP_KEYS[section], table[section], where, partial=True)
+        parts.append(construct_at(partial(kind, **chosen), where))
     outer = PositionLoop() if PositionLoop.section in table else None
     schedule = _schedule(table["schedule"], plant, f"{path}: [schedule]") if "schedule" in table else None
     made = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
-    loop = construct_at(lambda: made(feedforward=lead, compensators=parts, outer=outer), str(path))
+    loop = construct_at(lambda: made(feedforward=lead, compensators=tuple(parts), outer=outer), str(path))
     return loop, _parameters(table, loop, path, centre)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.evaluation.plants import monte_carlo
 from pneuopt.evaluation.scenarios import SampleSpreads, corners
-from pneuopt.files.drive import ambient_pressure, read_fit
+from pneuopt.files.drive import StoredFit, ambient_pressure
 from pneuopt.files.loop import (
     CORNERS_KEY,
     SAMPLE_KEYS,
@@ -69,14 +69,14 @@ class CaseSource:
 
     where: str  # what messages begin with
     folder: Path  # to which files are relative
-    drive: Path
+    fit: StoredFit
     parameters: ParameterSet  # the nominal values
 
 
-def read_study_cases(study: "Study", parameters: ParameterSet) -> Cases:
-    """Read the cases that a study's file asks for in place of a grid."""
+def read_study_cases(study: "Study", fit: StoredFit, parameters: ParameterSet) -> Cases:
+    """Read the cases that a study's file asks for in place of a grid, of the drive in `fit`."""
     ((kind, given),) = study.cases.items()
-    source = CaseSource(f"{study.path}: [{kind}]", study.path.parent, study.drive, parameters)
+    source = CaseSource(f"{study.path}: [{kind}]", study.path.parent, fit, parameters)
     try:
         cases = _READERS[kind](given, source)
     except InputError as error:
@@ -112,15 +112,14 @@ def read_sensitivity(study: "Study", parameters: ParameterSet) -> SensitivityTas
 def _read_samples(given: Mapping[str, Any], source: CaseSource) -> Cases:
     where, draw = source.where, read_table(CASE_KEYS["samples"].keys, given, source.where, partial=True)
     entries, from_fit = {n: entry for n, entry in given.items() if n not in draw}, draw["fit"]
-    fit = read_fit(source.drive) if from_fit else None
-    covariance = None if fit is None else fit.covariance
-    needed = f"{where} fit = true needs a fit.toml, which identify writes; {source.drive} has no estimates"
+    covariance = source.fit.covariance if from_fit else None
+    needed = f"{where} fit = true needs a fit.toml, which identify writes; {source.fit.path} has no estimates"
     require(not from_fit or covariance is not None, needed)
     return monte_carlo(
         source.parameters,
         draw["count"],
         covariance=covariance,
-        estimates=None if fit is None else fit.estimates,
+        estimates=source.fit.estimates if from_fit else None,
         spreads=read_sample_spreads(entries, where, source.parameters),
         seed=draw["seed"],
         sampling=draw["sampling"],

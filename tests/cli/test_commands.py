@@ -16,6 +16,7 @@ from pneuopt.cli import study as study_front
 from pneuopt.cli import study as study_module
 from pneuopt.cli.app import app
 from pneuopt.cli.study import tune_cell
+from pneuopt.models.declaration import Drive
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.sweep import sweep
@@ -123,16 +124,19 @@ def tuned(front: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return front
 
 
-def test_a_study_tunes_each_cell_from_the_gains_of_its_neighbours(tuned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_tunes_each_cell_from_the_gains_of_its_neighbours(
+    tuned: Path, monkeypatch: pytest.MonkeyPatch, parsed: list[str]
+) -> None:
     begun = dict[float, float]()
 
-    def cell(sources: dict[str, bytes], drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
+    def cell(sources: dict[str, bytes], drive: Drive, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
         begun[parameters.value("load.mass")] = parameters.value("pid.Kp")
         return tune_cell(sources, drive, tuning, parameters)
 
     monkeypatch.setattr(study_module, "tune_cell", cell)
     result = run("study study.toml -o cases.csv --json cases.json --plot map.png")
     assert result.exit_code == 0, result.stdout
+    assert parsed.count(Path("drive.toml").read_text("utf-8")) == 1
     assert result.stdout.splitlines()[0] == "3 cases, each the worst of 2 references: all settle"
     cases = pd.read_csv("cases.csv").set_index("load.mass [kg]")
     assert begun[5.0] == 300.0
@@ -148,7 +152,7 @@ def test_a_cell_that_breaks_with_its_neighbours_is_searched_again_and_named(
 ) -> None:
     searched = list[float]()
 
-    def cell(_: object, __: Path, ___: Path, parameters: ParameterSet) -> dict[str, float]:
+    def cell(_: object, __: object, ___: Path, parameters: ParameterSet) -> dict[str, float]:
         mass = parameters.value("load.mass")
         searched.append(mass)
         long = 0.4 if mass == 6.0 else 0.1

@@ -6,6 +6,7 @@ import pytest
 
 from pneuopt.evaluation.plants import monte_carlo
 from pneuopt.evaluation.scenarios import Distribution, LogNormal, LogUniform, Normal, Sampling, Spread, Uniform, corners
+from pneuopt.files.drive import read_fit
 from pneuopt.files.study import (
     CASE_KEYS,
     Cases,
@@ -231,7 +232,8 @@ def case_file(tmp_path: Path) -> Path:
 
 def cases(case_file: Path, text: str) -> Cases:
     case_file.write_text(HEAD + text, encoding="utf-8")
-    return read_study_cases(read_study(case_file), CASE_RIG)
+    study = read_study(case_file)
+    return read_study_cases(study, read_fit(study.drive), CASE_RIG)
 
 
 def test_each_kind_gives_what_python_gives(case_file: Path) -> None:
