@@ -15,8 +15,7 @@ from typing import Annotated, NamedTuple
 import typer
 from typer.models import CommandFunctionType
 
-from pneuopt.cli.run import interruption_status, run_guarded
-from pneuopt.cli.tolerances import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED
+from pneuopt.cli.run import ExitStatus, interruption_status, run_guarded
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
 from pneuopt.quantities.output import read_once
 
@@ -216,13 +215,13 @@ def report_errors() -> Iterator[None]:
             yield
     except InputError as error:
         say(f"error: {error}")
-        raise typer.Exit(EXIT_BAD_INPUT) from None
+        raise typer.Exit(ExitStatus.BAD_INPUT) from None
     except ConvergenceError as error:
         say(f"NOT converged: {error}")
-        raise typer.Exit(EXIT_FAILURE) from None
+        raise typer.Exit(ExitStatus.FAILURE) from None
     except KeyboardInterrupt:
         say("interrupted: no file was left half-written")
-        raise typer.Exit(interruption_status() or EXIT_INTERRUPTED) from None
+        raise typer.Exit(interruption_status() or ExitStatus.INTERRUPTED) from None
 
 
 def main() -> None:

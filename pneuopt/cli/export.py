@@ -8,8 +8,8 @@ from typing import Any
 import typer
 
 from pneuopt.cli.init import write_files
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import make_console, read_fit_and_tuning, show_output_files, warn
-from pneuopt.cli.tolerances import EXIT_SUCCESS
 from pneuopt.export.blocks import export_settings
 from pneuopt.export.fmu import export_fmu
 from pneuopt.export.languages import Language, export_controller
@@ -62,7 +62,7 @@ def run_export(
     if to in blocks:
         typer.echo("".join(map(str, files.values())))
     show_output_files(make_console(), list(placed))
-    return EXIT_SUCCESS
+    return ExitStatus.SUCCESS
 
 
 def _check_form(to: str, forms: Sequence[str]) -> None:

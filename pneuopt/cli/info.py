@@ -13,8 +13,8 @@ from itertools import groupby
 import numpy as np
 import typer
 
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import make_console, show_pairs
-from pneuopt.cli.tolerances import EXIT_FAILURE, EXIT_SUCCESS
 from pneuopt.dynamics.compiled.compiler import COMPILER_FLAGS, cache_directory, cached_libraries, find_compiler
 from pneuopt.dynamics.compiled.self_check import check_machine_code
 from pneuopt.dynamics.system import discretise, parameter_vector
@@ -49,7 +49,7 @@ def run_info() -> int:
         "speed": "ns a step: " + ", ".join(f"{time:.0f} {names[way]}" for way, time in check.nanoseconds.items()),
     }
     show_pairs(make_console(), shown)
-    return EXIT_SUCCESS if check.is_good else EXIT_FAILURE
+    return ExitStatus.SUCCESS if check.is_good else ExitStatus.FAILURE
 
 
 def package_versions() -> dict[str, str]:
@@ -73,19 +73,19 @@ def run_keys(word: str | None, markdown: bool) -> int:
     rows = find_keys(word)
     if markdown:
         typer.echo(format_markdown(rows))
-        return EXIT_SUCCESS
+        return ExitStatus.SUCCESS
     files = groupby(rows, key=lambda row: row.file)
     _show_entries(
         {f"{file}: {FILE_MEANINGS[file]}": [(row.heading, row.remarks) for row in own] for file, own in files}
     )
-    return EXIT_SUCCESS
+    return ExitStatus.SUCCESS
 
 
 def run_outputs(markdown: bool) -> int:
     """Print what each command writes with --json."""
     if markdown:
         typer.echo(describe_outputs())
-        return EXIT_SUCCESS
+        return ExitStatus.SUCCESS
     _show_entries(
         {
             f"{name}: {output.meaning}": [
@@ -94,7 +94,7 @@ def run_outputs(markdown: bool) -> int:
             for name, output in OUTPUTS.items()
         }
     )
-    return EXIT_SUCCESS
+    return ExitStatus.SUCCESS
 
 
 def find_keys(word: str | None) -> Sequence[KeyRow]:

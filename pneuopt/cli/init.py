@@ -10,7 +10,8 @@ from pathlib import Path
 
 import typer
 
-from pneuopt.cli.tolerances import EXIT_SUCCESS, SAMPLE_TIMES, WIDTH
+from pneuopt.cli.run import ExitStatus
+from pneuopt.cli.tolerances import SAMPLE_TIMES
 from pneuopt.evaluation.moves import excitation_run
 from pneuopt.files.drive import read_drive
 from pneuopt.files.first_files import (
@@ -100,7 +101,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
         typer.echo(f"  pneuopt init KIND --from {log} --force")
     written = [n for n in files if folder / n not in kept]
     _show_files(folder, written, guess, unused, ask.assumed, log)
-    return EXIT_SUCCESS
+    return ExitStatus.SUCCESS
 
 
 def write_files(files: Mapping[Path, str | bytes], force: bool) -> None:
@@ -206,9 +207,9 @@ def _advise_command(guess: LogGuess, unused: Container[str]) -> None:
         say(held, "    ")
 
 
-def say(text: str, indent: str = "") -> None:
+def say(text: str, indent: str = "", width: int = 80) -> None:
     """Print a sentence in lines of the screen's width."""
-    typer.echo("\n".join(textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")))
+    typer.echo("\n".join(textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent + "  ")))
 
 
 @dataclass(frozen=True)
@@ -243,4 +244,4 @@ def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, un
     say(f"{run.duration:.3g} s between {low} and {high}, at {fast} at most; with a gain of {gain} it trails by {trail}")
     say(f"Log {', '.join(logged_channels(run))} at the controller's samples, from before the first move on, then")
     typer.echo(f"  pneuopt identify {drive} LOG -o fit.toml")
-    return EXIT_SUCCESS
+    return ExitStatus.SUCCESS

@@ -20,17 +20,12 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
-from pneuopt.cli.tolerances import (
-    EXIT_OUTPUT_LOST,
-    EXIT_UNFORESEEN,
-    PATIENCE,
-    RETURN,
-    SHOWN_REASON,
-)
+from pneuopt.cli.tolerances import PATIENCE, RETURN
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -49,8 +44,19 @@ def run_guarded(load: Callable[[], Callable[[], object]]) -> NoReturn:
     lost = next((e for e in errors if e is not None and e.errno != errno.EPIPE), None)  # EPIPE: its reader just left
     if lost is not None and status == 0 and stopped is None:
         _say(f"error: standard output cannot be written ({lost.strerror}); the files that were asked for are written")
-        status = EXIT_OUTPUT_LOST
+        status = ExitStatus.OUTPUT_LOST
     sys.exit(status if stopped is None else stopped)
+
+
+class ExitStatus(IntEnum):
+    """How a command ends; scripts may rely on these. By SIGTERM it ends with 143."""
+
+    SUCCESS = 0
+    FAILURE = 1  # not converged, not certified, no interval that holds; in a study a case failed or never settles
+    BAD_INPUT = 2  # something that the user gave cannot be used; Typer's own where an option is wrong
+    UNFORESEEN = 70  # an error that nobody foresaw, sysexits' EX_SOFTWARE: one line names a file with the details
+    OUTPUT_LOST = 74  # the screen could not be written, sysexits' EX_IOERR; the files that were asked for are
+    INTERRUPTED = 130  # Ctrl-C: 128 + the number of SIGINT, as shells have it
 
 
 class LastingFile(io.FileIO):
@@ -84,8 +90,8 @@ def _run(load: Callable[[], Callable[[], object]]) -> int:
             reason = " ".join(f"{type(error).__name__}{place}: {error}".split()).removesuffix(":")
             file = _write_details(error)
             where = f"the details are in {file}; please send it" if file else "run it again with a folder to write to"
-            _say(f"error: unforeseen, a bug of pneuopt: {reason[:SHOWN_REASON]}; {where}")
-            return EXIT_UNFORESEEN
+            _say(f"error: unforeseen, a bug of pneuopt: {reason[:160]}; {where}")
+            return ExitStatus.UNFORESEEN
     return 0
 
 

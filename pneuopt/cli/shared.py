@@ -19,8 +19,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column
 from rich.text import Text
 
-from pneuopt.cli.run import interruption_status, without_interruption
-from pneuopt.cli.tolerances import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS, SECONDS_A_LINE
+from pneuopt.cli.run import ExitStatus, interruption_status, without_interruption
+from pneuopt.cli.tolerances import SECONDS_A_LINE
 from pneuopt.files.drive import StoredFit, read_fit, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -105,8 +105,8 @@ def finish(
         raise InputError("; ".join(map(str, failures)))
     if status is None or status.code in (Code.CONVERGED, Code.PARTIAL):
         show_hints(make_console(), hints)
-        return EXIT_SUCCESS
-    return EXIT_INTERRUPTED if interrupted else EXIT_FAILURE
+        return ExitStatus.SUCCESS
+    return ExitStatus.INTERRUPTED if interrupted else ExitStatus.FAILURE
 
 
 def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], list[InputError]]:

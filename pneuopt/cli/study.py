@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
     Outputs,
     add_to_stem,
@@ -24,15 +25,7 @@ from pneuopt.cli.shared import (
     warn,
     warn_of_status,
 )
-from pneuopt.cli.tolerances import (
-    EXIT_FAILURE,
-    EXIT_INTERRUPTED,
-    EXIT_SUCCESS,
-    MAX_CASE_ROWS,
-    MAX_FAILURE_REASONS,
-    MAX_GAIN_COLUMNS,
-    MAX_MAP_AXES,
-)
+from pneuopt.cli.tolerances import MAX_MAP_AXES
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate, metric_cell, metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
@@ -169,7 +162,7 @@ class _Job:
             self.outputs,
             {} if output is None else {output: table_writer(output, *written)},
             {"verdict": verdict, **tables, "provenance": hashes},
-            Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None,
+            Status(Code.INTERRUPTED, (verdict,)) if status == ExitStatus.INTERRUPTED else None,
             figures=lambda: {"": draw()},
             report=Report((Line(verdict, Tone.BAD if status else Tone.GOOD),)) + report,
             page=make_page,
@@ -253,7 +246,7 @@ def run_cases(job: _Job, computing: Computing) -> int:
         is_drawn=bool(study.cases) or len(axes) <= MAX_MAP_AXES,
         has_design=not study.tune,
     )
-    if journal is not None and status != EXIT_INTERRUPTED:
+    if journal is not None and status != ExitStatus.INTERRUPTED:
         journal.delete()
     return status
 
@@ -372,7 +365,7 @@ def _batch_verdict(checks: "pd.DataFrame", verdict: str, status: int) -> tuple[s
     """The verdict on a grid with how many of its cases are certified; where lanes are refuted, that is a failure."""
     differ, certified = checks["case"][~checks["agrees"]].nunique(), checks["case"].nunique()
     said = f"{differ} of {certified} certified differ from the lanes" if differ else f"{certified} certified, all agree"
-    return f"{verdict}; {said}", max(status, EXIT_FAILURE) if differ else status
+    return f"{verdict}; {said}", max(status, ExitStatus.FAILURE) if differ else status
 
 
 def _worst_of_references(
@@ -435,7 +428,7 @@ def run_sensitivity(job: _Job, computing: Computing) -> int:
             journal=journal,
         )
     status = _finish_sensitivity(job, found, slopes)
-    if journal is not None and status != EXIT_INTERRUPTED:
+    if journal is not None and status != ExitStatus.INTERRUPTED:
         journal.delete()
     return status
 
@@ -528,14 +521,21 @@ def _count_failures(errors: "pd.Series", word: str, **others: int) -> tuple[list
     interrupted = int((errors == INTERRUPTED_CASE).sum())
     counts = {"interrupted": interrupted, word: int((errors != "").sum()) - interrupted, **others}
     parts = [f"{count} {what.replace('_', ' ')}" for what, count in counts.items() if count]
-    return parts, EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if parts else EXIT_SUCCESS
+    return parts, ExitStatus.INTERRUPTED if interrupted else ExitStatus.FAILURE if parts else ExitStatus.SUCCESS
 
 
-def report_cases(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> Report:
+def report_cases(
+    table: "pd.DataFrame",
+    axes: Mapping[str, str],
+    metrics: Mapping[str, str],
+    *,
+    most_rows: int = 40,
+    most_reasons: int = 5,
+) -> Report:
     """A study, a row a case; of many the worst, by the first metric; then the reasons of those that failed."""
     first = next(iter(metrics))
     ordered = table.sort_values(first, ascending=larger_is_better(first), na_position="first", kind="stable")
-    shown, rows = table if len(table) <= MAX_CASE_ROWS else ordered.head(MAX_CASE_ROWS), []
+    shown, rows = table if len(table) <= most_rows else ordered.head(most_rows), []
     for row in shown.to_dict(orient="records"):
         figures = [metric_cell(m, row[m]) for m in metrics]
         if row["error"]:
@@ -546,17 +546,17 @@ def report_cases(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mappin
     if len(shown) < len(table):
         lines.append(f"the {len(shown)} worst of {len(table)} cases by {first}; -o FILE writes all")
     reasons = table["error"][~table["error"].isin(["", INTERRUPTED_CASE])].value_counts()
-    for reason, count in list(reasons.items())[:MAX_FAILURE_REASONS]:
+    for reason, count in list(reasons.items())[:most_reasons]:
         lines.append(f"failed ({count} of {len(table)}): {reason}")
     return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
 
 
-def report_checks(checks: "pd.DataFrame") -> Report:
+def report_checks(checks: "pd.DataFrame", most: int = 5) -> Report:
     """The certified cases of a batch: the largest difference a metric, and the cases in which lanes are refuted."""
     rows = [(str(m), format_number(float(own["difference"].max()), 2)) for m, own in checks.groupby("metric")]
     lines = [
         Line(f"{row['case']}: {row['metric']} is {row['batch']:.6g} in the lanes, {row['certified']:.6g} certified")
-        for row in checks[~checks["agrees"]].head(MAX_FAILURE_REASONS).to_dict(orient="records")
+        for row in checks[~checks["agrees"]].head(most).to_dict(orient="records")
     ]
     table = (
         (Table((Column("metric"), Column("largest difference\nfrom the certificate")), tuple(rows)),) if rows else ()
@@ -565,10 +565,12 @@ def report_checks(checks: "pd.DataFrame") -> Report:
     return Report((*table, *lines, Line(left)))
 
 
-def report_front(table: "pd.DataFrame", requirements: Mapping[str, str], gains: Mapping[str, str]) -> Report:
+def report_front(
+    table: "pd.DataFrame", requirements: Mapping[str, str], gains: Mapping[str, str], *, most_gains: int = 6
+) -> Report:
     """A front, a row a design, of those that are not certified the limit; then the reasons."""
     first, second = requirements
-    shown = dict(list(gains.items())[:MAX_GAIN_COLUMNS])
+    shown = dict(list(gains.items())[:most_gains])
     relation, rows = ">=" if larger_is_better(second) else "<=", []
     for row in table.to_dict(orient="records"):
         figures = [format_number(row[n], 4) for n in (first, second)]

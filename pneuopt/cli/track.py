@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.cli.identify import read_experiments, read_free_drive
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
@@ -19,7 +20,6 @@ from pneuopt.cli.shared import (
     warn_of_status,
     write_csv,
 )
-from pneuopt.cli.tolerances import EXIT_FAILURE
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
 from pneuopt.experiments.design import AOptimal, DOptimal, ExperimentDesign
@@ -92,7 +92,7 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     source = Source(title_of("Tracking", drive, logs), file_hashes(*inputs[:1], *inputs[1 + len(logs) :]))
     page = partial(summary_page, source, shown, [tracking_picture(found)], experiments)
     finish(outputs, writers, tables, None, figures=lambda: {"": plot_tracking(found)}, report=shown, page=page)
-    return EXIT_FAILURE if found.drifting or (outlook is not None and outlook.fails is not None) else 0
+    return ExitStatus.FAILURE if found.drifting or (outlook is not None and outlook.fails is not None) else 0
 
 
 def _identify_alone(

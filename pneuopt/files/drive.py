@@ -17,7 +17,7 @@ import tomlkit
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import System
-from pneuopt.files.tolerances import COVARIANCE_ROUNDING
+from pneuopt.files.tolerances import COVARIANCE_ROUNDING, FILE_DIGITS
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.identification.checkup import AMBIENT_PRESSURE, DRIVE_FILE, Assumption
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -369,9 +369,9 @@ def _write_absolute(document: tomlkit.TOMLDocument, given: ParameterSet) -> None
         if isinstance(said, dict):
             for part in ("value", "lower", "upper"):
                 if "(g)" in str(said.get(part)):
-                    said[part] = write_value(getattr(p, part), p.unit, 9)
+                    said[part] = write_value(getattr(p, part), p.unit, FILE_DIGITS)
         elif "(g)" in str(said):
-            entries[key] = write_value(p.value, p.unit, 9)
+            entries[key] = write_value(p.value, p.unit, FILE_DIGITS)
 
 
 def _agreement_rows(fit: "pd.DataFrame") -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """The first files of a new user: drive, tuning, study, rig and a log's sidecar; and those of an excitation run."""
 
 import json
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +12,12 @@ from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.moves import ExcitationRun
 from pneuopt.files.drive import FIT_SECTIONS, default_parameters, drive_keys
-from pneuopt.files.keys import Template, json_schema
+from pneuopt.files.keys import Template, comment_lines, json_schema
 from pneuopt.files.loop import signal_units_of, tuning_keys
 from pneuopt.files.outputs import output_schema
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
-from pneuopt.files.tolerances import COMMENT_WIDTH, DIGITS, SAMPLE_TIME, SAMPLES_A_DITHER_PERIOD, SWEEP
+from pneuopt.files.tolerances import LEAST_DITHER_SAMPLES, SAMPLE_TIME
 from pneuopt.files.tuning import TUNED_SECTIONS
 from pneuopt.logs.columns import CHANNELS, SIDECAR_KEYS, plant_channels
 from pneuopt.models.catalog import CATALOGUE_SOURCE
@@ -127,14 +126,14 @@ def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, 
     given = loop.parameters.with_values({f"pid.{n}": value for n, (value, _, _) in first.gains.items()})
     given = given.with_bounds({f"pid.{n}": (low, high) for n, (_, low, high) in first.gains.items()})
     ends = (0.0, 2 * first.limit) if counts_from_zero else (-first.limit, first.limit)
-    sample_time = write_value(loop.pid.sample_time or 0.0, "s", DIGITS)
+    sample_time = write_value(loop.pid.sample_time or 0.0, "s")
     stated = {"pid.form": '"parallel"', "pid.sample_time": _quote(sample_time)}
     stated |= {f"pid.{n}": _value_text(given[f"pid.{n}"], free=True, bounds=True) for n in first.gains}
     stated["pid.limits"] = "[" + ", ".join(_quote(write_value(end, command)) for end in ends) + "]"
     if first.dither is not None:
         frequency, most = first.dither
-        frequency = min(frequency, 1.0 / (SAMPLES_A_DITHER_PERIOD * (loop.pid.sample_time or SAMPLE_TIME)))
-        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz", DIGITS))}
+        frequency = min(frequency, 1.0 / (LEAST_DITHER_SAMPLES * (loop.pid.sample_time or SAMPLE_TIME)))
+        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz"))}
         least = {"amplitude": 0.0, "offset": -most}
         free = {n: Parameter(0.0, command, lower, most) for n, lower in least.items()}
         stated |= {f"dither.{n}": _value_text(p, free=True, bounds=True) for n, p in free.items()}
@@ -176,7 +175,7 @@ def _tuning_names(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> 
 
 def _study_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> Template:
     swept = values[first.swept]
-    axis = ", ".join(_value_text(replace(swept, value=share * swept.value)) for share in SWEEP)
+    axis = ", ".join(_value_text(replace(swept, value=share * swept.value)) for share in (0.8, 1.0, 1.2))
     stated = {"study.drive": '"drive.toml"', "study.tuning": '"tuning.toml"', f'axes."{first.swept}"': f"[{axis}]"}
     limits, unit = {"lower": 0.5 * first.limit, "upper": first.limit}, loop.command.unit
     ends = {f"pareto.{n}": _quote(write_value(limit, unit)) for n, limit in limits.items()}
@@ -243,7 +242,7 @@ def _value_text(p: Parameter, *, free: bool = False, bounds: bool = False) -> st
 
 
 def _number_text(value: float, unit: str) -> str:
-    text = write_value(value, unit, DIGITS)
+    text = write_value(value, unit)
     return text if unit == "1" else _quote(text)
 
 
@@ -286,7 +285,7 @@ def _run_head(run: ExcitationRun, drive: str) -> list[str]:
         f"Then: pneuopt identify {drive} LOG -o fit.toml",
         f"Simulated on the drive as guessed: pneuopt simulate {drive} {RUN_FILE} -o predicted.csv",
     )
-    return [f"# {line}" for part in text for line in textwrap.wrap(part, COMMENT_WIDTH, subsequent_indent="  ")]
+    return [line for part in text for line in comment_lines(part)]
 
 
 def _run_sections(run: ExcitationRun) -> Iterator[str]:

@@ -12,7 +12,6 @@ from pneuopt.files.drive import drive_keys
 from pneuopt.files.loop import tuning_keys
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
-from pneuopt.files.tolerances import COMMENT_COLUMN, MAX_WIDTH, SHARED_BY
 from pneuopt.logs.columns import SIDECAR_KEYS
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import UnitError
@@ -110,7 +109,7 @@ def describe_unit(key: Key) -> str:
     return "" if unit == "1" else unit
 
 
-def _merge_shared(sections: Mapping[str, Key]) -> Iterable[tuple[str, Key]]:
+def _merge_shared(sections: Mapping[str, Key], least: int = 3) -> Iterable[tuple[str, Key]]:
     """Keys by full name; what several requirements of a section share has one row, "minimise.*.weight"."""
     walked = list(table("", sections).walk())
     counts: dict[tuple[str, str, str], int] = {}
@@ -120,7 +119,7 @@ def _merge_shared(sections: Mapping[str, Key]) -> Iterable[tuple[str, Key]]:
     done = set()
     for name, key in walked:
         shape = _shape(name, key) if name.count(".") == 2 else None
-        if shape is None or counts[shape] < SHARED_BY:
+        if shape is None or counts[shape] < least:
             yield name, key
         elif shape not in done:
             done.add(shape)
@@ -241,7 +240,7 @@ class Template:
     def render(self) -> str:
         """The file's text."""
         lines = [f"#:schema {self.schema}"] if self.schema else []
-        lines += [line for text in self.title for line in _comment(text)]
+        lines += [line for text in self.title for line in comment_lines(text)]
         for name, key in self.sections.items():
             lines += [""] if lines else []
             lines += self._render_entry("", name, key) if key.takes is Takes.LIST else self._render_section(name, key)
@@ -250,13 +249,13 @@ class Template:
     def _render_section(self, name: str, key: Key) -> Iterator[str]:
         if key.takes is Takes.TABLES:
             for number, stated in enumerate(self.repeated[name]):
-                yield from ["", f"[[{name}]]"] if number else [*_comment(key.meaning), f"[[{name}]]"]
+                yield from ["", f"[[{name}]]"] if number else [*comment_lines(key.meaning), f"[[{name}]]"]
                 for own, known in key.keys.items():
                     if own in stated or not number:
                         yield from self._render_entry(name, own, known, stated.get(own))
             return
         said = {n.partition(".")[2]: text for n, text in self.stated.items() if n.partition(".")[0] == name}
-        yield from _comment(key.meaning)
+        yield from comment_lines(key.meaning)
         yield f"[{name}]" if said or key.required else f"# [{name}]"
         for own, known in key.keys.items():
             yield from self._render_entry(name, own, known, said.get(own))
@@ -302,16 +301,17 @@ def _words_of(unit: str) -> list[str]:
     return [part.partition("}")[0] for part in unit.split("{")[1:]]
 
 
-def _comment(text: str) -> list[str]:
+def comment_lines(text: str, width: int = 110) -> list[str]:
+    """A comment in lines of at most this width."""
     whole = text.replace(" [", f"{_NO_BREAK}[")  # "# [s]" would look like a section
     whole = re.sub(r'"[^"]*"', lambda quoted: quoted[0].replace(" ", _NO_BREAK), whole)  # a value stays in one piece
-    lines = textwrap.wrap(whole, MAX_WIDTH - 2, subsequent_indent="  ", break_on_hyphens=False)
+    lines = textwrap.wrap(whole, width - 2, subsequent_indent="  ", break_on_hyphens=False)
     return [f"# {line}".replace(_NO_BREAK, " ") for line in lines]
 
 
-def _line(entry: str, remark: str) -> list[str]:
+def _line(entry: str, remark: str, column: int = 44, width: int = 110) -> list[str]:
     """An entry with its comment beside it, or above where that would be too long."""
     if not remark:
         return [entry]
-    beside = f"{entry:<{COMMENT_COLUMN}} # {remark}"
-    return [beside] if len(beside) <= MAX_WIDTH else [*_comment(remark), entry]
+    beside = f"{entry:<{column}} # {remark}"
+    return [beside] if len(beside) <= width else [*comment_lines(remark, width), entry]

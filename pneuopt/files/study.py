@@ -21,7 +21,7 @@ from pneuopt.files.loop import (
     read_sample_spreads,
     read_spreads,
 )
-from pneuopt.files.tolerances import DEFAULT_POINTS, MAX_CASES
+from pneuopt.files.tolerances import MAX_CASES
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, check_sections, flag, read_table, table
@@ -197,7 +197,7 @@ STUDY_KEYS: Mapping[str, Key] = {
                 of=Key("a requirement", Takes.TEXT),
                 counts=(2, 2),
             ),
-            "points": Key("designs of the front", Takes.COUNT, usual=DEFAULT_POINTS, least=2, most=MAX_CASES),
+            "points": Key("designs of the front", Takes.COUNT, usual=9, least=2, most=MAX_CASES),
             "lower": Key("where the second ends; by default the least that can be", unit="{own}", example='"100 N"'),
             "upper": Key("where it begins; by default the tuning's limit", unit="{own}", example='"250 N"'),
         },

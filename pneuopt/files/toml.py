@@ -13,6 +13,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Table
 
+from pneuopt.files.tolerances import FILE_DIGITS
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import PARAMETER_KEYS, Takes
 from pneuopt.quantities.output import MAX_REASON, plain_value, read_toml_source
@@ -136,7 +137,7 @@ def _field_differs(field: str, found: Parameter, given: Parameter) -> bool:
 
 
 def _format_value(value: float, parameter: Parameter) -> str:
-    """Round to nine digits, unless the rounded value would cross a bound."""
-    text = write_value(value, parameter.unit, 9)
+    """Round to `FILE_DIGITS`, unless the rounded value would cross a bound."""
+    text = write_value(value, parameter.unit, FILE_DIGITS)
     inside = parameter.lower <= read_value(text, parameter.unit) <= parameter.upper
     return text if inside else write_value(value, parameter.unit, 17)

@@ -13,7 +13,7 @@ from pneuopt.evaluation.response import cases
 from pneuopt.files.certificate import CHECKSUM, checksum_section
 from pneuopt.files.drive import StoredFit, read_fit
 from pneuopt.files.loop import TUNABLE_SECTIONS
-from pneuopt.files.tolerances import SAME_GAINS
+from pneuopt.files.tolerances import FILE_DIGITS
 from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.files.tuning import TUNED_SECTIONS, move_paths, read_tuning_table
 from pneuopt.quantities.errors import InputError, require
@@ -93,7 +93,7 @@ def _check_subject(
     task = read_tuning_table(table, path, fit.drive.system(), plant)
     known = plant | task.parameters
     for n, p in known.items():
-        same = n not in gains or isclose(gains.value(n), p.value, rel_tol=SAME_GAINS)
+        same = n not in gains or isclose(gains.value(n), p.value, rel_tol=10.0 ** (1 - FILE_DIGITS))
         values = f"{write_value(p.value, p.unit)}, the result was made with {write_value(gains[n].value, p.unit)}"
         require(same, f"{path}: {n} is {values}" if n in task.parameters else f"{fit.path}: {n} is {values}")
     labels = [case.label for case in cases(task.references, task.scenarios(known), known)]

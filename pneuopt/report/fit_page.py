@@ -27,7 +27,6 @@ from pneuopt.quantities.status import report_status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
 from pneuopt.report.page import Page, Picture, Section, data_section, log_hashes, provenance_section
-from pneuopt.report.tolerances import MIN_CORRELATED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -123,7 +122,7 @@ def _estimate_section(result: IdentificationResult) -> Section:
     parts: list[Report | Picture] = [report_estimates(result.estimates, result.widths), Report(said)]
     if result.window is not None:
         parts.append(Report((Line(str(result.window)),)))
-    if int(result.estimates["stderr"].notna().sum()) >= MIN_CORRELATED:
+    if int(result.estimates["stderr"].notna().sum()) > 1:
         alt = "A cell for each pair of estimates with their correlation, from -1 to 1."
         caption = "Correlation of the estimates; near 1 or -1 the logs tell little more than a combination of two."
         parts.append(Picture(partial(plot_correlation, result), alt, caption))

@@ -29,9 +29,9 @@ from pneuopt.report.tolerances import (
     INCLINE,
     INDEPENDENT,
     LOG_RANGE,
-    RANGE,
     RESIDUAL,
     SHRINKAGES,
+    SLIDER_RANGE,
     UNCHANGED_LEAST,
     UNCHANGED_RATIO,
 )
@@ -132,7 +132,7 @@ PLANT_SECTIONS = ("load", "supply", "friction")
 NOT_MOVED = ("pid.Tt", "pid.lower", "pid.upper", "pid.fault_samples", "pid.fault_output", "friction.smoothing")
 """Parameters without a slider: limits of hardware, what only a fault shows, and what makes a loop too stiff here."""
 RANGES = {"supply.pressure": 1.5}
-"""The same where hardware varies less: no shop's air has three times its pressure."""
+"""`SLIDER_RANGE` where hardware varies less: no shop's air has three times its pressure."""
 
 
 def live_script(
@@ -253,7 +253,7 @@ def _ends(parameters: ParameterSet, name: str) -> tuple[float, float]:
     p = parameters[name]
     if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
         return p.lower, p.upper
-    ends = sorted((p.value / (ratio := RANGES.get(name, RANGE)), p.value * ratio))
+    ends = sorted((p.value / (ratio := RANGES.get(name, SLIDER_RANGE)), p.value * ratio))
     if name == "load.force" and "load.mass" in parameters:
         reach = INCLINE * GRAVITY * parameters.value("load.mass")
         ends = [p.value - reach, p.value + reach]

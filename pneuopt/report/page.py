@@ -43,7 +43,6 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import unit_ratio, write_value
-from pneuopt.report.tolerances import GAIN_DIGITS
 
 if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure
@@ -222,7 +221,7 @@ def report_forms(controller: Controller, parameters: ParameterSet) -> Report:
             continue
         if gains.get("Td") == 0:
             gains = {n: math.nan if n == "N" else v for n, v in gains.items()}  # of no derivative there is no ratio
-        written = {n: write_value(v, units.get(n, "s"), GAIN_DIGITS) for n, v in gains.items() if not math.isnan(v)}
+        written = {n: write_value(v, units.get(n, "s")) for n, v in gains.items() if not math.isnan(v)}
         rows.append((name, *(f"{n} {written.get(n, '-')}" for n in gains), law.replace("~", TIED)))
     return Report((Table(text_columns("form", "", "", "", "", "law"), tuple(rows)), *refused, Line(N_NOTE)))
 

@@ -39,7 +39,6 @@ from pneuopt.report.page import (
     report_settings,
     write_page,
 )
-from pneuopt.report.tolerances import MOST_NAMES
 from pneuopt.studies.sensitivity import Sensitivity
 from pneuopt.tuning.result import TuningResult, report_active, report_certificate_status, report_gains, report_refusal
 from pneuopt.tuning.validation import report_validation, report_validation_verdict
@@ -354,7 +353,7 @@ def tracking_picture(found: Tracking) -> Picture:
     return Picture(partial(plot_tracking, found), alt, "Estimates over time.")
 
 
-def title_of(what: str, file: Path, logs: Sequence[Path]) -> str:
+def title_of(what: str, file: Path, logs: Sequence[Path], most: int = 3) -> str:
     """What a page is of: "Check of drive.toml with run_01.csv"; of many logs their number."""
-    names = ", ".join(log.name for log in logs) if len(logs) <= MOST_NAMES else f"{len(logs)} logs"
+    names = ", ".join(log.name for log in logs) if len(logs) <= most else f"{len(logs)} logs"
     return f"{what} of {file.name}" + (f" with {names}" if logs else "")

@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from pneuopt.cli import study as study_front
 from pneuopt.cli import study as study_module
 from pneuopt.cli.app import app
-from pneuopt.cli.study import tune_cell
+from pneuopt.cli.study import report_cases, tune_cell
 from pneuopt.models.declaration import Drive
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.studies.neighbours import sweep_from_neighbours
@@ -219,7 +219,7 @@ def test_a_study_of_nothing_but_failures_is_shown_and_drawn(folder: Path) -> Non
 
 
 def test_many_cases_are_shown_by_the_worst(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pneuopt.cli.study.MAX_CASE_ROWS", 2)
+    monkeypatch.setattr(study_module, "report_cases", partial(report_cases, most_rows=2))
     result = run("study study.toml -o cases.csv")
     assert "the 2 worst of 4 cases by SettlingTime; -o FILE writes all" in result.stdout
     settling = pd.read_csv("cases.csv")[["SettlingTime[0 to 0.2] [s]", "SettlingTime[0 to -0.1] [s]"]].max(axis=1)
