@@ -1,4 +1,4 @@
-"""fit.toml: the covariance of a fit's estimates, from which a design's plants are drawn."""
+"""drive.toml and fit.toml: what is read, written and kept, for every kind of drive."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""[samples], [corners] and [table] of a study.toml: each kind through the same mill."""
+"""study.toml: axes, fronts, and the cases of each kind through the same mill."""
 
 from pathlib import Path
 
