@@ -1,15 +1,13 @@
 """The commands `pneuopt init | check | identify | tune | certify | export | ...`, as `pneuopt --help` has them.
 
-Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 70 an
-error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated. Each command imports what it
-needs, so that `--help` waits for no heavy import.
-
-What `pneuopt --help` says of each command in a line, and the examples and pointers below a command's own help.
-
-Options that several commands have.
+First their help and the options that several have, then the commands. Each imports what it needs, so that `--help`
+waits for no heavy import. Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never
+settles), 2 bad input, 70 an error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated.
 """
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from math import inf
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -17,9 +15,9 @@ from typing import Annotated, NamedTuple
 import typer
 from typer.models import CommandFunctionType
 
-from pneuopt.cli.errors import report_errors
-from pneuopt.cli.run import run_guarded
-from pneuopt.quantities.errors import require
+from pneuopt.cli.run import ExitStatus, interruption_status, run_guarded
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
+from pneuopt.quantities.output import read_once
 
 
 class CommandHelp(NamedTuple):
@@ -190,8 +188,40 @@ app = typer.Typer(
 
 
 def _command(name: str) -> Callable[[CommandFunctionType], CommandFunctionType]:
-    """Register a command with what `command_help` says of it."""
+    """Register a command with its help."""
     return app.command(name, short_help=COMMAND_HELP[name].line, epilog=epilog(name))
+
+
+@contextmanager
+def report_errors() -> Iterator[None]:
+    """Turn an error that a user can mend into one message and an exit status, and a `PhysicsWarning` into one line."""
+    printed: set[str] = set()
+
+    def say(sentence: str) -> None:
+        from pneuopt.cli.shared import make_console, show_sentence
+
+        show_sentence(make_console(error=True), sentence)
+
+    def print_warning(message: Warning | str, *_: object, **__: object) -> None:  # each once, as soon as it comes
+        line = f"warning: {message}"
+        if line not in printed:
+            printed.add(line)
+            say(line)
+
+    try:
+        with warnings.catch_warnings(), read_once():
+            warnings.simplefilter("always", PhysicsWarning)
+            warnings.showwarning = print_warning
+            yield
+    except InputError as error:
+        say(f"error: {error}")
+        raise typer.Exit(ExitStatus.BAD_INPUT) from None
+    except ConvergenceError as error:
+        say(f"NOT converged: {error}")
+        raise typer.Exit(ExitStatus.FAILURE) from None
+    except KeyboardInterrupt:
+        say("interrupted: no file was left half-written")
+        raise typer.Exit(interruption_status() or ExitStatus.INTERRUPTED) from None
 
 
 def main() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.cli.init import write_files
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import Outputs, file_hashes, finish, make_console, show_output_files, show_report, show_sentence
-from pneuopt.cli.tolerances import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_SUCCESS
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check, finding_line
@@ -41,25 +41,19 @@ def run_check(
     experiments, errors = _read_all(logs, system, parameters, accept)
     for error in errors:
         show_sentence(make_console(error=True), f"error: {error}")
-    status = EXIT_BAD_INPUT if errors else EXIT_SUCCESS
+    status = ExitStatus.BAD_INPUT if errors else ExitStatus.SUCCESS
     if experiments:
         found = check(system, experiments, parameters)
         found = replace(found, assumptions=(*found.assumptions, *stored.assumed_options))
         show_report(make_console(), found.summary())
         page = partial(_page, drive, logs, found, errors)
         finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found), page=page)
-        status = status or (EXIT_FAILURE if found.is_refused else EXIT_SUCCESS)
+        status = status or (ExitStatus.FAILURE if found.is_refused else ExitStatus.SUCCESS)
     return _fix(places, system, parameters, accept) if places else status
 
 
 def _new_places(folder: Path, logs: Sequence[Path]) -> dict[Path, Path]:
-    """Where each mended log goes; no file that is there already is written over.
-
-    Raises
-    ------
-    InputError
-        If two logs have one name, or there is such a file.
-    """
+    """Where each mended log goes; no file that is there already is written over."""
     places: dict[Path, Path] = {}
     for log in logs:
         place = folder / f"{log.stem}.csv"
@@ -92,11 +86,11 @@ def _fix(places: Mapping[Path, Path], system: System, parameters: ParameterSet, 
     show_report(make_console(), Report(tuple(said)))
     show_output_files(make_console(), list(files))
     if not mended:
-        return EXIT_BAD_INPUT
+        return ExitStatus.BAD_INPUT
     left = check(system, _read_all([places[path] for path in mended], system, parameters, accept)[0], parameters)
     verdict = replace(left.headline, text=f"the mended logs: {left.headline.text}")
     show_report(make_console(), Report((verdict, *map(finding_line, left.findings))))
-    return EXIT_BAD_INPUT if errors else EXIT_FAILURE if left.is_refused else EXIT_SUCCESS
+    return ExitStatus.BAD_INPUT if errors else ExitStatus.FAILURE if left.is_refused else ExitStatus.SUCCESS
 
 
 def _read_all(
@@ -115,15 +109,10 @@ def _read_all(
             check_logs(system, log, parameters)
             found.append(log)
         except InputError as error:
-            errors.append(f"{error}{_name_unread(log)}")
+            unread = ", ".join(log.source.unread) if log.source else ""  # the missing channel may be one of them
+            told = f"; columns that are not read: {unread}; a sidecar's [columns] says which channel a column is"
+            errors.append(f"{error}{told if unread else ''}")
     return found, errors
-
-
-def _name_unread(log: Experiment) -> str:
-    """The columns among which the missing channel may be."""
-    unread = log.source.unread if log.source else ()
-    remedy = "a sidecar's [columns] says which channel a column is"
-    return f"; columns that are not read: {', '.join(unread)}; {remedy}" if unread else ""
 
 
 def _page(drive: Path, logs: Sequence[Path], found: Checkup, errors: Sequence[str]) -> Page:

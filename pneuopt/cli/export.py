@@ -8,8 +8,8 @@ from typing import Any
 import typer
 
 from pneuopt.cli.init import write_files
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import make_console, read_fit_and_tuning, show_output_files, warn
-from pneuopt.cli.tolerances import EXIT_SUCCESS
 from pneuopt.export.blocks import export_settings
 from pneuopt.export.fmu import export_fmu
 from pneuopt.export.languages import Language, export_controller
@@ -18,7 +18,7 @@ from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.output import read_toml_source, write_bytes
+from pneuopt.quantities.output import read_toml_source
 from pneuopt.quantities.units import difference_unit, read_value
 
 FMU = "fmu"  # the form that is the plant, not the controller
@@ -32,23 +32,7 @@ NO_CERTIFICATE = CertificateCheck(False, ("its gains were not written by pneuopt
 def run_export(
     fit: Path, tuned: Path, to: str, folder: Path, name: str, uncertified: bool, force: bool, span: str = ""
 ) -> int:
-    """Write the files and say which; returns the exit status.
-
-    Parameters
-    ----------
-    fit, tuned : Path
-    to : str
-        A `Language`, a `Block`, whose settings are shown, too, or "fmu", the plant.
-    folder : Path
-        Made where it is missing.
-    name : str
-    uncertified : bool
-        Whether gains without a certificate may be written.
-    force : bool
-        Whether old files may be replaced.
-    span : str
-        Of the process value as a block scales it, with its unit; "" for what the references take.
-    """
+    """Export as a `Language`, as a `Block`, which is also shown, or the plant, "fmu"; returns the exit status."""
     languages, blocks = {kind.value: kind for kind in Language}, {kind.value: kind for kind in Block}
     _check_form(to, [*languages, *blocks, FMU])
     scaled = Block.ROCKWELL.value
@@ -56,23 +40,29 @@ def run_export(
     stored, task, parameters = read_fit_and_tuning(fit, tuned)
     unit = task.loop.feedback.unit
     measured_span = read_value(span, difference_unit(unit), where="--pv-span") if span else None
-    origin = [*_certificate_lines(stored, tuned, uncertified), *_source_lines(fit, tuned)]
+    sums = {path: hashlib.sha256(read_toml_source(path)).hexdigest() for path in (fit, tuned)}
+    origin = _certificate_lines(stored, tuned, uncertified)
+    origin += [f"from {tuned.name}, sha256 {sums[tuned]}", f"plant {fit.name}, sha256 {sums[fit]}"]
     given = (task.loop, parameters)
+    files: Mapping[str, str | bytes]
     if to == FMU:
-        return _write_fmu(folder / f"{name}.fmu", export_fmu(task.loop.plant, parameters, name=name), force)
-    if to in languages:
+        place = folder / f"{name}.fmu"
+        told = "is there already, and stays as it is; --force replaces it, -o names another folder"
+        require(force or not place.exists(), f"{place}: {told}")  # not even by the same one
+        files = {place.name: export_fmu(task.loop.plant, parameters, name=name)}
+    elif to in languages:
         files = export_controller(*given, languages[to], name=name, centre=task.centre, origin=origin)
     else:
         block = blocks[to]
         files = export_settings(
             *given, block, task.references, name=name, centre=task.centre, origin=origin, measured_span=measured_span
         )
-    placed = {folder / file: text for file, text in files.items()}
+    placed = {folder / file: content for file, content in files.items()}
     write_files(placed, force)
     if to in blocks:
-        typer.echo("".join(files.values()))
+        typer.echo("".join(map(str, files.values())))
     show_output_files(make_console(), list(placed))
-    return EXIT_SUCCESS
+    return ExitStatus.SUCCESS
 
 
 def _check_form(to: str, forms: Sequence[str]) -> None:
@@ -85,19 +75,6 @@ def _check_form(to: str, forms: Sequence[str]) -> None:
     meant = word if word in forms else MAKERS.get(word, to)
     require(to in forms or meant == to, f"{lead}; it is called {meant!r} here")
     check_names("form", [to], forms, "export --to")
-
-
-def _write_fmu(path: Path, content: bytes, force: bool) -> int:
-    """Write the plant as an FMU, whole or not at all."""
-    told = "is there already, and stays as it is; --force replaces it, -o names another folder"
-    require(force or not path.exists(), f"{path}: {told}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        require(False, f"{path.parent}: the folder cannot be made ({error.strerror}); name another with -o")
-    write_bytes(path, content)
-    show_output_files(make_console(), [path])
-    return EXIT_SUCCESS
 
 
 def _certificate_lines(fit: StoredFit, tuned: Path, uncertified: bool) -> list[str]:
@@ -122,9 +99,3 @@ def _metric_lines(metrics: Any) -> list[str]:
         shown = [f"{n} {known[n]:.4g}" for n in SHOWN_METRICS if isinstance(known.get(n), int | float)]
         lines += [f"{step}: {', '.join(shown)}"] if shown else []
     return lines
-
-
-def _source_lines(fit: Path, tuned: Path) -> list[str]:
-    """Which files the gains and the plant come from."""
-    sums = {path: hashlib.sha256(read_toml_source(path)).hexdigest() for path in (fit, tuned)}
-    return [f"from {tuned.name}, sha256 {sums[tuned]}", f"plant {fit.name}, sha256 {sums[fit]}"]

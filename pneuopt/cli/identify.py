@@ -25,7 +25,7 @@ from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, read_fit, write_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.identify import identify, predict, validate
-from pneuopt.identification.result import IdentificationResult, Mark, Verdict, report_agreement
+from pneuopt.identification.result import IdentificationResult, Mark, report_agreement
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.doctor import CHECKS, LogFinding
 from pneuopt.logs.experiment import Experiment
@@ -123,10 +123,11 @@ def _hints(outputs: Outputs) -> list[str]:
 
 def _fit_tables(result: IdentificationResult) -> dict[str, Any]:
     """What a JSON file holds of a fit."""
+    verdict = result.verdict
     return {
         "estimates": records(result.estimates),
         "fit": records(result.fit),
-        "verdict": _verdict_record(result.verdict),
+        "verdict": {**verdict.to_dict(), "table": records(verdict.table)} if verdict is not None else {},
         "widths": [asdict(width) for width in result.widths],
         "window": asdict(result.window) if result.window else None,
     }
@@ -134,7 +135,8 @@ def _fit_tables(result: IdentificationResult) -> dict[str, Any]:
 
 def _page_source(drive: Path, logs: Sequence[Path], warned: Sequence[str]) -> Source:
     """The title of a fit's page, the drive's hash, and what was said before the fit."""
-    title = f"Identification of {drive.name} from {_log_names(logs)}"
+    names = ", ".join(log.name for log in logs[:3]) + (f" and {len(logs) - 3} more" if len(logs) > 3 else "")
+    title = f"Identification of {drive.name} from {names}"
     return Source(title, file_hashes(drive), tuple(f"before the fit: {sentence}" for sentence in warned))
 
 
@@ -146,7 +148,10 @@ def run_select(
     require((outputs.output, outputs.plot) == (None, None), f"--select writes neither -o nor --plot; {remedy}")
     outputs.check(_input_files(drive, logs))
     model, parameters = read_free_drive(drive)
-    systems = _friction_systems(drive, model)
+    message = f"{drive}: --select chooses a drive's friction model; this plant is not built from one"
+    require(DRIVE_KINDS[model.kind].any_friction, message)
+    built: Any = model
+    systems = {name: replace(built, friction=law).system() for name, law in friction_ladder().items()}
     free = [n for n in parameters.free_names if not n.startswith("friction.")]
     known = parameters.fixed("friction.*").select(
         n for n in parameters if any(n in s.parameters for s in systems.values())
@@ -188,20 +193,17 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
         writers[outputs.output] = partial(write_csv, run=runs[0].with_columns(given), columns=columns)
     hashes = file_hashes(fit) | {f"sha256[{log.name}]": experiment.sha256}
     tables = {"fit": records(table), "provenance": hashes}
-    figures = partial(_prediction_figures, runs, experiment)
     source = Source(f"Prediction of {log.name} by {fit.name}", file_hashes(fit), describe_status(stored))
     page = partial(prediction_page, source, table, runs, [experiment])
-    return finish(outputs, writers, tables, None, figures=figures, report=report_agreement(table), page=page)
-
-
-def _prediction_figures(runs: Sequence[Trajectory], experiment: Experiment) -> dict[str, "Figure"]:
-    return {"": plot_prediction(runs, [experiment], label="predicted")}
-
-
-def _log_names(logs: Sequence[Path]) -> str:
-    """The first three logs, and how many more there are."""
-    shown = ", ".join(log.name for log in logs[:3])
-    return shown if len(logs) <= 3 else f"{shown} and {len(logs) - 3} more"
+    return finish(
+        outputs,
+        writers,
+        tables,
+        None,
+        figures=lambda: {"": plot_prediction(runs, [experiment], label="predicted")},
+        report=report_agreement(table),
+        page=page,
+    )
 
 
 @contextmanager
@@ -239,20 +241,6 @@ def read_free_drive(path: Path) -> tuple[Drive, ParameterSet]:
     remedy = 'mark what to identify, as in coulomb = { value = "40 N", free = true }'
     require(len(parameters.free_names) > 0, f"{path}: no parameter is free; {remedy}")
     return model, parameters
-
-
-def _friction_systems(path: Path, model: Drive) -> dict[str, System]:
-    """The drive with each friction model in turn."""
-    message = f"{path}: --select chooses a drive's friction model; this plant is not built from one"
-    require(DRIVE_KINDS[model.kind].any_friction, message)
-    drive: Any = model
-    return {name: replace(drive, friction=friction).system() for name, friction in friction_ladder().items()}
-
-
-def _verdict_record(verdict: Verdict | None) -> dict[str, Any]:
-    if verdict is None:
-        return {}
-    return {**verdict.to_dict(), "table": records(verdict.table)}
 
 
 def _fit_figures(

@@ -1,7 +1,4 @@
-"""The command `init`: the first files of a new user, each whole or not at all, none over an old one.
-
-`pneuopt init --run`: a run of moves to play, from whose log a drive is identified.
-"""
+"""`pneuopt init`: the first files of a new user, none over an old one; with --run, moves to play and to log."""
 
 import os
 import sys
@@ -13,7 +10,8 @@ from pathlib import Path
 
 import typer
 
-from pneuopt.cli.tolerances import EXIT_SUCCESS, SAMPLE_TIMES, WIDTH
+from pneuopt.cli.run import ExitStatus
+from pneuopt.cli.tolerances import SAMPLE_TIMES
 from pneuopt.evaluation.moves import excitation_run
 from pneuopt.files.drive import read_drive
 from pneuopt.files.first_files import (
@@ -33,7 +31,7 @@ from pneuopt.logs.foreign import parse_log
 from pneuopt.logs.table import LogTable, read_bytes
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.output import check_output_paths, write_text
+from pneuopt.quantities.output import check_output_paths, write_bytes
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import read_value, write_value
 
@@ -64,21 +62,7 @@ class Asker:
 
 
 def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], log: Path | None, force: bool) -> int:
-    """Write the files and say which.
-
-    Parameters
-    ----------
-    kind : str, optional
-        Without it, as the log's channels say.
-    folder : Path
-        Made where it is missing.
-    parts : mapping of str to str or None
-        "size", "cylinder" and "valve" of the catalogue.
-    log : Path, optional
-        Whose sidecar is filled.
-    force : bool
-        Whether old files may be replaced; without it those that stand beside another log's sidecar are kept.
-    """
+    """Write the files of a kind of drive, by default the one that the log's channels show; returns the exit status."""
     table = None if log is None else parse_log(log, read_bytes(log))
     guessed = None if table is None or kind is not None else _guess_kind(table)
     message = f"say what drives the load: pneuopt init KIND, one of {', '.join(first_kinds())}"
@@ -89,7 +73,9 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     check_names("kind", [name], first_kinds(), "init")
     known, source = _read_catalogue(name, parts)
     ask = Asker(sys.stdin.isatty() and sys.stdout.isatty())
-    guess = LogGuess((), (), SAMPLE_TIME) if table is None else _guess_log(table, name, ask)
+    guess = LogGuess((), (), SAMPLE_TIME)
+    if table is not None:
+        guess = guess_log(table, first_channels(name), ask, has_centre=name == _PNEUMATIC)
     unused = unused_channels(name)
     columns = {c.channel: "false" if c.channel in unused else c.entry for c in guess.columns}
     least, most = SAMPLE_TIMES
@@ -115,19 +101,14 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
         typer.echo(f"  pneuopt init KIND --from {log} --force")
     written = [n for n in files if folder / n not in kept]
     _show_files(folder, written, guess, unused, ask.assumed, log)
-    return EXIT_SUCCESS
+    return ExitStatus.SUCCESS
 
 
-def write_files(files: Mapping[Path, str], force: bool) -> None:
-    """Write files, all or none: an old one with another text is refused, unless forced.
-
-    Raises
-    ------
-    InputError
-        Before the first is written, if one of them may not or cannot be.
-    """
-    for path, text in files.items():
-        is_new = force or not path.exists() or (path.is_file() and path.read_bytes() == text.encode())
+def write_files(files: Mapping[Path, str | bytes], force: bool) -> None:
+    """Write files, all or none: an old one with another text is refused, unless forced."""
+    contents = {path: text.encode() if isinstance(text, str) else text for path, text in files.items()}
+    for path, content in contents.items():
+        is_new = force or not path.exists() or (path.is_file() and path.read_bytes() == content)
         require(is_new, f"{path}: is there already, and stays as it is; --force replaces it, -o names another folder")
     for parent in dict.fromkeys(path.parent for path in files):
         try:
@@ -135,12 +116,8 @@ def write_files(files: Mapping[Path, str], force: bool) -> None:
         except OSError as error:
             require(False, f"{parent}: the folder cannot be made ({error.strerror}); name another with -o")
     check_output_paths(files, [])
-    for path, text in files.items():
-        write_text(path, text)
-
-
-def _guess_log(table: LogTable, kind: str, ask: Asker) -> LogGuess:
-    return guess_log(table, first_channels(kind), ask, has_centre=kind == _PNEUMATIC)
+    for path, content in contents.items():
+        write_bytes(path, content)
 
 
 def _guess_kind(table: LogTable) -> str:
@@ -230,9 +207,9 @@ def _advise_command(guess: LogGuess, unused: Container[str]) -> None:
         say(held, "    ")
 
 
-def say(text: str, indent: str = "") -> None:
+def say(text: str, indent: str = "", width: int = 80) -> None:
     """Print a sentence in lines of the screen's width."""
-    typer.echo("\n".join(textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")))
+    typer.echo("\n".join(textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent + "  ")))
 
 
 @dataclass(frozen=True)
@@ -245,27 +222,19 @@ class RunOptions:
 
 
 def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, unused: Mapping[str, object]) -> int:
-    """Write the run's files and say what it is for, how long it takes and what to log.
-
-    Parameters
-    ----------
-    drive : Path
-        The drive's file.
-    folder : Path
-        Made where it is missing.
-    options : RunOptions
-    force : bool
-        Whether old files may be replaced.
-    unused : mapping of str to object
-        Options of `pneuopt init` that have no sense here, by their names; None where they are not given.
-    """
+    """Write a run's files, and show how long it takes and what to log; `unused` are options that it does not take."""
     given = ", ".join(n for n, value in unused.items() if value is not None)
     require(not given, f"--run reads the drive from its file: leave out {given}")
     model, parameters = read_drive(drive)
     speed = read_value(options.speed, "m/s", where="--speed") if options.speed else inf
     sample_time = read_value(options.sample_time, "s", where="--sample-time")
     require(sample_time > 0, f"--sample-time {options.sample_time}: give the controller's, such as 1ms")
-    between = _read_between(options.between) if options.between else None
+    between = None
+    if options.between:
+        low, dots, high = options.between.partition("..")
+        require(bool(dots), f"--between {options.between}: give both ends, as in 20mm..180mm")
+        between = read_value(low.strip(), "m", where="--between"), read_value(high.strip(), "m", where="--between")
+        require(between[0] < between[1], f"--between {options.between}: the first end must be below the second")
     run = excitation_run(model.system(), parameters, sample_time=sample_time, between=between, speed=speed)
     write_files({folder / name: text for name, text in run_files(run, drive.name).items()}, force)
     low, high, trail = (write_value(x, "m", 3) for x in (*run.between, run.following_error))
@@ -275,12 +244,4 @@ def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, un
     say(f"{run.duration:.3g} s between {low} and {high}, at {fast} at most; with a gain of {gain} it trails by {trail}")
     say(f"Log {', '.join(logged_channels(run))} at the controller's samples, from before the first move on, then")
     typer.echo(f"  pneuopt identify {drive} LOG -o fit.toml")
-    return EXIT_SUCCESS
-
-
-def _read_between(text: str) -> tuple[float, float]:
-    low, dots, high = text.partition("..")
-    require(bool(dots), f"--between {text}: give both ends, as in 20mm..180mm")
-    first, last = (read_value(end.strip(), "m", where="--between") for end in (low, high))
-    require(first < last, f"--between {text}: the first end must be below the second")
-    return first, last
+    return ExitStatus.SUCCESS

@@ -1,14 +1,10 @@
-"""`run_guarded`: the last that stands between a command and the user: streams that fail, signals, unforeseen errors.
+"""`run_guarded`: runs the command line and survives streams that fail, signals and unforeseen errors.
 
-It imports nothing but the standard library, so that it listens from the first moment on.
-
-Ctrl-C, SIGTERM and the closing of the terminal: a command ends soon, with the best so far, and its files whole.
-
-The first signal raises KeyboardInterrupt, after which a command only writes what it has. A second one within
-`PATIENCE` changes nothing, for many press twice; a later one ends the process at once. Where the main thread is in
-foreign code that hears no signal, another thread ends the process after `PATIENCE`.
-
-How a command ends: the exit statuses of `pneuopt`, which scripts may rely on.
+It imports nothing but the standard library, so that it listens from the first moment on. By Ctrl-C, SIGTERM or the
+closing of the terminal a command ends soon, with the best so far, and its files whole: the first signal raises
+KeyboardInterrupt, after which a command only writes what it has. A second one within `PATIENCE` changes nothing, for
+many press twice; a later one ends the process at once. Where the main thread is in foreign code that hears no signal,
+another thread ends the process after `PATIENCE`.
 """
 
 import errno
@@ -24,49 +20,47 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
-from pneuopt.cli.tolerances import (
-    EXIT_OUTPUT_LOST,
-    EXIT_UNFORESEEN,
-    PATIENCE,
-    RETURN,
-    SHOWN_REASON,
-)
+from pneuopt.cli.tolerances import PATIENCE, RETURN
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 
 def run_guarded(load: Callable[[], Callable[[], object]]) -> NoReturn:
-    """Run the command line and end the process; never a traceback.
-
-    Parameters
-    ----------
-    load : callable
-        Imports the command line and returns it.
-    """
+    """Run the command line that `load` imports, and end the process; never with a traceback."""
     streams = _guard_streams()
     listen_to_signals()
     status = _run(load)
     command_is_over()
     stopped = interruption_status()
-    lost = _flush(streams)
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    errors = [raw.error for raw in streams if raw.fileno() == 1]
+    lost = next((e for e in errors if e is not None and e.errno != errno.EPIPE), None)  # EPIPE: its reader just left
     if lost is not None and status == 0 and stopped is None:
         _say(f"error: standard output cannot be written ({lost.strerror}); the files that were asked for are written")
-        status = EXIT_OUTPUT_LOST
+        status = ExitStatus.OUTPUT_LOST
     sys.exit(status if stopped is None else stopped)
 
 
-class LastingFile(io.FileIO):
-    """A stream that may fail: what cannot be written is dropped and the reason kept, so that the work is not lost.
+class ExitStatus(IntEnum):
+    """How a command ends; scripts may rely on these. By SIGTERM it ends with 143."""
 
-    Attributes
-    ----------
-    error : OSError or None
-    """
+    SUCCESS = 0
+    FAILURE = 1  # not converged, not certified, no interval that holds; in a study a case failed or never settles
+    BAD_INPUT = 2  # something that the user gave cannot be used; Typer's own where an option is wrong
+    UNFORESEEN = 70  # an error that nobody foresaw, sysexits' EX_SOFTWARE: one line names a file with the details
+    OUTPUT_LOST = 74  # the screen could not be written, sysexits' EX_IOERR; the files that were asked for are
+    INTERRUPTED = 130  # Ctrl-C: 128 + the number of SIGINT, as shells have it
+
+
+class LastingFile(io.FileIO):
+    """A stream that may fail: what cannot be written is dropped and the reason kept, so that the work is not lost."""
 
     error: OSError | None = None
 
@@ -91,8 +85,13 @@ def _run(load: Callable[[], Callable[[], object]]) -> int:
         if interruption_status() is not None:  # foreign code that turns an interruption into an error of its own
             _say("interrupted: no file was left half-written")
         else:
-            _report_unforeseen(error)
-            return EXIT_UNFORESEEN
+            frames = traceback.extract_tb(error.__traceback__)
+            place = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+            reason = " ".join(f"{type(error).__name__}{place}: {error}".split()).removesuffix(":")
+            file = _write_details(error)
+            where = f"the details are in {file}; please send it" if file else "run it again with a folder to write to"
+            _say(f"error: unforeseen, a bug of pneuopt: {reason[:160]}; {where}")
+            return ExitStatus.UNFORESEEN
     return 0
 
 
@@ -116,24 +115,6 @@ def _guard_streams() -> list[LastingFile]:
         setattr(sys, name, text)
         guarded.append(raw)
     return guarded
-
-
-def _flush(streams: list[LastingFile]) -> OSError | None:
-    """Write out what is buffered; returns why standard output is lost, but not where its reader just left."""
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    errors = [raw.error for raw in streams if raw.fileno() == 1]
-    return next((e for e in errors if e is not None and e.errno != errno.EPIPE), None)
-
-
-def _report_unforeseen(error: BaseException) -> None:
-    """One line, and a file with the details."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
-    reason = " ".join(f"{type(error).__name__}{place}: {error}".split()).removesuffix(":")
-    file = _write_details(error)
-    where = f"the details are in {file}; please send it" if file else "run it again with a folder to write to"
-    _say(f"error: unforeseen, a bug of pneuopt: {reason[:SHOWN_REASON]}; {where}")
 
 
 def _write_details(error: BaseException) -> Path | None:
@@ -253,10 +234,6 @@ def _watch(heard: socket.socket, _wake: socket.socket) -> None:
     """Wait for a signal; end the process if its main thread has not heard it in time."""
     while (received := heard.recv(1)) and not sys.is_finalizing():
         time.sleep(PATIENCE)
-        if _State.number is None and received[0] in _numbers():
+        ends = {number for number in signal.Signals if signal.getsignal(number) is _interrupt}
+        if _State.number is None and received[0] in ends:
             end_at_once(128 + received[0])
-
-
-def _numbers() -> set[int]:
-    """The signals that end a command here."""
-    return {number for number in signal.Signals if signal.getsignal(number) is _interrupt}

@@ -1,7 +1,4 @@
-"""What the commands share: their input, and the files they write once everything is computed.
-
-The terminal: a progress line, reports in colour, and the files that were written.
-"""
+"""What the commands share: the files they read, those they write once everything is computed, and the terminal."""
 
 import hashlib
 import math
@@ -22,8 +19,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column
 from rich.text import Text
 
-from pneuopt.cli.run import interruption_status, without_interruption
-from pneuopt.cli.tolerances import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS, SECONDS_A_LINE
+from pneuopt.cli.run import ExitStatus, interruption_status, without_interruption
+from pneuopt.cli.tolerances import SECONDS_A_LINE
 from pneuopt.files.drive import StoredFit, read_fit, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -54,12 +51,7 @@ INTERRUPTED_STEM = "interrupted"
 
 @dataclass(frozen=True)
 class Outputs:
-    """The files that are wanted; `check` refuses early those that could not be written.
-
-    Attributes
-    ----------
-    output, json, plot, report : Path or None
-    """
+    """The files that are wanted; `check` refuses early those that could not be written."""
 
     output: Path | None
     json: Path | None
@@ -93,28 +85,6 @@ def finish(
 
     Each file is tried, whatever becomes of the others. An interrupted command draws no figures, and replaces no file:
     its own stand beside those that are there.
-
-    Parameters
-    ----------
-    outputs : Outputs
-    writers : mapping of Path to callable
-        How to write each file but the JSON and the figures.
-    tables : mapping of str to object
-        What the JSON file holds.
-    status : Status or None
-    figures : callable, optional
-        Draws the figures, by the name that is added to the path of the first, which has none.
-    report : Report, optional
-        What is shown of the result.
-    page : callable, optional
-        Makes the page that --report writes; of an interrupted command without figures.
-    hints : sequence of str
-        What may come next, a command a line; shown where the command has met what was asked.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
     """
     ended = {"status": {"code": status.code.value, "message": status.message}} if status else {}
     if outputs.json is not None:
@@ -125,7 +95,8 @@ def finish(
         drawn, missed = _draw(outputs.plot, figures)
         written, failures = written + drawn, failures + missed
     if page is not None and outputs.report is not None:
-        paged, missed = write_files({outputs.report: partial(_write_page, page, not interrupted)}, beside=interrupted)
+        writers = {outputs.report: lambda path: write_page(path, page(), draws=not interrupted)}
+        paged, missed = write_files(writers, beside=interrupted)
         written, failures = written + paged, failures + missed
     if report is not None:
         show_report(make_console(), report)
@@ -134,19 +105,12 @@ def finish(
         raise InputError("; ".join(map(str, failures)))
     if status is None or status.code in (Code.CONVERGED, Code.PARTIAL):
         show_hints(make_console(), hints)
-        return EXIT_SUCCESS
-    return EXIT_INTERRUPTED if interrupted else EXIT_FAILURE
+        return ExitStatus.SUCCESS
+    return ExitStatus.INTERRUPTED if interrupted else ExitStatus.FAILURE
 
 
 def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], list[InputError]]:
-    """Try to write each file, with no interruption within; those that are written, and why others are not.
-
-    Parameters
-    ----------
-    writers : mapping of Path to callable
-    beside : bool
-        Whether a file that is there already stays, and the new one gets a name of its own.
-    """
+    """Try to write each file without interruption; `beside` one that is there already, under a name of its own."""
     written, failures = list[Path](), list[InputError]()
     with without_interruption():
         for path, write in writers.items():
@@ -157,10 +121,6 @@ def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], 
             except InputError as error:
                 failures.append(error)
     return written, failures
-
-
-def _write_page(make: Callable[[], Page], draws: bool, path: Path) -> None:
-    write_page(path, make(), draws=draws)
 
 
 def _draw(path: Path, figures: Figures) -> tuple[list[Path], list[InputError]]:
@@ -216,6 +176,11 @@ def add_to_stem(path: Path, name: str) -> Path:
     return path.with_stem(f"{path.stem}_{name}")
 
 
+def number_paths(path: Path, count: int) -> list[Path]:
+    """One file a run: run.csv, or run_1.csv, run_2.csv."""
+    return [path] if count == 1 else [add_to_stem(path, str(k)) for k in range(1, count + 1)]
+
+
 def write_csv(path: Path, run: Trajectory, columns: Columns) -> None:
     """Write a run as a log that can be read again."""
     header = ",".join(["time [s]", *(f"{name} [{unit}]" for name, unit in columns.values())])
@@ -262,20 +227,7 @@ def make_console(*, error: bool = False) -> Console:
 
 @contextmanager
 def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
-    """Show the latest report and the time: in one line of a terminal, elsewhere in a line every few seconds.
-
-    Parameters
-    ----------
-    label : str
-        Shown until there is a report.
-    quiet : bool
-        Show nothing.
-
-    Yields
-    ------
-    callable
-        Takes a line of text.
-    """
+    """Yield a function that shows a line of news and the time: in place on a terminal, else every few seconds."""
     console = make_console(error=True)
     if quiet:
         yield lambda _: None

@@ -4,23 +4,20 @@ from functools import partial
 from pathlib import Path
 
 from pneuopt.cli.shared import (
-    Columns,
     Outputs,
     Writers,
-    add_to_stem,
     describe_status,
     file_hashes,
     finish,
+    number_paths,
     read_fit_and_tuning,
     write_csv,
 )
-from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.evaluate import evaluate, metric_limits, relevant_units, report_metrics
 from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.tuning import Tuning
-from pneuopt.plotting import Response
 from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
@@ -48,10 +45,16 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     )
     writers: Writers = {}
     if outputs.output is not None:
-        runs = [_as_logged(r, task.centre) for r in simulate_responses(task.loop, task.references, parameters)]
+        loop, runs = task.loop, list[Trajectory]()
+        for found_run in simulate_responses(loop, task.references, parameters):
+            run, reference = found_run.run, found_run.reference
+            on_wire = run["control"] + task.centre
+            runs.append(run.with_columns({"reference": reference.values(run.t), "control": on_wire}))
         paths = number_paths(outputs.output, len(runs))
         check_output_paths(paths, [fit, tuning])
-        columns = _loop_columns(task.loop)
+        columns = {"reference": (f"{loop.feedback.name}_reference", loop.feedback.unit)}  # as a log names them
+        columns |= {q.name: (q.name, q.unit) for q in loop.plant.outputs}
+        columns |= {"control": (loop.command.name, loop.command.unit)}
         writers |= {p: partial(write_csv, run=run, columns=columns) for p, run in zip(paths, runs, strict=True)}
     tables = {"certified": records(metrics.T), "provenance": file_hashes(fit, tuning)}
     tables |= {} if found is None else {"certificate": {"holds": found.holds, "reasons": list(found.reasons)}}
@@ -93,22 +96,3 @@ def _simulation_page(
         f"Simulation of {fit.path.name} with {tuning.name}", file_hashes(fit.path, tuning), describe_status(fit)
     )
     return simulation_page(source, found, view, metric_limits(task.specification.limits), standing=standing)
-
-
-def number_paths(path: Path, count: int) -> list[Path]:
-    """One file a run: run.csv, or run_1.csv, run_2.csv."""
-    return [path] if count == 1 else [add_to_stem(path, str(k)) for k in range(1, count + 1)]
-
-
-def _loop_columns(loop: ClosedLoop) -> Columns:
-    """Columns of a response as a log names them, so that it can be read as one."""
-    measured, command = loop.feedback, loop.command
-    columns = {"reference": (f"{measured.name}_reference", measured.unit)}
-    columns |= {q.name: (q.name, q.unit) for q in loop.plant.outputs}
-    return columns | {"control": (command.name, command.unit)}
-
-
-def _as_logged(response: Response, centre: float) -> Trajectory:
-    """The response with its reference, and with the command that is on the wire."""
-    run, reference = response.run, response.reference
-    return run.with_columns({"reference": reference.values(run.t), "control": run["control"] + centre})

@@ -1,14 +1,6 @@
-"""`pneuopt study`: a loop certified over a grid of parameters or other cases; a front is in `study_front`.
+"""`pneuopt study`: a loop over a grid or other cases, a front between two requirements, or which tolerances matter.
 
-`pneuopt study` with a [pareto]: a loop tuned along a front between two requirements.
-
-The pages that `pneuopt study --report` writes: of cases, of a sensitivity, and of a Pareto front.
-
-`pneuopt study` with a [sensitivity]: which tolerances matter for a design.
-
-What a study shows: its cases, or the designs of a front.
-
-How the cases of a study are computed and kept, as the options of `pneuopt study` say it.
+`run_study` chooses; then how cases are computed and kept, the three kinds of study, and what they share on the screen.
 """
 
 import math
@@ -19,11 +11,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
     Outputs,
-    Writers,
     add_to_stem,
     describe_status,
     file_hashes,
@@ -33,15 +25,7 @@ from pneuopt.cli.shared import (
     warn,
     warn_of_status,
 )
-from pneuopt.cli.tolerances import (
-    EXIT_FAILURE,
-    EXIT_INTERRUPTED,
-    EXIT_SUCCESS,
-    MAX_CASE_ROWS,
-    MAX_FAILURE_REASONS,
-    MAX_GAIN_COLUMNS,
-    MAX_MAP_AXES,
-)
+from pneuopt.cli.tolerances import MAX_MAP_AXES
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate, metric_cell, metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
@@ -56,7 +40,7 @@ from pneuopt.evaluation.requirements import (
     with_user_limit,
 )
 from pneuopt.evaluation.scenarios import axis_labels
-from pneuopt.files.drive import read_drive, read_fit
+from pneuopt.files.drive import StoredFit
 from pneuopt.files.loop import REQUIREMENTS_BY_KEY, bound_units
 from pneuopt.files.study import (
     Cases,
@@ -72,6 +56,7 @@ from pneuopt.files.study import (
 )
 from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning, read_tuning
+from pneuopt.models.declaration import Drive
 from pneuopt.plotting import plot_distribution, plot_front, plot_map, plot_sensitivity
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import format_table, read_once, records, write_bytes, write_text
@@ -106,240 +91,8 @@ if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure
 
 
-def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
-    """Tune a loop along a front between two requirements; returns the exit status."""
-    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning)
-    front_spec = read_pareto(study, bound_units(task.loop))
-    first, second, until = _front_requirements(study, front_spec, task)
-    free = task.parameters.free_names
-    require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
-    with progress("finding the front's ends", quiet=quiet) as report_progress:
-        front = pareto_front(
-            task.loop,
-            task.references,
-            parameters,
-            minimise=(first, second),
-            subject_to=[q for q in task.specification.limits if metric_name(q) != metric_name(second)],
-            scenarios=task.scenarios(parameters),
-            points=front_spec.points,
-            until=until,
-            max_steps=task.max_steps,
-            progress=report_progress,
-        )
-    front, known = _convert_to_percent(front, first, second), metric_units(task.loop)
-    pair, gains = (
-        {metric_name(q): known[metric_name(q)] for q in (first, second)},
-        {n: parameters[n].unit for n in front if n in free},
-    )
-    verdict, status = _front_verdict(front, pair)
-    report = lead_report(verdict, status) + report_front(front, pair, gains)
-    writers: Writers = {}
-    if outputs.output is not None:
-        claimed = {f"claimed {n}": unit for n, unit in pair.items()}
-        units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
-        writers[outputs.output] = table_writer(outputs.output, front, units)
-    hashes = file_hashes(study.path, study.drive, study.tuning)
-    tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}, "provenance": hashes}
-    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_front, front, pair)
-    page = partial(front_page, study, report, drawn, pair)
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    return status
-
-
-def _front_requirements(
-    study: Study, front_spec: Pareto, task: Tuning
-) -> tuple[Requirement, Requirement, float | None]:
-    """The two requirements, the second one bounded where the front begins, and its bound where the front ends."""
-    where = f"{study.path}: [pareto]"
-    given = {metric_name(q): q for q in (*task.specification.weights, *task.specification.limits)}
-    first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
-    ends = {"lower": front_spec.lower, "upper": front_spec.upper}
-    begin, end = ("lower", "upper") if second.metric.sense is Sense.AT_LEAST else ("upper", "lower")
-    start, until = ends[begin], ends[end]
-    loosest = second if start is None else construct_at(lambda: with_user_limit(second, start), f"{where} {begin}")
-    if until is not None:
-        tightest = construct_at(lambda: with_user_limit(second, until), f"{where} {end}")
-        side, unit = "below" if end == "lower" else "above", bound_units(task.loop)[front_spec.between[1]]
-        ends_at, begins_at = (write_value(user_limit(q) or math.inf, unit) for q in (tightest, loosest))
-        message = f"{where} {end}, {ends_at}, is not {side} the {begins_at} that {study.tuning} allows under [limits]"
-        require(upper_limit(tightest) < upper_limit(loosest), message)
-    return first, loosest, until
-
-
-def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, where: str) -> Requirement:
-    """The requirement of the tuning, with its bound; else one without a bound."""
-    kind: Any = REQUIREMENTS_BY_KEY[key]
-    if kind.__name__ in given:
-        return given[kind.__name__]
-    require(kind is not StepEnvelope, f"{where}: the tuning has no bounds for step_envelope; add them under [limits]")
-    plain: Requirement = SettlingTime(task.specification.band) if kind is SettlingTime else kind()
-    return plain
-
-
-def _front_verdict(front: "pd.DataFrame", pair: Mapping[str, str]) -> tuple[str, int]:
-    """How many designs are not certified, and the exit status."""
-    interrupted = int((front["error"] == INTERRUPTED_CASE).sum())
-    failed = int((front["error"] != "").sum()) - interrupted
-    parts = [f"{count} {what}" for count, what in ((interrupted, "interrupted"), (failed, "not certified")) if count]
-    status = EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if failed else EXIT_SUCCESS
-    one = " (one is best by both)" if len(front) == 1 and not parts else ""
-    what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
-    return f"{what}: {', '.join(parts) or 'all certified'}{one}", status
-
-
-def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":
-    """The front with figures as the metrics are shown, overshoot in percent."""
-    factors = {c: q.metric.factor for q in (first, second) for c in (metric_name(q), f"claimed {metric_name(q)}")}
-    factors["limit"] = second.metric.factor
-    return front.assign(**{c: factor * front[c] for c, factor in factors.items() if factor != 1})
-
-
-Design: TypeAlias = tuple[ClosedLoop, ParameterSet]
-"""The loop of all cases, and its parameters."""
-
-
-def case_page(
-    study: Study,
-    report: Report,
-    draw: Callable[[], "Figure"],
-    axes: Mapping[str, str],
-    metrics: Mapping[str, str],
-    design: Design,
-) -> Page:
-    """The page of a study's cases; a map of one or two axes, or how other cases are distributed."""
-    alt = f"{', '.join(metrics)} over {' and '.join(axes)}, a cell or a point a case; what failed is marked."
-    if study.cases:
-        alt = f"Share of the cases that keep a bound, over the bound: {', '.join(metrics)}."
-    drawn = draw if study.cases or len(axes) <= MAX_MAP_AXES else None
-    shared = None if study.tune else design
-    return study_page(_page_source(study), report, drawn, what="Cases", alt=alt, design=shared)
-
-
-def front_page(study: Study, report: Report, draw: Callable[[], "Figure"], pair: Mapping[str, str]) -> Page:
-    """The page of a Pareto front."""
-    first, second = pair
-    alt = f"{first} of certified designs over {second}; limits at which none was certified are marked."
-    return study_page(_page_source(study), report, draw, what="Pareto front", alt=alt)
-
-
-def sensitivity_page(study: Study, report: Report, draw: Callable[[], "Figure"], design: Design) -> Page:
-    """The page of a study that asks which tolerances matter."""
-    alt = "Share of a metric's variance that each parameter brings, by itself and with others, as bars with intervals."
-    return study_page(_page_source(study), report, draw, what="Sensitivity", alt=alt, design=design)
-
-
-def _page_source(study: Study) -> Source:
-    """The title of a study's page, its hashes and warnings."""
-    files = (study.path, study.drive, study.tuning)
-    warnings = (*describe_status(read_fit(study.drive)), *describe_status(study.tuning))
-    title = f"Study of {study.drive.name} with {study.tuning.name}"
-    return Source(title, file_hashes(*files), warnings)
-
-
-def report_cases(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> Report:
-    """A study, a row a case; of many the worst, by the first metric; then the reasons of those that failed.
-
-    Parameters
-    ----------
-    table : DataFrame
-        A column an axis and a metric, and "error".
-    axes, metrics : mapping of str to str
-        The columns, and their units.
-    """
-    first = next(iter(metrics))
-    ordered = table.sort_values(first, ascending=larger_is_better(first), na_position="first", kind="stable")
-    shown, rows = table if len(table) <= MAX_CASE_ROWS else ordered.head(MAX_CASE_ROWS), []
-    for row in shown.to_dict(orient="records"):
-        figures = [metric_cell(m, row[m]) for m in metrics]
-        if row["error"]:
-            figures = ["failed" if row["error"] != INTERRUPTED_CASE else INTERRUPTED_CASE] + [""] * (len(metrics) - 1)
-        rows.append((*(format_number(row[n], 6) for n in axes), *figures))
-    heads = (f"{n}\n[{unit}]" if unit not in ("", "1") else n for n, unit in {**axes, **metrics}.items())
-    lines = []
-    if len(shown) < len(table):
-        lines.append(f"the {len(shown)} worst of {len(table)} cases by {first}; -o FILE writes all")
-    reasons = table["error"][~table["error"].isin(["", INTERRUPTED_CASE])].value_counts()
-    for reason, count in list(reasons.items())[:MAX_FAILURE_REASONS]:
-        lines.append(f"failed ({count} of {len(table)}): {reason}")
-    return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
-
-
-def report_checks(checks: "pd.DataFrame") -> Report:
-    """The certified cases of a batch: the largest difference a metric, and the cases in which lanes are refuted.
-
-    Parameters
-    ----------
-    checks : DataFrame
-        Of a `BatchEvaluation`.
-    """
-    rows = [(str(m), format_number(float(own["difference"].max()), 2)) for m, own in checks.groupby("metric")]
-    lines = [
-        Line(f"{row['case']}: {row['metric']} is {row['batch']:.6g} in the lanes, {row['certified']:.6g} certified")
-        for row in checks[~checks["agrees"]].head(MAX_FAILURE_REASONS).to_dict(orient="records")
-    ]
-    table = (
-        (Table((Column("metric"), Column("largest difference\nfrom the certificate")), tuple(rows)),) if rows else ()
-    )
-    left = "margins, stick-slip events and what comes after the horizon are not in the lanes: leave out batch for them"
-    return Report((*table, *lines, Line(left)))
-
-
-def report_front(table: "pd.DataFrame", requirements: Mapping[str, str], gains: Mapping[str, str]) -> Report:
-    """A front, a row a design, of those that are not certified the limit; then the reasons.
-
-    Parameters
-    ----------
-    table : DataFrame
-        A column a requirement and a gain, "limit" and "error".
-    requirements, gains : mapping of str to str
-        The two requirements, the limited one last, and the gains, with their units.
-    """
-    first, second = requirements
-    shown = dict(list(gains.items())[:MAX_GAIN_COLUMNS])
-    relation, rows = ">=" if larger_is_better(second) else "<=", []
-    for row in table.to_dict(orient="records"):
-        figures = [format_number(row[n], 4) for n in (first, second)]
-        if row["error"]:
-            word = INTERRUPTED_CASE if row["error"] == INTERRUPTED_CASE else "failed"
-            figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {format_number(row['limit'], 4)}"]
-        rows.append((*figures, *(_format_gain(row[n]) for n in shown)))
-    heads = [_narrow_heading(n, unit) for n, unit in {**requirements, **shown}.items()]
-    lines = [f"{len(shown)} of {len(gains)} gains; -o FILE writes all"] if len(shown) < len(gains) else []
-    failed = table[~table["error"].isin(["", INTERRUPTED_CASE])].to_dict(orient="records")
-    lines += [f"failed ({second} {relation} {format_number(row['limit'], 4)}): {row['error']}" for row in failed]
-    return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
-
-
-def lead_report(verdict: str, status: int) -> Report:
-    """The verdict as a report."""
-    return Report((Line(verdict, Tone.BAD if status else Tone.GOOD),))
-
-
-def table_writer(path: Path, table: "pd.DataFrame", units: Mapping[str, str]) -> Callable[[Path], None]:
-    """What writes a table with units in its header: as Parquet where the file to be is called so, else as CSV."""
-    named = table.rename(columns={n: heading(n, unit) for n, unit in units.items()})
-    if path.suffix.lower() == PARQUET:
-        columns = {str(n): named[n].tolist() for n in named}
-        return partial(write_bytes, content=parquet_bytes(columns))
-    return partial(write_text, text=format_table(named))
-
-
-def heading(name: str, unit: str) -> str:
-    """A column's name with its unit, "SettlingTime [s]"."""
-    return f"{name} [{unit}]" if unit else name
-
-
-def _format_gain(value: float) -> str:
-    """Four digits, as gains are rounded, and no exponent where it is the longer one: 68130."""
-    return f"{float(format_number(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else format_number(value, 4)
-
-
-def _narrow_heading(column: str, unit: str) -> str:
-    """A heading in narrow lines, "Peak / Control / [V]" or "pid. / Kp / [V*s/m]"."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", column)
-    return words if unit in ("", "1") else f"{words}\n[{unit}]"
+# columns of a study that tunes: its objective, and the word before the name of a gain that was found
+OBJECTIVE, FOUND = "objective", "found"
 
 
 SO_FAR = "so_far"
@@ -348,22 +101,12 @@ SO_FAR = "so_far"
 
 @dataclass(frozen=True)
 class Computing:
-    """How the cases of a study are computed.
+    """How the cases of a study are computed."""
 
-    Attributes
-    ----------
-    executor : str
-        As for `open_executor`; empty: one process a CPU.
-    seconds, megabytes : float
-        What a case may take.
-    resume : bool
-        Whether there must be a journal of this study.
-    """
-
-    executor: str = ""
-    seconds: float = math.inf
+    executor: str = ""  # as for `open_executor`; empty: one process a CPU
+    seconds: float = math.inf  # what a case may take
     megabytes: float = math.inf
-    resume: bool = False
+    resume: bool = False  # whether there must be a journal of this study
 
     @contextmanager
     def open(self) -> Iterator[Executor | Processes]:
@@ -376,6 +119,71 @@ class Computing:
         require(here, f"--time-limit and --memory-limit hold in processes of this machine, not on {self.executor}")
         with open_executor(self.executor) as executor:
             yield replace(limits, count=executor.count) if isinstance(executor, Processes) else executor
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A study and what its files hold, read once; the parameters are those of plant and controller."""
+
+    study: Study
+    fit: StoredFit
+    task: Tuning
+    parameters: ParameterSet
+    outputs: Outputs
+    quiet: bool
+
+    def finish(
+        self,
+        verdict: str,
+        status: int,
+        report: Report,
+        tables: Mapping[str, Any],
+        written: "tuple[pd.DataFrame, Mapping[str, str]]",
+        draw: Callable[[], "Figure"],
+        page: tuple[str, str],
+        *,
+        is_drawn: bool = True,
+        has_design: bool = True,
+    ) -> int:
+        """Show and write what was found, the table with its units, and a page with its heading and the figure's words.
+
+        The page shows the figure if `is_drawn`, and the controller if all cases share it; returns the exit status.
+        """
+        study, output = self.study, self.outputs.output
+        hashes = file_hashes(study.path, study.drive, study.tuning)
+
+        def make_page() -> Page:
+            warnings = (*describe_status(self.fit), *describe_status(study.tuning))
+            source = Source(f"Study of {study.drive.name} with {study.tuning.name}", hashes, warnings)
+            design = (self.task.loop, self.parameters) if has_design else None
+            return study_page(source, report, draw if is_drawn else None, what=page[0], alt=page[1], design=design)
+
+        finish(
+            self.outputs,
+            {} if output is None else {output: table_writer(output, *written)},
+            {"verdict": verdict, **tables, "provenance": hashes},
+            Status(Code.INTERRUPTED, (verdict,)) if status == ExitStatus.INTERRUPTED else None,
+            figures=lambda: {"": draw()},
+            report=Report((Line(verdict, Tone.BAD if status else Tone.GOOD),)) + report,
+            page=make_page,
+        )
+        return status
+
+
+def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -> int:
+    """Compute what a study.toml asks for, a grid, other cases or a front; returns the exit status."""
+    study = read_study(file)
+    outputs.check([file, study.drive, study.tuning])
+    count = len(study.axes)
+    many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
+    require(outputs.plot is None or count <= MAX_MAP_AXES, many)
+    plain = study.pareto is None or computing == Computing()
+    require(plain, f"{file}: a front is one search after another: it takes no option of cases")
+    job = _Job(study, *read_fit_and_tuning(study.drive, study.tuning), outputs, quiet)
+    warn_of_status(study.tuning)
+    if study.pareto is not None:
+        return run_front(job)
+    return run_cases(job, computing) if study.sensitivity is None else run_sensitivity(job, computing)
 
 
 @contextmanager
@@ -402,37 +210,18 @@ def keep_cases(
                 warn(problem)
 
 
-# Columns of a study that tunes: its objective, and the word before the name of a gain that was found.
-OBJECTIVE, FOUND = "objective", "found"
-
-
-def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -> int:
-    """Compute what a study.toml asks for, a grid, other cases or a front; returns the exit status."""
-    study = read_study(file)
-    outputs.check([file, study.drive, study.tuning])
-    if study.sensitivity is not None:
-        return run_sensitivity(study, outputs, quiet, computing)
-    if study.pareto is None:
-        return run_cases(study, outputs, quiet, computing)
-    require(computing == Computing(), f"{file}: a front is one search after another: it takes no option of cases")
-    return run_front(study, outputs, quiet)
-
-
-def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
+def run_cases(job: _Job, computing: Computing) -> int:
     """Certify a loop over a grid or other cases; returns the exit status."""
-    file, count = study.path, len(study.axes)
-    many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
-    require(outputs.plot is None or count <= MAX_MAP_AXES, many)
-    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning)
-    (cases, axes), units = _read_cases(study, task, parameters), metric_units(task.loop)
+    study, task, parameters = job.study, job.task, job.parameters
+    (cases, axes), units = _read_cases(job), metric_units(task.loop)
     if any(SAMPLE_TIME_AXIS in values for values in cases.values()):
         parameters = with_sample_time(task.loop, parameters)
-    check_names("metric", study.show, units, f"{file}: [metrics] show")
+        job = replace(job, parameters=parameters)
+    check_names("metric", study.show, units, f"{study.path}: [metrics] show")
     column_units = partial(_column_unit, {axis.name: parameters[axis.name].unit for axis in axes}, task.loop)
     heads = partial(_cell_heading, column_units)
-    with keep_cases(study, outputs, len(cases), computing.resume, heads) as journal, computing.open() as executor:
-        table, checks = _compute_cases(study, task, parameters, (cases, axes), quiet, journal, executor)
+    with keep_cases(study, job.outputs, len(cases), computing.resume, heads) as journal, computing.open() as executor:
+        table, checks = _compute_cases(job, (cases, axes), journal, executor)
     verdict, status = _grid_verdict(table, len(task.references))
     if checks is not None:
         verdict, status = _batch_verdict(checks, verdict, status)
@@ -440,36 +229,35 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
     breaks = table["case"][table["breaks"]] if study.tune else ()
     flags = tuple(Line(f"{case}: breaks with its neighbours, also searched from their gains") for case in breaks)
-    report = lead_report(verdict, status) + report_cases(seen, written, metrics) + Report(flags)
+    report, tables = report_cases(seen, written, metrics) + Report(flags), {"cases": records(table)}
     if checks is not None:
-        report += report_checks(checks)
-    writers: Writers = {}
-    if outputs.output is not None:
-        writers[outputs.output] = table_writer(outputs.output, table, {str(c): column_units(str(c)) for c in table})
-    tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
-    tables |= {} if checks is None else {"checks": records(checks)}
-    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics)
-    page = partial(case_page, study, report, drawn, written, metrics, (task.loop, parameters))
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    if journal is not None and stopped is None:
+        report, tables = report + report_checks(checks), tables | {"checks": records(checks)}
+    alt = f"{', '.join(metrics)} over {' and '.join(written)}, a cell or a point a case; what failed is marked."
+    if study.cases:
+        alt = f"Share of the cases that keep a bound, over the bound: {', '.join(metrics)}."
+    job.finish(
+        verdict,
+        status,
+        report,
+        tables,
+        (table, {str(c): column_units(str(c)) for c in table}),
+        partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics),
+        ("Cases", alt),
+        is_drawn=bool(study.cases) or len(axes) <= MAX_MAP_AXES,
+        has_design=not study.tune,
+    )
+    if journal is not None and status != ExitStatus.INTERRUPTED:
         journal.delete()
     return status
 
 
 def _compute_cases(
-    study: Study,
-    task: Tuning,
-    parameters: ParameterSet,
-    given: tuple[Cases, Sequence[SweptAxis]],
-    quiet: bool,
-    journal: Journal | None,
-    executor: Executor | Processes,
+    job: _Job, given: tuple[Cases, Sequence[SweptAxis]], journal: Journal | None, executor: Executor | Processes
 ) -> "tuple[pd.DataFrame, pd.DataFrame | None]":
     """A row a case; and of a batch the certificates of some of them."""
-    cases, axes = given
+    study, task, parameters, (cases, axes) = job.study, job.task, job.parameters, given
     if study.tune:
-        return _tune_cells(study, task, parameters, axes, quiet, journal, executor), None
+        return _tune_cells(job, axes, journal, executor), None
     band = study.band or task.specification.band
     if study.batch:
         left = [n for n in study.show if n not in LANE_METRICS]
@@ -477,7 +265,7 @@ def _compute_cases(
         require(not left, f"{study.path}: [metrics] show: {', '.join(left)} is not read off responses; {remedy}")
         alike = SAMPLE_TIME_AXIS not in parameters
         require(alike, f"{study.path}: [study] a batch has one sample time: leave out batch, or {SAMPLE_TIME_AXIS}")
-        with progress("running", quiet=quiet) as report_progress:
+        with progress("running", quiet=job.quiet) as report_progress:
             found = evaluate_batch(
                 task.loop,
                 task.references,
@@ -491,17 +279,18 @@ def _compute_cases(
             )
         return found.table, found.checks
     certify = partial(evaluate_at_sample_time, task.loop, task.references, band=band, max_steps=task.max_steps)
-    with progress("certifying", quiet=quiet) as report_progress:
+    with progress("certifying", quiet=job.quiet) as report_progress:
         table = sweep(certify, parameters, cases, executor=executor, progress=report_progress, journal=journal)
     return table, None
 
 
-def _read_cases(study: Study, task: Tuning, parameters: ParameterSet) -> tuple[Cases, tuple[SweptAxis, ...]]:
+def _read_cases(job: _Job) -> tuple[Cases, tuple[SweptAxis, ...]]:
     """The cases of a study, and the parameters in which they differ; a sample time can be named, but not spread."""
+    study, task, parameters = job.study, job.task, job.parameters
     if SAMPLE_TIME_AXIS in study.axes or ("table" in study.cases and task.loop.pid.sample_time is not None):
         parameters = with_sample_time(task.loop, parameters)
     if study.cases:
-        cases = read_study_cases(study, parameters)
+        cases = read_study_cases(study, job.fit, parameters)
         return cases, swept_axes(parameters, cases)
     axes = read_axes(study, parameters)
     try:
@@ -511,23 +300,17 @@ def _read_cases(study: Study, task: Tuning, parameters: ParameterSet) -> tuple[C
 
 
 def _tune_cells(
-    study: Study,
-    task: Tuning,
-    parameters: ParameterSet,
-    axes: Sequence[SweptAxis],
-    quiet: bool,
-    journal: Journal | None,
-    executor: Executor | Processes,
+    job: _Job, axes: Sequence[SweptAxis], journal: Journal | None, executor: Executor | Processes
 ) -> "pd.DataFrame":
     """Tune every cell of the grid, each from the gains of its neighbours: a row a cell, with metrics and gains."""
-    require(bool(task.specification.weights), f"{study.tuning}: has nothing to minimise; add [minimise]")
-    free = task.parameters.free_names
+    study, free = job.study, job.task.parameters.free_names
+    require(bool(job.task.specification.weights), f"{study.tuning}: has nothing to minimise; add [minimise]")
     require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
     points = {axis.name: axis.points for axis in axes}
-    with progress("tuning", quiet=quiet) as report_progress, read_once() as sources:
+    with progress("tuning", quiet=job.quiet) as report_progress, read_once() as sources:
         table = sweep_from_neighbours(
-            partial(tune_cell, sources, study.drive, study.tuning),
-            parameters,
+            partial(tune_cell, sources, job.fit.drive, study.tuning),
+            job.parameters,
             points,
             value=OBJECTIVE,
             starts={f"{FOUND} {n}": n for n in free},
@@ -538,18 +321,13 @@ def _tune_cells(
     return table.rename(columns={f"{FOUND} {n}": n for n in free})
 
 
-def tune_cell(sources: Mapping[str, bytes], drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
+def tune_cell(sources: Mapping[str, bytes], drive: Drive, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
     """One cell of a study: the certified metrics of the gains tuned for it, the objective and the gains.
 
-    The files are those that the study has read: in another process they may have moved.
-
-    Raises
-    ------
-    ConvergenceError
-        If no design is certified.
+    The tuning is what the study has read: in another process it may have moved.
     """
     with read_once(sources):
-        task = read_tuning(tuning, read_drive(drive)[0].system(), parameters)
+        task = read_tuning(tuning, drive.system(), parameters)
     loop, own = loop_at_sample_time(task.loop, parameters)
     result = tune(
         loop,
@@ -573,14 +351,12 @@ def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
     """How many cases are certified, fail, never settle or break with their neighbours, and the exit status."""
     settling = table[[c for c in table if _metric_name(c) == "SettlingTime"]]
     good = table["error"] == ""
-    counts = {
-        "interrupted": int((table["error"] == INTERRUPTED_CASE).sum()),
-        "failed": int((~good & (table["error"] != INTERRUPTED_CASE)).sum()),
-        "never settle": int((good & settling.isna().any(axis=1)).sum()),
-        "break with their neighbours": int((good & table["breaks"]).sum()) if "breaks" in table else 0,
-    }
-    parts = [f"{count} {what}" for what, count in counts.items() if count]
-    status = EXIT_INTERRUPTED if counts["interrupted"] else EXIT_FAILURE if parts else EXIT_SUCCESS
+    parts, status = _count_failures(
+        table["error"],
+        "failed",
+        never_settle=int((good & settling.isna().any(axis=1)).sum()),
+        break_with_their_neighbours=int((good & table["breaks"]).sum()) if "breaks" in table else 0,
+    )
     each = f", each the worst of {references} references" if references > 1 else ""
     return f"{len(table)} cases{each}: {', '.join(parts) or 'all settle'}", status
 
@@ -589,7 +365,7 @@ def _batch_verdict(checks: "pd.DataFrame", verdict: str, status: int) -> tuple[s
     """The verdict on a grid with how many of its cases are certified; where lanes are refuted, that is a failure."""
     differ, certified = checks["case"][~checks["agrees"]].nunique(), checks["case"].nunique()
     said = f"{differ} of {certified} certified differ from the lanes" if differ else f"{certified} certified, all agree"
-    return f"{verdict}; {said}", max(status, EXIT_FAILURE) if differ else status
+    return f"{verdict}; {said}", max(status, ExitStatus.FAILURE) if differ else status
 
 
 def _worst_of_references(
@@ -624,76 +400,207 @@ def _cell_heading(unit: Callable[[str], str], column: str) -> str:
     return heading(name, unit(name))
 
 
-def run_sensitivity(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
+def run_sensitivity(job: _Job, computing: Computing) -> int:
     """Tell which tolerances matter for a design; returns the exit status."""
-    _, task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning)
+    study, task, parameters = job.study, job.task, job.parameters
     asked, units = read_sensitivity(study, parameters), metric_units(task.loop)
     check_names("metric", study.show, units, f"{study.path}: [metrics] show")
     band, slopes = study.band or task.specification.band, None
     if asked.local:  # at once, as it refuses metrics without a slope
         slopes = local_sensitivity(task.loop, task.references, parameters, asked.spreads, metrics=study.show, band=band)
+    labels = [step.label for step in task.references]
     count = asked.count * (len(axis_labels(parameters, asked.spreads)) + 2)
     certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
     with (
-        keep_cases(study, outputs, count, computing.resume) as journal,
+        keep_cases(study, job.outputs, count, computing.resume) as journal,
         computing.open() as executor,
-        progress("certifying", quiet=quiet) as report_progress,
+        progress("certifying", quiet=job.quiet) as report_progress,
     ):
         found = sensitivity(
             certify,
             parameters,
             asked.spreads,
-            figures=_figures(study, task),
+            figures=[n if len(labels) == 1 else f"{n}[{label}]" for label in labels for n in study.show],
             count=asked.count,
             seed=asked.seed,
             executor=executor,
             progress=report_progress,
             journal=journal,
         )
-    status = _write(study, outputs, found, slopes, (task.loop, parameters))
-    if journal is not None and status != EXIT_INTERRUPTED:
+    status = _finish_sensitivity(job, found, slopes)
+    if journal is not None and status != ExitStatus.INTERRUPTED:
         journal.delete()
     return status
 
 
-def _write(study: Study, outputs: Outputs, found: Sensitivity, slopes: LocalSensitivity | None, design: Design) -> int:
-    """Show and write what was found; returns the exit status."""
-    verdict, status = _verdict(found.cases)
-    report = lead_report(verdict, status) + found.summary()
-    writers: Writers = {}
-    if outputs.output is not None:
-        writers[outputs.output] = table_writer(outputs.output, _join(found, slopes), {})
-    tables: dict[str, Any] = {"verdict": verdict, "shares": records(found.table), "figures": records(found.figures)}
+def _finish_sensitivity(job: _Job, found: Sensitivity, slopes: LocalSensitivity | None) -> int:
+    """Show and write which tolerances matter; returns the exit status."""
+    parts, status = _count_failures(found.cases["error"], "failed")
+    verdict = f"{len(found.cases)} points: {', '.join(parts) or 'all certified'}"
+    report, table = found.summary(), found.table
+    tables = {"shares": records(found.table), "figures": records(found.figures), "cases": records(found.cases)}
     if slopes is not None:
-        report += slopes.summary()
+        named: dict[Hashable, str] = {"change": "local_change", "relative": "local_relative", "share": "local_share"}
+        report, table = report + slopes.summary(), table.join(slopes.table).rename(columns=named)
         tables["slopes"] = records(slopes.table)
-    tables["cases"] = records(found.cases)
-    tables["provenance"] = file_hashes(study.path, study.drive, study.tuning)
-    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_sensitivity, found, slopes)
-    page = partial(sensitivity_page, study, report, drawn, design)
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    return status
+    alt = "Share of a metric's variance that each parameter brings, by itself and with others, as bars with intervals."
+    written, draw = (table.reset_index(), dict[str, str]()), partial(plot_sensitivity, found, slopes)
+    return job.finish(verdict, status, report, tables, written, draw, ("Sensitivity", alt))
 
 
-def _figures(study: Study, task: Tuning) -> list[str]:
-    """The columns of the metrics that are shown, one a reference."""
-    labels = [step.label for step in task.references]
-    return [n if len(labels) == 1 else f"{n}[{label}]" for label in labels for n in study.show]
+def run_front(job: _Job) -> int:
+    """Tune a loop along a front between two requirements; returns the exit status."""
+    study, task, parameters = job.study, job.task, job.parameters
+    front_spec = read_pareto(study, bound_units(task.loop))
+    first, second, until = _front_requirements(study, front_spec, task)
+    free = task.parameters.free_names
+    require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
+    with progress("finding the front's ends", quiet=job.quiet) as report_progress:
+        front = pareto_front(
+            task.loop,
+            task.references,
+            parameters,
+            minimise=(first, second),
+            subject_to=[q for q in task.specification.limits if metric_name(q) != metric_name(second)],
+            scenarios=task.scenarios(parameters),
+            points=front_spec.points,
+            until=until,
+            max_steps=task.max_steps,
+            progress=report_progress,
+        )
+    factors = {c: q.metric.factor for q in (first, second) for c in (metric_name(q), f"claimed {metric_name(q)}")}
+    factors["limit"], known = second.metric.factor, metric_units(task.loop)
+    front = front.assign(**{c: factor * front[c] for c, factor in factors.items() if factor != 1})  # as shown, in %
+    pair = {metric_name(q): known[metric_name(q)] for q in (first, second)}
+    gains = {n: parameters[n].unit for n in front if n in free}
+    parts, status = _count_failures(front["error"], "not certified")
+    one = " (one is best by both)" if len(front) == 1 and not parts else ""
+    what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
+    verdict = f"{what}: {', '.join(parts) or 'all certified'}{one}"
+    claimed = {f"claimed {n}": unit for n, unit in pair.items()}
+    units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
+    tables = {"designs": records(front), "units": {**pair, **gains}}
+    shown, draw = report_front(front, pair, gains), partial(plot_front, front, pair)
+    alt = "{} of certified designs over {}; limits at which none was certified are marked.".format(*pair)
+    page = ("Pareto front", alt)
+    return job.finish(verdict, status, shown, tables, (front, units), draw, page, has_design=False)
 
 
-def _verdict(cases: "pd.DataFrame") -> tuple[str, int]:
-    """How many points were certified, and the exit status."""
-    interrupted = int((cases["error"] == INTERRUPTED_CASE).sum())
-    failed = int((cases["error"] != "").sum()) - interrupted
-    parts = [f"{n} {what}" for n, what in ((interrupted, "interrupted"), (failed, "failed")) if n]
-    status = EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if failed else EXIT_SUCCESS
-    return f"{len(cases)} points: {', '.join(parts) or 'all certified'}", status
+def _front_requirements(
+    study: Study, front_spec: Pareto, task: Tuning
+) -> tuple[Requirement, Requirement, float | None]:
+    """The two requirements, the second one bounded where the front begins, and its bound where the front ends."""
+    where = f"{study.path}: [pareto]"
+    given = {metric_name(q): q for q in (*task.specification.weights, *task.specification.limits)}
+    first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
+    ends = {"lower": front_spec.lower, "upper": front_spec.upper}
+    begin, end = ("lower", "upper") if second.metric.sense is Sense.AT_LEAST else ("upper", "lower")
+    start, until = ends[begin], ends[end]
+    loosest = second if start is None else construct_at(lambda: with_user_limit(second, start), f"{where} {begin}")
+    if until is not None:
+        tightest = construct_at(lambda: with_user_limit(second, until), f"{where} {end}")
+        side, unit = "below" if end == "lower" else "above", bound_units(task.loop)[front_spec.between[1]]
+        ends_at, begins_at = (write_value(user_limit(q) or math.inf, unit) for q in (tightest, loosest))
+        message = f"{where} {end}, {ends_at}, is not {side} the {begins_at} that {study.tuning} allows under [limits]"
+        require(upper_limit(tightest) < upper_limit(loosest), message)
+    return first, loosest, until
 
 
-def _join(found: Sensitivity, slopes: LocalSensitivity | None) -> "pd.DataFrame":
-    """A row a metric and axis: the shares, and what the slopes say beside them."""
-    table = found.table if slopes is None else found.table.join(slopes.table)
-    named: dict[Hashable, str] = {"change": "local_change", "relative": "local_relative", "share": "local_share"}
-    return table.rename(columns=named).reset_index()
+def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, where: str) -> Requirement:
+    """The requirement of the tuning, with its bound; else one without a bound."""
+    kind: Any = REQUIREMENTS_BY_KEY[key]
+    if kind.__name__ in given:
+        return given[kind.__name__]
+    require(kind is not StepEnvelope, f"{where}: the tuning has no bounds for step_envelope; add them under [limits]")
+    plain: Requirement = SettlingTime(task.specification.band) if kind is SettlingTime else kind()
+    return plain
+
+
+def _count_failures(errors: "pd.Series", word: str, **others: int) -> tuple[list[str], int]:
+    """How many cases were interrupted and how many failed, which is called so, with other counts; the exit status."""
+    interrupted = int((errors == INTERRUPTED_CASE).sum())
+    counts = {"interrupted": interrupted, word: int((errors != "").sum()) - interrupted, **others}
+    parts = [f"{count} {what.replace('_', ' ')}" for what, count in counts.items() if count]
+    return parts, ExitStatus.INTERRUPTED if interrupted else ExitStatus.FAILURE if parts else ExitStatus.SUCCESS
+
+
+def report_cases(
+    table: "pd.DataFrame",
+    axes: Mapping[str, str],
+    metrics: Mapping[str, str],
+    *,
+    most_rows: int = 40,
+    most_reasons: int = 5,
+) -> Report:
+    """A study, a row a case; of many the worst, by the first metric; then the reasons of those that failed."""
+    first = next(iter(metrics))
+    ordered = table.sort_values(first, ascending=larger_is_better(first), na_position="first", kind="stable")
+    shown, rows = table if len(table) <= most_rows else ordered.head(most_rows), []
+    for row in shown.to_dict(orient="records"):
+        figures = [metric_cell(m, row[m]) for m in metrics]
+        if row["error"]:
+            figures = ["failed" if row["error"] != INTERRUPTED_CASE else INTERRUPTED_CASE] + [""] * (len(metrics) - 1)
+        rows.append((*(format_number(row[n], 6) for n in axes), *figures))
+    heads = (f"{n}\n[{unit}]" if unit not in ("", "1") else n for n, unit in {**axes, **metrics}.items())
+    lines = []
+    if len(shown) < len(table):
+        lines.append(f"the {len(shown)} worst of {len(table)} cases by {first}; -o FILE writes all")
+    reasons = table["error"][~table["error"].isin(["", INTERRUPTED_CASE])].value_counts()
+    for reason, count in list(reasons.items())[:most_reasons]:
+        lines.append(f"failed ({count} of {len(table)}): {reason}")
+    return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
+
+
+def report_checks(checks: "pd.DataFrame", most: int = 5) -> Report:
+    """The certified cases of a batch: the largest difference a metric, and the cases in which lanes are refuted."""
+    rows = [(str(m), format_number(float(own["difference"].max()), 2)) for m, own in checks.groupby("metric")]
+    lines = [
+        Line(f"{row['case']}: {row['metric']} is {row['batch']:.6g} in the lanes, {row['certified']:.6g} certified")
+        for row in checks[~checks["agrees"]].head(most).to_dict(orient="records")
+    ]
+    table = (
+        (Table((Column("metric"), Column("largest difference\nfrom the certificate")), tuple(rows)),) if rows else ()
+    )
+    left = "margins, stick-slip events and what comes after the horizon are not in the lanes: leave out batch for them"
+    return Report((*table, *lines, Line(left)))
+
+
+def report_front(
+    table: "pd.DataFrame", requirements: Mapping[str, str], gains: Mapping[str, str], *, most_gains: int = 6
+) -> Report:
+    """A front, a row a design, of those that are not certified the limit; then the reasons."""
+    first, second = requirements
+    shown = dict(list(gains.items())[:most_gains])
+    relation, rows = ">=" if larger_is_better(second) else "<=", []
+    for row in table.to_dict(orient="records"):
+        figures = [format_number(row[n], 4) for n in (first, second)]
+        if row["error"]:
+            word = INTERRUPTED_CASE if row["error"] == INTERRUPTED_CASE else "failed"
+            figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {format_number(row['limit'], 4)}"]
+        rows.append((*figures, *(_format_gain(row[n]) for n in shown)))
+    names = {n: re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", n) for n in (*requirements, *shown)}  # narrow lines
+    units = {**requirements, **shown}
+    heads = [name if units[n] in ("", "1") else f"{name}\n[{units[n]}]" for n, name in names.items()]
+    lines = [f"{len(shown)} of {len(gains)} gains; -o FILE writes all"] if len(shown) < len(gains) else []
+    failed = table[~table["error"].isin(["", INTERRUPTED_CASE])].to_dict(orient="records")
+    lines += [f"failed ({second} {relation} {format_number(row['limit'], 4)}): {row['error']}" for row in failed]
+    return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
+
+
+def table_writer(path: Path, table: "pd.DataFrame", units: Mapping[str, str]) -> Callable[[Path], None]:
+    """What writes a table with units in its header: as Parquet where the file to be is called so, else as CSV."""
+    named = table.rename(columns={n: heading(n, unit) for n, unit in units.items()})
+    if path.suffix.lower() == PARQUET:
+        columns = {str(n): named[n].tolist() for n in named}
+        return partial(write_bytes, content=parquet_bytes(columns))
+    return partial(write_text, text=format_table(named))
+
+
+def heading(name: str, unit: str) -> str:
+    """A column's name with its unit, "SettlingTime [s]"."""
+    return f"{name} [{unit}]" if unit else name
+
+
+def _format_gain(value: float) -> str:
+    """Four digits, as gains are rounded, and no exponent where it is the longer one: 68130."""
+    return f"{float(format_number(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else format_number(value, 4)

@@ -1,7 +1,4 @@
-"""`pneuopt track`: a drive's parameters over dated logs, and what its tuned loop is worth as they drift.
-
-`pneuopt next-experiment`: which run shrinks the asked confidence intervals most, as a CSV for the controller.
-"""
+"""`pneuopt track` and `pneuopt next-experiment`: how parameters drift over dated logs, and which run to log next."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,18 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.cli.identify import read_experiments, read_free_drive
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
-    add_to_stem,
     file_hashes,
     finish,
+    number_paths,
     progress,
     warn,
     warn_of_status,
     write_csv,
 )
-from pneuopt.cli.tolerances import EXIT_FAILURE
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
 from pneuopt.experiments.design import AOptimal, DOptimal, ExperimentDesign
@@ -50,32 +47,16 @@ from pneuopt.shooting.least_squares import LeastSquares
 if TYPE_CHECKING:
     from datetime import date
 
-    import pandas as pd
-
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """What `pneuopt track` is asked for.
+    """What `pneuopt track` is asked for."""
 
-    Attributes
-    ----------
-    tuned : Path or None
-        The design whose loss is predicted.
-    parameters : tuple of str
-        Empty: all that are free.
-    dates : str
-        One a log, with commas; empty: as the logs say.
-    drift : float
-        For the power calculation [1/week].
-    horizon : int
-        Logs for which the level holds.
-    """
-
-    tuned: Path | None
-    parameters: tuple[str, ...]
-    dates: str
-    drift: float
-    horizon: int
+    tuned: Path | None  # the design whose loss is predicted
+    parameters: tuple[str, ...]  # empty: all that are free
+    dates: str  # one a log, with commas; empty: as the logs say
+    drift: float  # for the power calculation [1/week]
+    horizon: int  # logs for which the level holds
 
 
 def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs: Outputs, quiet: bool = False) -> int:
@@ -86,7 +67,10 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     system = model.system()
     check_names("parameter", options.parameters, parameters.free_names, f"{drive}: --parameter")
     experiments = read_experiments(logs, system, parameters, ())
-    dates = _read_dates(logs, options.dates)
+    dates: list[str | date] = [text.strip() for text in options.dates.split(",")] if options.dates else []
+    given = f"--dates has {len(dates)} dates for {len(logs)} logs; give one a log"
+    require(not options.dates or len(dates) == len(logs), given)
+    dates = dates or [find_date(path) for path in logs]
     task = read_tuning(options.tuned, system, parameters) if options.tuned else None
     warnings.filterwarnings("ignore", message="before the search")  # each log would say it again
     with progress("identifying", quiet=quiet) as report:
@@ -99,7 +83,7 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
             outlook = predict_loss(found, task.loop, task.references, own, task.specification)
     writers: Writers = {}
     if outputs.output is not None:
-        writers[outputs.output] = partial(_write_history, table=found.history)
+        writers[outputs.output] = partial(write_text, text=format_table(found.history.reset_index()))
     tables = {"drift": records(found.table), "history": records(found.history), "provenance": file_hashes(drive)}
     shown = found.summary()
     if outlook is not None:
@@ -108,7 +92,7 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     source = Source(title_of("Tracking", drive, logs), file_hashes(*inputs[:1], *inputs[1 + len(logs) :]))
     page = partial(summary_page, source, shown, [tracking_picture(found)], experiments)
     finish(outputs, writers, tables, None, figures=lambda: {"": plot_tracking(found)}, report=shown, page=page)
-    return EXIT_FAILURE if found.drifting or (outlook is not None and outlook.fails is not None) else 0
+    return ExitStatus.FAILURE if found.drifting or (outlook is not None and outlook.fails is not None) else 0
 
 
 def _identify_alone(
@@ -122,48 +106,22 @@ def _identify_alone(
     return fit
 
 
-def _read_dates(logs: Sequence[Path], given: str) -> "list[str | date]":
-    if not given:
-        return [find_date(path) for path in logs]
-    dates: list[str | date] = [text.strip() for text in given.split(",")]
-    require(len(dates) == len(logs), f"--dates has {len(dates)} dates for {len(logs)} logs; give one a log")
-    return dates
-
-
-def _write_history(path: Path, table: "pd.DataFrame") -> None:
-    write_text(path, format_table(table.reset_index()))
-
-
 _ALT = "What is played, the signals with limits as predicted, and each parameter's interval now and afterwards."
 
 
 @dataclass(frozen=True)
 class PlannedOptions:
-    """What a planned run may do, as the command line says it.
-
-    Attributes
-    ----------
-    duration, sample_time : str
-        With their units; an empty sample time is the controller's.
-    targets : tuple of str
-    limits, noise, start : tuple of str
-        "position=20 mm..180 mm", "position=20 um", "position=100 mm".
-    runs : int
-    mean : bool
-        Whether the mean deviation counts (`AOptimal`), not the joint region (`DOptimal`).
-    budget : float
-        CPU seconds.
-    """
+    """What a planned run may do, as the command line says it."""
 
     duration: str
-    sample_time: str
+    sample_time: str  # empty: the controller's
     targets: tuple[str, ...]
-    limits: tuple[str, ...]
-    noise: tuple[str, ...]
-    start: tuple[str, ...]
+    limits: tuple[str, ...]  # "position=20 mm..180 mm"
+    noise: tuple[str, ...]  # "position=20 um"
+    start: tuple[str, ...]  # "position=100 mm"
     runs: int
-    mean: bool
-    budget: float
+    mean: bool  # whether the mean deviation counts (`AOptimal`), not the joint region (`DOptimal`)
+    budget: float  # CPU seconds
 
 
 def run_next_experiment(
@@ -210,9 +168,8 @@ def _writers(design: ExperimentDesign, output: Path | None) -> Writers:
     """A file a run, as `ExperimentDesign.write_csv` names them."""
     if output is None:
         return {}
-    several, unit = len(design.runs) > 1, design.units[design.channel]
-    places = [add_to_stem(output, str(k)) if several else output for k in range(1, len(design.runs) + 1)]
-    columns = {design.channel: (design.channel, unit)}
+    places = number_paths(output, len(design.runs))
+    columns = {design.channel: (design.channel, design.units[design.channel])}
     return {place: partial(write_csv, run=run, columns=columns) for place, run in zip(places, design.runs, strict=True)}
 
 

@@ -88,23 +88,11 @@ def run_certify(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, qui
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """A loop that is to be certified, the files that it comes from, and those that are to be written.
+    """A loop that is to be certified, the files that it comes from, and those that are to be written."""
 
-    Attributes
-    ----------
-    stored : StoredFit
-        The plant's file as read.
-    task : Tuning
-    parameters : ParameterSet
-        Of plant and controller, as given.
-    fit, tuning : Path
-    rig : Path or None
-    outputs : Outputs
-    """
-
-    stored: StoredFit
+    stored: StoredFit  # the plant's file as read
     task: Tuning
-    parameters: ParameterSet
+    parameters: ParameterSet  # of plant and controller, as given
     fit: Path
     tuning: Path
     rig: Path | None
@@ -166,8 +154,13 @@ class _Job:
             stays = f"{output} stays as it was" if output.exists() else f"{output} is not written"
             beside = f"; pneuopt export refuses {written[0]}, the best candidate" if written else ""
             show_sentence(console, f"{stays}, for no design is certified{beside}")
+        hints = [] if self.outputs.report is not None else ["with --report FILE.html: a page to hand on"]
+        if output is None:
+            hints = ["with -o tuned.toml: keeps the gains, for pneuopt export", *hints]
+        elif self.task.loop.pid.sample_time is not None:
+            hints = [f"pneuopt export {self.fit} {output} --to st    (for a PLC; or --help)", *hints]
         result = self._with_files(result)
-        tables = _tuning_tables(result) | _design_tables(result) | dict(compared or {}) | stats_and_provenance(result)
+        tables = _tables(result) | dict(compared or {}) | stats_and_provenance(result)
         status = finish(
             self.outputs,
             {},
@@ -175,7 +168,7 @@ class _Job:
             result.status,
             figures=self.view(result).figures,
             page=page,
-            hints=_hints(self.task, self.fit, self.outputs),
+            hints=hints,
         )
         if failures:
             raise failures[0]
@@ -206,23 +199,6 @@ def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, A
     return tuning_page(source, result, job.view(result), exports=exports, **told)
 
 
-def _hints(task: Tuning, fit: Path, outputs: Outputs) -> list[str]:
-    """What to do with a design: take it to a controller, and show it."""
-    told = [] if outputs.report is not None else ["with --report FILE.html: a page to hand on"]
-    if outputs.output is None:
-        return ["with -o tuned.toml: keeps the gains, for pneuopt export", *told]
-    command = f"pneuopt export {fit} {outputs.output} --to st    (for a PLC; or --help)"
-    return told if task.loop.pid.sample_time is None else [command, *told]
-
-
-def _design_tables(result: TuningResult) -> dict[str, Any]:
-    """The tables of a design's certificate and of the plants that it was tried on."""
-    if not result.status.converged:
-        return {}
-    notes = {} if result.certificate is None else {"notes": list(result.certificate.notes)}
-    return notes | ({} if result.validation is None else {"validation": records(result.validation.figures)})
-
-
 def _compare_dither(
     console: "Console", task: Tuning, before: ParameterSet, result: TuningResult, quiet: bool
 ) -> tuple[dict[str, Any], Report]:
@@ -237,7 +213,17 @@ def _compare_dither(
         rival = tune_rival(console, task, before, quiet)
         if interruption_status() is not None:
             return nothing
-        return _show_dither_verdict(console, task, result.parameters, rival)
+        parameters = result.parameters
+        try:
+            verdict = judge_dither(task.loop, task.references, parameters, without=rival, band=task.specification.band)
+        except ConvergenceError as error:  # of the loop without dither
+            unknown = Report((Line(f"no verdict on the dither: {error}"),))
+            show_report(console, unknown)
+            return {}, unknown
+        show_report(console, verdict.summary())
+        gains = None if rival is None else {n: rival.value(n) for n in rival.free_names}
+        found = {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": gains}
+        return {"dither": found}, verdict.summary()
     if DITHER_AMPLITUDE in result.parameters.free_names:
         useless = Report((Line("the dither's amplitude is 0: the tuning found no use for it"),))
         show_report(console, useless)
@@ -273,22 +259,6 @@ def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet
     return None
 
 
-def _show_dither_verdict(
-    console: "Console", task: Tuning, parameters: ParameterSet, rival: ParameterSet | None
-) -> tuple[dict[str, Any], Report]:
-    """Show the dither's verdict; returns no table where the loop cannot be simulated without dither."""
-    try:
-        verdict = judge_dither(task.loop, task.references, parameters, without=rival, band=task.specification.band)
-    except ConvergenceError as error:
-        unknown = Report((Line(f"no verdict on the dither: {error}"),))
-        show_report(console, unknown)
-        return {}, unknown
-    show_report(console, verdict.summary())
-    gains = None if rival is None else {n: rival.value(n) for n in rival.free_names}
-    found = {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": gains}
-    return {"dither": found}, verdict.summary()
-
-
 def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
     """The metrics with the gains as given; None where that loop cannot be simulated, or no time is left for it."""
     if interruption_status() is not None:
@@ -307,9 +277,14 @@ def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | 
         return None
 
 
-def _tuning_tables(result: TuningResult) -> dict[str, Any]:
+def _tables(result: TuningResult) -> dict[str, Any]:
+    """What a JSON file holds of a tuning; of a design also its certificate's notes and the plants it was tried on."""
     gains = result.parameters.select(result.parameters.free_names).to_frame()
     tables = {"gains": gains, "claimed": result.claimed.T, "certified": result.certified.T}
     tables |= {"requirements": result.requirements, "relaxations": result.relaxations}
-    best = {"best": dict(result.best)} if result.best else {}
-    return {name: records(table) for name, table in tables.items()} | {"active": result.active} | best
+    told: dict[str, Any] = {name: records(table) for name, table in tables.items()} | {"active": result.active}
+    told |= {"best": dict(result.best)} if result.best else {}
+    if result.status.converged:
+        told |= {} if result.certificate is None else {"notes": list(result.certificate.notes)}
+        told |= {} if result.validation is None else {"validation": records(result.validation.figures)}
+    return told

@@ -13,12 +13,11 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tomlkit.items import Table
 
-from pneuopt.control.loop import ClosedLoop
 from pneuopt.files.drive import StoredFit, stored_status
 from pneuopt.files.loop import (
     LOOP_KEYS,
@@ -30,7 +29,7 @@ from pneuopt.files.loop import (
     read_draw,
     read_sample_spreads,
     read_spreads,
-    signal_units,
+    signal_units_of,
 )
 from pneuopt.files.tolerances import CHECKSUM_DIGITS, MAX_CHANGES
 from pneuopt.files.toml import read_toml, toml_table
@@ -39,9 +38,6 @@ from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.units import difference_unit, is_unit, read_unit, read_value, si_conversion, write_value
-
-if TYPE_CHECKING:
-    pass
 
 Entries = dict[str, str]
 Parts = dict[str, Entries]
@@ -71,25 +67,7 @@ class CertificateCheck:
 
 
 def check_certificate(fit: StoredFit, tuned: str | Path) -> CertificateCheck | None:
-    """Whether the certificate in a tuned.toml holds, and if not, what was changed.
-
-    Parameters
-    ----------
-    fit : StoredFit
-        The plant's file.
-    tuned : str or Path
-        A tuned.toml; or a tuning.toml, which has no certificate.
-
-    Returns
-    -------
-    CertificateCheck or None
-        None for a file that no tuning has written.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
+    """Whether the certificate in a tuned.toml holds, and if not, what was changed; None for a file without one."""
     table = read_toml(tuned).unwrap()
     if not any(name in table for name in TUNED_SECTIONS):
         return None
@@ -104,24 +82,16 @@ def check_certificate(fit: StoredFit, tuned: str | Path) -> CertificateCheck | N
     if _digest(parts) == stored.get("hash"):
         return CertificateCheck(not ended, ended)
     changes = list(_find_changes(stored, parts, _Writer(table, fit.toml)))
-    changes = changes or [f"its {part} was changed, and its [checksum] with it" for part in _other_parts(stored, parts)]
+    kept = {part: own.get("hash") for part, own in stored.items() if isinstance(own, dict)}
+    others = [part for part, now in parts.items() if kept.get(part) != _digest(now)[:16]]
+    changes = changes or [f"its {part} was changed, and its [checksum] with it" for part in others]
     more = f"and {len(changes) - MAX_CHANGES} more changes"
     told_changes = changes[:MAX_CHANGES] + ([more] if len(changes) > MAX_CHANGES else [])
     return CertificateCheck(False, (*ended, *(told_changes or ["its [checksum] was edited, or is damaged"])))
 
 
 def checksum_section(table: Mapping[str, Any], path: str | Path, fit: StoredFit) -> Table:
-    """The section of the checksum for a tuned.toml's table.
-
-    Parameters
-    ----------
-    table : mapping
-        The file with its figures and its status.
-    path : str or Path
-        Where it is to stand.
-    fit : StoredFit
-        The plant's file.
-    """
+    """The [checksum] of a tuned.toml's table, which has its figures and status and is to stand at `path`."""
     parts = _describe(table, path, fit)
     tables = {n: toml_table({"hash": _digest(own)[:16], **own}) for n, own in parts.items()}
     section = toml_table({"hash": _digest(parts), **tables})
@@ -134,6 +104,9 @@ def _describe(table: Mapping[str, Any], path: str | Path, fit: StoredFit) -> Par
     plant = fit.parameters
     task = read_tuning_table(table, path, fit.drive.system(), plant)
     task.scenarios(plant | task.parameters)  # refuses what is no table of scenarios, and says where
+    status = table["status"] if isinstance(table.get("status"), dict) else {}
+    code, message = str(status.get("code", "")), " ".join(str(status.get("message", "")).split())
+    codes = {code.value: code.name for code in Code}
     return {
         "loop": _describe_loop(task),
         "plant": _describe_plant(fit),
@@ -141,12 +114,12 @@ def _describe(table: Mapping[str, Any], path: str | Path, fit: StoredFit) -> Par
         "limits": _describe_limits(task),
         "scenarios": dict(_describe_scenarios(table.get("scenarios", {}), str(path), plant | task.parameters)),
         "figures": _describe_figures(table, task),
-        "status": _describe_status(table.get("status", {})),
+        "status": {"the status": codes.get(code, code), "the message of the status": _digest(message)[:16]},
     }
 
 
 def _describe_loop(task: Tuning) -> Entries:
-    loop, units = task.loop, _signal_units(task.loop)
+    loop, units = task.loop, signal_units_of(task.loop)
     found: Entries = {"loop.measured": loop.feedback.name, "loop.actuated": loop.command.name}
     parts = {f.name: getattr(loop, f.name) for f in fields(loop)}
     others = ("plant", "measured", "actuated", "compensators")
@@ -173,7 +146,7 @@ def _describe_plant(fit: StoredFit) -> Entries:
 
 
 def _describe_references(task: Tuning) -> Entries:
-    signals, keys = _signal_units(task.loop), REFERENCE_KEYS.items()
+    signals, keys = signal_units_of(task.loop), REFERENCE_KEYS.items()
     units = {n: key.unit.format_map({**signals, "own": ""}) for n, key in keys if key.unit}
     units |= dict.fromkeys(("size", "distance"), difference_unit(task.loop.feedback.unit))
     found: Entries = {}
@@ -233,14 +206,6 @@ def _describe_figures(table: Mapping[str, Any], task: Tuning) -> Entries:
     return found
 
 
-def _describe_status(status: Any) -> Entries:
-    said = status if isinstance(status, dict) else {}
-    message = " ".join(str(said.get("message", "")).split())
-    codes = {code.value: code.name for code in Code}
-    code = str(said.get("code", ""))
-    return {"the status": codes.get(code, code), "the message of the status": _digest(message)[:16]}
-
-
 def _find_changes(stored: Mapping[str, Any], parts: Parts, writer: "_Writer") -> Iterator[str]:
     """What differs from what was certified, a sentence each."""
     for part, now in parts.items():
@@ -258,23 +223,11 @@ def _find_changes(stored: Mapping[str, Any], parts: Parts, writer: "_Writer") ->
                 yield f"{lead}{n} was left out after tuning{writer.tell(n, was[n])}"
 
 
-def _other_parts(stored: Mapping[str, Any], parts: Parts) -> list[str]:
-    """The parts that are not the certified ones by their hash."""
-    kept = {part: own.get("hash") for part, own in stored.items() if isinstance(own, dict)}
-    return [part for part, now in parts.items() if kept.get(part) != _digest(now)[:16]]
-
-
 @dataclass(frozen=True)
 class _Writer:
-    """Writes a value of the checksum for its reader, in the unit that the files have it in.
+    """Writes a value of the checksum for its reader, in the unit that the files have it in."""
 
-    Parameters
-    ----------
-    tuned, fit : mapping
-        The tables of the files.
-    """
-
-    tuned: Mapping[str, Any]
+    tuned: Mapping[str, Any]  # both as parsed
     fit: Mapping[str, Any]
 
     def compare(self, name: str, was: str, now: str) -> str:
@@ -381,9 +334,3 @@ def _digest(content: Any) -> str:
 
 def _is_digest(text: str) -> bool:
     return len(text) == 16 and all(c in "0123456789abcdef" for c in text)
-
-
-def _signal_units(loop: ClosedLoop) -> dict[str, str]:
-    axis, units = loop.plant.axis, {q.name: q.unit for q in loop.plant.outputs}
-    position = "m" if axis is None else units.get(axis.position, "m")
-    return signal_units(loop.command.unit, loop.feedback.unit, position)

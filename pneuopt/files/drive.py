@@ -17,7 +17,7 @@ import tomlkit
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import System
-from pneuopt.files.tolerances import COVARIANCE_ROUNDING
+from pneuopt.files.tolerances import COVARIANCE_ROUNDING, FILE_DIGITS
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.identification.checkup import AMBIENT_PRESSURE, DRIVE_FILE, Assumption
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -53,24 +53,17 @@ Option = tuple[str, str]
 
 @cache
 def drive_keys(name: str) -> Mapping[str, Key]:
-    """The sections of a drive's file with all keys that any drive of the kind may have.
-
-    Parameters
-    ----------
-    name : str
-        Of `DRIVE_KINDS`.
-
-    Returns
-    -------
-    mapping of str to Key
-        The condition of a key says under which options there is such a parameter.
-    """
+    """The sections with all keys that a drive of the kind may have; a key's condition says under which options."""
     kind = DRIVE_KINDS[name]
     sections: dict[str, dict[str, Key]] = {section: dict(keys) for section, keys in kind.sections.items()}
     for alias in kind.aliases:
         sections[alias.section][alias.key] = alias.as_key()
-    for whole, (parameter, condition) in _find_parameters(kind).items():
+    variants, found = list(_build_variants(kind)), dict[str, Parameter]()
+    for variant in variants:
+        found = {**variant.parameters, **found}
+    for whole, parameter in found.items():
         section, _, key = whole.partition(".")
+        condition = _describe_condition(whole, kind, variants)
         sections.setdefault(section, {})[key] = parameter_key(parameter, condition)
     tables = {section: table(SECTION_MEANINGS.get(section, ""), keys) for section, keys in sections.items()}
     return {"drive": table("the kind of drive", {"kind": KIND_KEY}, required=True), **tables}
@@ -90,15 +83,6 @@ class _DriveOptions(NamedTuple):
     parameters: ParameterSet
 
 
-def _find_parameters(kind: DriveKind) -> dict[str, tuple[Parameter, str]]:
-    """Each parameter of any drive of the kind, and under which options the drive has it."""
-    variants = list(_build_variants(kind))
-    found: dict[str, Parameter] = {}
-    for variant in variants:
-        found = {**variant.parameters, **found}
-    return {n: (p, _describe_condition(n, kind, variants)) for n, p in found.items()}
-
-
 def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
     """Drives that together have every parameter: each law, and of each section one option after the other."""
     known = {(section, key): k for section, keys in kind.sections.items() for key, k in keys.items()}
@@ -111,7 +95,8 @@ def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
         for base in bases if own_laws else bases[:1]:
             try:
                 options = base if option is None else {**base, option: value}
-                yield _DriveOptions(base, option, value, default_parameters(kind, _as_sections(options)))
+                sections = {s: {k: v for (own, k), v in options.items() if own == s} for s, _ in options}
+                yield _DriveOptions(base, option, value, default_parameters(kind, sections))
             except ModelError:  # options that exclude each other
                 continue
 
@@ -126,13 +111,6 @@ def _other_values(key: Key) -> Sequence[Any]:
     return [1] if key.takes is Takes.COUNT else ()
 
 
-def _as_sections(options: Mapping[Option, Any]) -> dict[str, dict[str, Any]]:
-    sections: dict[str, dict[str, Any]] = {}
-    for (section, key), value in options.items():
-        sections.setdefault(section, {})[key] = value
-    return sections
-
-
 def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOptions]) -> str:
     """The options under which a drive has a parameter: 'model = "stribeck" or "lugre"'."""
     parts = []
@@ -144,7 +122,8 @@ def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOpt
             )
             if not all(has.values()):
                 own = "" if name.startswith(f"{section}.") else f"[{section}] "
-                parts.append(f"{own}{key} = {' or '.join(_word(value) for value, there in has.items() if there)}")
+                words = (f'"{v}"' if isinstance(v, str) else str(v).lower() for v, there in has.items() if there)
+                parts.append(f"{own}{key} = {' or '.join(words)}")
     return " and ".join(parts)
 
 
@@ -168,10 +147,6 @@ def _has_by_value(name: str, option: Option, key: Key, variants: Sequence[_Drive
     for variant, _ in changed:
         has[variant.value] = has.get(variant.value, False) or name in variant.parameters
     return has
-
-
-def _word(value: bool | str) -> str:
-    return f'"{value}"' if isinstance(value, str) else str(value).lower()
 
 
 FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
@@ -207,22 +182,12 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
 
 @dataclass(frozen=True, eq=False)
 class StoredFit:
-    """A fit.toml, or the drive.toml that it was made from, parsed once for all that a command needs of it.
-
-    Attributes
-    ----------
-    path : Path
-    drive : Drive
-    parameters : ParameterSet
-        All of `drive.system().parameters`.
-    toml : mapping
-        The whole file as parsed; the properties read what a fit has written into it, and raise `InputError` for what
-        pneuopt does not write so.
-    """
+    """A fit.toml, or the drive.toml that it was made from, parsed once for all that a command needs of it."""
 
     path: Path
     drive: Drive
-    parameters: ParameterSet
+    parameters: ParameterSet  # all of `drive.system().parameters`
+    # as parsed; the properties raise `InputError` for what pneuopt does not write so
     toml: Mapping[str, Any]
 
     @property
@@ -337,13 +302,7 @@ def ambient_pressure(parameters: ParameterSet) -> float:
 
 
 def read_status(path: str | Path) -> Status | None:
-    """How the fit or the tuning in a file ended; None for a file that no result has written.
-
-    Raises
-    ------
-    InputError
-        If the status is none that pneuopt writes.
-    """
+    """How the fit or the tuning in a file ended; None for a file that no result has written."""
     return stored_status(read_toml(path).unwrap(), path)
 
 
@@ -378,8 +337,11 @@ def write_fit(path: str | Path, source: str | Path, result: IdentificationResult
     """
     document, (drive, given) = read_toml(source), read_drive(source)
     for alias in DRIVE_KINDS[drive.kind].aliases:
-        if any(n in given and result.parameters[n] != given[n] for n in (alias.parameter, *alias.uses)):
-            given = _without_alias(document, alias, drive, given)
+        # what an alias says is wrong once its parameter, or one that it is converted by, is estimated
+        is_wrong = any(n in given and result.parameters[n] != given[n] for n in (alias.parameter, *alias.uses))
+        section: Any = document.get(alias.section, {})
+        if is_wrong and section.pop(alias.key, None) is not None:
+            given |= drive.system().parameters.select([alias.parameter])
     if AMBIENT_PRESSURE in given and result.parameters[AMBIENT_PRESSURE].value != given.value(AMBIENT_PRESSURE):
         _write_absolute(document, given)
     for name, found in result.parameters.items():
@@ -387,7 +349,9 @@ def write_fit(path: str | Path, source: str | Path, result: IdentificationResult
             write_parameter(document, name, found, given[name])
     rows = result.estimates.to_dict(orient="index")
     document["estimates"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
-    document["covariance"] = toml_table(_covariance_rows(result.covariance))
+    covariance = result.covariance
+    known = [n for n in covariance.index if np.isfinite(covariance.to_dict()[n][n])]  # the others have none
+    document["covariance"] = toml_table({str(n): covariance.loc[n, known].to_list() for n in known})
     document["agreement"] = toml_table(_agreement_rows(result.fit))
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
     if result.verdict is not None:
@@ -405,9 +369,9 @@ def _write_absolute(document: tomlkit.TOMLDocument, given: ParameterSet) -> None
         if isinstance(said, dict):
             for part in ("value", "lower", "upper"):
                 if "(g)" in str(said.get(part)):
-                    said[part] = write_value(getattr(p, part), p.unit, 9)
+                    said[part] = write_value(getattr(p, part), p.unit, FILE_DIGITS)
         elif "(g)" in str(said):
-            entries[key] = write_value(p.value, p.unit, 9)
+            entries[key] = write_value(p.value, p.unit, FILE_DIGITS)
 
 
 def _agreement_rows(fit: "pd.DataFrame") -> dict[str, Any]:
@@ -422,46 +386,20 @@ def _agreement_rows(fit: "pd.DataFrame") -> dict[str, Any]:
     }
 
 
-def _covariance_rows(covariance: "pd.DataFrame") -> dict[str, list[float]]:
-    """The rows of a covariance, without the parameters that have none."""
-    known = [n for n in covariance.index if np.isfinite(covariance.to_dict()[n][n])]
-    return {str(n): covariance.loc[n, known].to_list() for n in known}
-
-
-def _without_alias(document: tomlkit.TOMLDocument, alias: Alias, drive: Drive, given: ParameterSet) -> ParameterSet:
-    """Drop an alias from the file: once the parameter, or one that it is converted by, is estimated, it is wrong."""
-    section: Any = document.get(alias.section, {})
-    if alias.key not in section:
-        return given
-    section.remove(alias.key)
-    return given | drive.system().parameters.select([alias.parameter])
-
-
 def _read_parameters(system: System, kind: DriveKind, sections: Sections, places: FileLocations) -> ParameterSet:
     defaults = system.parameters
     _check_keys(defaults, kind, sections, places)
     entries = {f"{s}.{k}": v for s, said in sections.items() for k, v in said.items() if f"{s}.{k}" in defaults}
-    with count_gauge_from(_read_ambient_pressure(entries, defaults, places)):
-        return _read_entries(system, kind, sections, entries, places)
 
+    def read(name: str) -> Parameter:
+        return read_parameter(entries[name], defaults[name], _parameter_place(name, places))
 
-def _read_ambient_pressure(entries: Mapping[str, Any], defaults: ParameterSet, places: FileLocations) -> float:
-    """What the file's gauge pressures count from [Pa]: the drive's ambient pressure, else the standard atmosphere."""
-    if AMBIENT_PRESSURE not in entries:
-        return ambient_pressure(defaults)
-    where = _parameter_place(AMBIENT_PRESSURE, places)
-    return read_parameter(entries[AMBIENT_PRESSURE], defaults[AMBIENT_PRESSURE], where).value
-
-
-def _read_entries(
-    system: System, kind: DriveKind, sections: Sections, entries: dict[str, Any], places: FileLocations
-) -> ParameterSet:
-    defaults, edits = system.parameters, dict[str, Parameter]()
-    _check_hardware(system, entries, places)
-    for alias in kind.aliases:
-        entries |= _read_alias(alias, sections, entries, defaults, places)
-    for name, entry in entries.items():
-        edits[name] = read_parameter(entry, defaults[name], _parameter_place(name, places))
+    zero = read(AMBIENT_PRESSURE).value if AMBIENT_PRESSURE in entries else ambient_pressure(defaults)
+    with count_gauge_from(zero):
+        _check_hardware(system, entries, places)
+        for alias in kind.aliases:
+            entries |= _read_alias(alias, sections, entries, defaults, places)
+        edits = {name: read(name) for name in entries}
     return defaults | ParameterSet({name: edits[name] for name in defaults if name in edits})
 
 

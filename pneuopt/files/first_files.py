@@ -1,7 +1,6 @@
 """The first files of a new user: drive, tuning, study, rig and a log's sidecar; and those of an excitation run."""
 
 import json
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +12,12 @@ from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.moves import ExcitationRun
 from pneuopt.files.drive import FIT_SECTIONS, default_parameters, drive_keys
-from pneuopt.files.keys import Template, json_schema
-from pneuopt.files.loop import signal_units, tuning_keys
+from pneuopt.files.keys import Template, comment_lines, json_schema
+from pneuopt.files.loop import signal_units_of, tuning_keys
 from pneuopt.files.outputs import output_schema
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
-from pneuopt.files.tolerances import COMMENT_WIDTH, DIGITS, SAMPLE_TIME, SAMPLES_A_DITHER_PERIOD, SWEEP
+from pneuopt.files.tolerances import LEAST_DITHER_SAMPLES, SAMPLE_TIME
 from pneuopt.files.tuning import TUNED_SECTIONS
 from pneuopt.logs.columns import CHANNELS, plant_channels
 from pneuopt.logs.read_log import SIDECAR_KEYS
@@ -26,7 +25,6 @@ from pneuopt.models.catalog import CATALOGUE_SOURCE
 from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.keys import Key
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.units import write_value
 
@@ -53,29 +51,8 @@ def first_files(
 ) -> dict[str, str]:
     """The texts of the files, by their names within a folder.
 
-    Parameters
-    ----------
-    name : str
-        Of a kind of drive.
-    known : ParameterSet
-        Values of the drive's parameters that are known, of a catalogue; each has its source.
-    columns : mapping of str to str
-        What the sidecar states, by channel: '"t [ms]"'; none: the log's header says it.
-    log : str
-        The log's file name.
-    sample_time : float
-        Of the controller [s].
-    counts_from_zero : bool
-        Whether a log shows a command from 0 to twice the usual limit about a centre between, which is then estimated.
-    source : sequence of str
-        Lines at the drive's top that say where its values come from.
-    doubts : sequence of str
-        What the sidecar states without being sure: lines at its top.
-
-    Raises
-    ------
-    UnknownNameError
-        If there are no first files for that kind.
+    `columns` is what the sidecar states by channel ('"t [ms]"'), `doubts` what it states without being sure; with
+    `counts_from_zero` the command goes from 0 to twice the usual limit about a centre that is estimated.
     """
     check_names("kind", [name], first_kinds(), "init")
     others = {sidecar_name(other) for other in _OTHER_FILES}
@@ -133,8 +110,8 @@ def _drive_template(kind: DriveKind, first: FirstFiles, values: ParameterSet, so
         section, _, key = name.partition(".")
         declared = sections[section].keys[key]
         if declared.source != DEFAULT_WIDTH:  # a stated width is not chosen by the logs any more
-            keys = {**sections[section].keys, key: _with_source(declared, p)}
-            sections[section] = replace(sections[section], keys=keys)
+            declared = replace(declared, source="catalogue") if p.source == CATALOGUE_SOURCE else declared
+            sections[section] = replace(sections[section], keys={**sections[section].keys, key: declared})
             stated[name] = _value_text(p, free=True) if name in first.unknowns else _value_text(p)
     title = (
         f"A {kind.name} drive: its hardware. Put in what you know; what is free is identified from logs:",
@@ -145,23 +122,19 @@ def _drive_template(kind: DriveKind, first: FirstFiles, values: ParameterSet, so
     return Template(title, sections, stated, schema=_schema_path("drive"))
 
 
-def _with_source(key: Key, parameter: Parameter) -> Key:
-    return replace(key, source="catalogue" if parameter.source == CATALOGUE_SOURCE else key.source)
-
-
 def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, counts_from_zero: bool) -> Template:
     command, measured = loop.command.unit, loop.feedback.unit
     given = loop.parameters.with_values({f"pid.{n}": value for n, (value, _, _) in first.gains.items()})
     given = given.with_bounds({f"pid.{n}": (low, high) for n, (_, low, high) in first.gains.items()})
     ends = (0.0, 2 * first.limit) if counts_from_zero else (-first.limit, first.limit)
-    sample_time = write_value(loop.pid.sample_time or 0.0, "s", DIGITS)
+    sample_time = write_value(loop.pid.sample_time or 0.0, "s")
     stated = {"pid.form": '"parallel"', "pid.sample_time": _quote(sample_time)}
     stated |= {f"pid.{n}": _value_text(given[f"pid.{n}"], free=True, bounds=True) for n in first.gains}
     stated["pid.limits"] = "[" + ", ".join(_quote(write_value(end, command)) for end in ends) + "]"
     if first.dither is not None:
         frequency, most = first.dither
-        frequency = min(frequency, 1.0 / (SAMPLES_A_DITHER_PERIOD * (loop.pid.sample_time or SAMPLE_TIME)))
-        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz", DIGITS))}
+        frequency = min(frequency, 1.0 / (LEAST_DITHER_SAMPLES * (loop.pid.sample_time or SAMPLE_TIME)))
+        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz"))}
         least = {"amplitude": 0.0, "offset": -most}
         free = {n: Parameter(0.0, command, lower, most) for n, lower in least.items()}
         stated |= {f"dither.{n}": _value_text(p, free=True, bounds=True) for n, p in free.items()}
@@ -181,7 +154,7 @@ def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, 
         tuning_keys(command, measured),
         stated,
         {"reference": steps},
-        signal_units(command, measured, _position_unit(loop)),
+        signal_units_of(loop),
         examples,
         _tuning_names(loop, first, values),
         _schema_path("tuning"),
@@ -203,7 +176,7 @@ def _tuning_names(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> 
 
 def _study_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> Template:
     swept = values[first.swept]
-    axis = ", ".join(_value_text(replace(swept, value=share * swept.value)) for share in SWEEP)
+    axis = ", ".join(_value_text(replace(swept, value=share * swept.value)) for share in (0.8, 1.0, 1.2))
     stated = {"study.drive": '"drive.toml"', "study.tuning": '"tuning.toml"', f'axes."{first.swept}"': f"[{axis}]"}
     limits, unit = {"lower": 0.5 * first.limit, "upper": first.limit}, loop.command.unit
     ends = {f"pareto.{n}": _quote(write_value(limit, unit)) for n, limit in limits.items()}
@@ -260,11 +233,6 @@ def _sidecar_template(
     return Template(title, SIDECAR_KEYS, stated, names=names, schema=_schema_path("sidecar"))
 
 
-def _position_unit(loop: ClosedLoop) -> str:
-    units = {q.name: q.unit for q in loop.plant.outputs}
-    return "m" if loop.plant.axis is None else units.get(loop.plant.axis.position, "m")
-
-
 def _value_text(p: Parameter, *, free: bool = False, bounds: bool = False) -> str:
     """A parameter's value, or a table with its bounds where it is free."""
     value = _number_text(p.value, p.unit)
@@ -275,7 +243,7 @@ def _value_text(p: Parameter, *, free: bool = False, bounds: bool = False) -> st
 
 
 def _number_text(value: float, unit: str) -> str:
-    text = write_value(value, unit, DIGITS)
+    text = write_value(value, unit)
     return text if unit == "1" else _quote(text)
 
 
@@ -288,7 +256,11 @@ PLAYED_FILE, RUN_FILE = "moves.csv", "run.toml"  # not one name: run.toml would 
 
 def run_files(run: ExcitationRun, drive: str = "drive.toml") -> dict[str, str]:
     """The texts of both files, by their names; `drive` is the name of the drive's file."""
-    return {PLAYED_FILE: _play_file(run), RUN_FILE: "\n".join([*_head(run, drive), *_loop(run), *_moves(run)]) + "\n"}
+    columns = run.moves.trajectory(run.loop.pid.sample_time or 0.0)
+    rows = zip(columns.t.tolist(), columns["reference"].tolist(), columns["reference_speed"].tolist(), strict=True)
+    header = "time [s],position_reference [mm],speed_reference [m/s]"
+    played = "\n".join([header, *(f"{t:.9g},{1e3 * r:.9g},{v:.6g}" for t, r, v in rows)]) + "\n"
+    return {PLAYED_FILE: played, RUN_FILE: "\n".join([*_run_head(run, drive), *_run_sections(run)]) + "\n"}
 
 
 def logged_channels(run: ExcitationRun) -> tuple[str, ...]:
@@ -299,15 +271,7 @@ def logged_channels(run: ExcitationRun) -> tuple[str, ...]:
     return run.loop.command.name, run.loop.feedback.name, *axis.final_element.pushing
 
 
-def _play_file(run: ExcitationRun) -> str:
-    """Time, position and speed of the reference at each sample."""
-    columns = run.moves.trajectory(run.loop.pid.sample_time or 0.0)
-    rows = zip(columns.t.tolist(), columns["reference"].tolist(), columns["reference_speed"].tolist(), strict=True)
-    header = "time [s],position_reference [mm],speed_reference [m/s]"
-    return "\n".join([header, *(f"{t:.9g},{1e3 * r:.9g},{v:.6g}" for t, r, v in rows)]) + "\n"
-
-
-def _head(run: ExcitationRun, drive: str) -> list[str]:
+def _run_head(run: ExcitationRun, drive: str) -> list[str]:
     low, high = (write_value(x, "m", 3) for x in run.between)
     fast = write_value(run.fastest, "m/s", 3)
     trail = write_value(run.following_error, "m", 2)
@@ -322,10 +286,11 @@ def _head(run: ExcitationRun, drive: str) -> list[str]:
         f"Then: pneuopt identify {drive} LOG -o fit.toml",
         f"Simulated on the drive as guessed: pneuopt simulate {drive} {RUN_FILE} -o predicted.csv",
     )
-    return [f"# {line}" for part in text for line in textwrap.wrap(part, COMMENT_WIDTH, subsequent_indent="  ")]
+    return [line for part in text for line in comment_lines(part)]
 
 
-def _loop(run: ExcitationRun) -> Iterator[str]:
+def _run_sections(run: ExcitationRun) -> Iterator[str]:
+    """The lines of a run's loop and of its moves."""
     p, unit, loop = run.parameters, run.loop.command.unit, run.loop
     limits = (write_value(p.value(f"pid.{end}") + run.centre, unit) for end in ("lower", "upper"))
     gain = write_value(p.value("pid.Kp"), p["pid.Kp"].unit)
@@ -333,9 +298,6 @@ def _loop(run: ExcitationRun) -> Iterator[str]:
     yield f'sample_time = "{write_value(loop.pid.sample_time or 0.0, "s")}"'
     yield f'Kp = "{gain}"'
     yield "limits = [" + ", ".join(f'"{end}"' for end in limits) + "]"
-
-
-def _moves(run: ExcitationRun) -> Iterator[str]:
     moves: Sequence[Move] = run.moves.moves
     first = moves[0]
     shared = {"speed": ("m/s", run.fastest), "acceleration": ("m/s^2", first.acceleration), "at": ("s", first.at)}

@@ -12,7 +12,6 @@ from pneuopt.files.drive import drive_keys
 from pneuopt.files.loop import tuning_keys
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
-from pneuopt.files.tolerances import COMMENT_COLUMN, MAX_WIDTH, SHARED_BY
 from pneuopt.logs.read_log import SIDECAR_KEYS
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import UnitError
@@ -31,31 +30,25 @@ _SIGNAL_WORDS = {"command": "command", "measured": "measured", "difference": "me
 
 @dataclass(frozen=True)
 class KeyRow:
-    """A key in the list.
-
-    Attributes
-    ----------
-    file, section, name : str
-        The name within its section, "smoothing.corner"; empty for the section itself.
-    key : Key
-    unit, usual : str
-        As text; of drives that differ, each with its kind.
-    kinds : tuple of str
-        The kinds of drive that have it; empty where all have it that have the section.
-    """
+    """A key in the list."""
 
     file: str
     section: str
-    name: str
+    name: str  # within its section, "smoothing.corner"; empty for the section itself
     key: Key
-    unit: str
+    unit: str  # as text; of drives that differ, each with its kind
     usual: str
-    kinds: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()  # the kinds of drive that have it; empty where all have it that have the section
 
     @property
     def full_name(self) -> str:
         """Section and key."""
         return ".".join(filter(None, [self.section, self.name]))
+
+    @property
+    def heading(self) -> str:
+        """Full name, unit and default in one line."""
+        return f"{self.full_name}{f' [{self.unit}]' if self.unit else ''}{f' = {self.usual}' if self.usual else ''}"
 
     @property
     def remarks(self) -> str:
@@ -83,7 +76,9 @@ def list_keys() -> tuple[KeyRow, ...]:
     others = {"tuning.toml": tuning_keys(), "study.toml": STUDY_KEYS, "rig.toml": RIG_KEYS, "log.toml": SIDECAR_KEYS}
     rows = list(_drive_rows())
     for file, sections in others.items():
-        rows += [_row(file, name, key) for name, key in _merge_shared(sections)]
+        for name, key in _merge_shared(sections):
+            section, _, own = name.partition(".")
+            rows.append(KeyRow(file, section, own, key, describe_unit(key), describe_usual(key)))
     return tuple(rows)
 
 
@@ -100,7 +95,11 @@ def describe_usual(key: Key) -> str:
         return f"[{', '.join(describe_usual(Key('', usual=entry)) for entry in usual)}]"
     if isinstance(usual, int) and key.takes in (Takes.COUNT, Takes.SAMPLES):
         return str(usual)
-    return _describe_value(usual, key.unit)
+    try:
+        text = write_value(usual, key.unit)
+    except UnitError:  # of a signal that is not known yet
+        return f"{usual:g}"
+    return text if key.unit == "1" else f'"{text}"'
 
 
 def describe_unit(key: Key) -> str:
@@ -110,20 +109,7 @@ def describe_unit(key: Key) -> str:
     return "" if unit == "1" else unit
 
 
-def _describe_value(value: float, unit: str) -> str:
-    try:
-        text = write_value(value, unit)
-    except UnitError:  # of a signal that is not known yet
-        return f"{value:g}"
-    return text if unit == "1" else f'"{text}"'
-
-
-def _row(file: str, name: str, key: Key) -> KeyRow:
-    section, _, own = name.partition(".")
-    return KeyRow(file, section, own, key, describe_unit(key), describe_usual(key))
-
-
-def _merge_shared(sections: Mapping[str, Key]) -> Iterable[tuple[str, Key]]:
+def _merge_shared(sections: Mapping[str, Key], least: int = 3) -> Iterable[tuple[str, Key]]:
     """Keys by full name; what several requirements of a section share has one row, "minimise.*.weight"."""
     walked = list(table("", sections).walk())
     counts: dict[tuple[str, str, str], int] = {}
@@ -133,7 +119,7 @@ def _merge_shared(sections: Mapping[str, Key]) -> Iterable[tuple[str, Key]]:
     done = set()
     for name, key in walked:
         shape = _shape(name, key) if name.count(".") == 2 else None
-        if shape is None or counts[shape] < SHARED_BY:
+        if shape is None or counts[shape] < least:
             yield name, key
         elif shape not in done:
             done.add(shape)
@@ -168,19 +154,11 @@ def _join(texts: Mapping[str, str]) -> str:
 
 
 _VALUE: dict[str, Any] = {"type": ["number", "string"]}
+_SPREAD: dict[str, Any] = {"type": ["number", "string", "array"]}
 
 
 def json_schema(title: str, sections: Mapping[str, Key], results: Iterable[str] = ()) -> dict[str, Any]:
-    """The schema of a file (draft 7).
-
-    Parameters
-    ----------
-    title : str
-    sections : mapping of str to Key
-        What stands at the file's top.
-    results : iterable of str
-        Sections that a command adds, about which nothing is said.
-    """
+    """The schema (draft 7) of a file with these sections, and with others, `results`, that a command adds."""
     schema = _describe_table(table("", sections))
     schema["properties"] |= {name: {"type": "object"} for name in results}
     return {"$schema": "http://json-schema.org/draft-07/schema#", "title": title, **schema}
@@ -207,10 +185,6 @@ def _describe_table(key: Key) -> dict[str, Any]:
     }
 
 
-def _describe_text(key: Key) -> dict[str, Any]:
-    return {"type": "string"} if key.choices is None else {"type": "string", "enum": list(key.choices)}
-
-
 def _describe_list(key: Key) -> dict[str, Any]:
     items = {"enum": list(key.choices)} if key.choices is not None else _describe_entry(key.of) if key.of else {}
     least, most = key.counts
@@ -223,30 +197,19 @@ def _describe_list(key: Key) -> dict[str, Any]:
     }
 
 
-def _describe_count(key: Key) -> dict[str, Any]:
-    bounds = {"minimum": key.least, "maximum": key.most}
-    return {"type": "integer", **{n: bound for n, bound in bounds.items() if abs(bound) < inf}}
-
-
-def _value_or_table(key: Key) -> dict[str, Any]:
-    return {"anyOf": [_VALUE, _describe_table(table("", key.keys or PARAMETER_KEYS))]}
-
-
-def _spread_or_table(key: Key) -> dict[str, Any]:
-    spread: dict[str, Any] = {"type": ["number", "string", "array"]}
-    return {"anyOf": [spread, _describe_table(table("", key.keys))]} if key.keys else spread
-
-
 _FORMS: Mapping[Takes, Callable[[Key], dict[str, Any]]] = {
     Takes.FLAG: lambda _: {"type": "boolean"},
-    Takes.TEXT: _describe_text,
-    Takes.COUNT: _describe_count,
+    Takes.TEXT: lambda key: {"type": "string"} | ({} if key.choices is None else {"enum": list(key.choices)}),
+    Takes.COUNT: lambda key: (
+        {"type": "integer"}
+        | {n: bound for n, bound in (("minimum", key.least), ("maximum", key.most)) if abs(bound) < inf}
+    ),
     Takes.SAMPLES: lambda _: {"type": ["integer", "string"]},
     Takes.NUMBER: lambda _: _VALUE,
-    Takes.PARAMETER: _value_or_table,
+    Takes.PARAMETER: lambda key: {"anyOf": [_VALUE, _describe_table(table("", key.keys or PARAMETER_KEYS))]},
     Takes.LIST: _describe_list,
     Takes.FLAG_OR_LIST: lambda _: {"type": ["boolean", "array"]},
-    Takes.SPREAD: _spread_or_table,
+    Takes.SPREAD: lambda key: {"anyOf": [_SPREAD, _describe_table(table("", key.keys))]} if key.keys else _SPREAD,
     Takes.AXIS: lambda _: {"type": ["array", "object"]},
     Takes.COLUMN: lambda key: {"anyOf": [{"type": ["string", "boolean"]}, _describe_table(table("", key.keys))]},
     Takes.TABLE: _describe_table,
@@ -259,41 +222,25 @@ _NO_BREAK = "\N{NO-BREAK SPACE}"
 
 @dataclass(frozen=True)
 class Template:
-    """What a new file says.
+    """What a new file says."""
 
-    Attributes
-    ----------
-    title : tuple of str
-        Lines of comment at its top.
-    sections : mapping of str to Key
-        Its keys.
-    stated : mapping of str to str
-        Text of what it states, by full name; a name with dots of its own as '"load.mass"'.
-    repeated : mapping of str to sequence of mapping
-        Of a section that stands there several times, what each states.
-    units : mapping of str to str
-        What the words in braces of a unit stand for.
-    examples : mapping of str to str
-        For comments: text of a key by its full name, where neither its default nor its own example would do.
-    names : mapping of str to str
-        For comments: an entry in place of one that the user names, by the table's full name: '"load.mass" = "30 %"'.
-    schema : str
-        Where the file's schema is; the first line says it to editors.
-    """
-
-    title: Sequence[str]
-    sections: Mapping[str, Key]
+    title: Sequence[str]  # lines of comment at its top
+    sections: Mapping[str, Key]  # its keys
+    # text of what it states, by full name; a name with dots of its own as '"load.mass"'
     stated: Mapping[str, str] = field(default_factory=dict)
+    # of a section that stands there several times, what each states
     repeated: Mapping[str, Sequence[Mapping[str, str]]] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)  # what the words in braces of a unit stand for
+    # for comments: text of a key by its full name, where neither its default nor its own example would do
     examples: Mapping[str, str] = field(default_factory=dict)
+    # for comments: an entry in place of one that the user names, by the table's full name: '"load.mass" = "30 %"'
     names: Mapping[str, str] = field(default_factory=dict)
-    schema: str = ""
+    schema: str = ""  # where the file's schema is; the first line says it to editors
 
     def render(self) -> str:
         """The file's text."""
         lines = [f"#:schema {self.schema}"] if self.schema else []
-        lines += [line for text in self.title for line in _comment(text)]
+        lines += [line for text in self.title for line in comment_lines(text)]
         for name, key in self.sections.items():
             lines += [""] if lines else []
             lines += self._render_entry("", name, key) if key.takes is Takes.LIST else self._render_section(name, key)
@@ -302,13 +249,13 @@ class Template:
     def _render_section(self, name: str, key: Key) -> Iterator[str]:
         if key.takes is Takes.TABLES:
             for number, stated in enumerate(self.repeated[name]):
-                yield from ["", f"[[{name}]]"] if number else [*_comment(key.meaning), f"[[{name}]]"]
+                yield from ["", f"[[{name}]]"] if number else [*comment_lines(key.meaning), f"[[{name}]]"]
                 for own, known in key.keys.items():
                     if own in stated or not number:
                         yield from self._render_entry(name, own, known, stated.get(own))
             return
         said = {n.partition(".")[2]: text for n, text in self.stated.items() if n.partition(".")[0] == name}
-        yield from _comment(key.meaning)
+        yield from comment_lines(key.meaning)
         yield f"[{name}]" if said or key.required else f"# [{name}]"
         for own, known in key.keys.items():
             yield from self._render_entry(name, own, known, said.get(own))
@@ -321,17 +268,13 @@ class Template:
         """A key that is stated, or a comment with what is usual, or with an example."""
         usual = describe_usual(key)
         shown = text if text is not None else self._example_text(f"{section}.{name}", key)
-        unit = self._fill(key)
+        known = all(word in self.units for word in _words_of(key.unit))
+        unit = "" if key.unit == "1" else key.unit.format_map(self.units) if known else describe_unit(key)
         words = f"one of {', '.join(key.choices)}" if key.choices is not None else ""
         standing = f"default {usual}" if text is not None and usual and usual != text else "default" if usual else ""
         standing = "" if key.takes is Takes.TABLE or key.source.startswith(standing) else standing
         remarks = [key.meaning + (f" [{unit}]" if unit else ""), words, key.limits, key.condition, standing, key.source]
         yield from _line(f"{'' if text is not None else '# '}{name} = {shown}", "; ".join(filter(None, remarks)))
-
-    def _fill(self, key: Key) -> str:
-        """The unit of a key for this file's signals."""
-        known = all(word in self.units for word in _words_of(key.unit))
-        return "" if key.unit == "1" else key.unit.format_map(self.units) if known else describe_unit(key)
 
     def _example_text(self, name: str, key: Key) -> str:
         if name in self.examples:
@@ -342,19 +285,15 @@ class Template:
             return f"{{ {', '.join(inner)} }}"
         words = _words_of(key.unit)
         if words and all(word in self.units for word in words) and key.takes is not Takes.LIST:
-            return _value_example(key, key.unit.format_map(self.units))
+            unit = key.unit.format_map(self.units)
+            if key.usual is not None:
+                return f"{key.usual:g}" if unit == "1" else f'"{key.usual:g} {unit}"'
+            try:
+                read_value(key.example.strip('"'), unit)
+            except UnitError:
+                return "1" if unit == "1" else f'"1 {unit}"'
+            return key.example
         return describe_usual(key) or key.example or (f'"{next(iter(key.choices))}"' if key.choices else '""')
-
-
-def _value_example(key: Key, unit: str) -> str:
-    """The usual value in the unit of a signal; else the key's own example where it has that unit, or one unit."""
-    if key.usual is not None:
-        return f"{key.usual:g}" if unit == "1" else f'"{key.usual:g} {unit}"'
-    try:
-        read_value(key.example.strip('"'), unit)
-    except UnitError:
-        return "1" if unit == "1" else f'"1 {unit}"'
-    return key.example
 
 
 def _words_of(unit: str) -> list[str]:
@@ -362,16 +301,17 @@ def _words_of(unit: str) -> list[str]:
     return [part.partition("}")[0] for part in unit.split("{")[1:]]
 
 
-def _comment(text: str) -> list[str]:
+def comment_lines(text: str, width: int = 110) -> list[str]:
+    """A comment in lines of at most this width."""
     whole = text.replace(" [", f"{_NO_BREAK}[")  # "# [s]" would look like a section
     whole = re.sub(r'"[^"]*"', lambda quoted: quoted[0].replace(" ", _NO_BREAK), whole)  # a value stays in one piece
-    lines = textwrap.wrap(whole, MAX_WIDTH - 2, subsequent_indent="  ", break_on_hyphens=False)
+    lines = textwrap.wrap(whole, width - 2, subsequent_indent="  ", break_on_hyphens=False)
     return [f"# {line}".replace(_NO_BREAK, " ") for line in lines]
 
 
-def _line(entry: str, remark: str) -> list[str]:
+def _line(entry: str, remark: str, column: int = 44, width: int = 110) -> list[str]:
     """An entry with its comment beside it, or above where that would be too long."""
     if not remark:
         return [entry]
-    beside = f"{entry:<{COMMENT_COLUMN}} # {remark}"
-    return [beside] if len(beside) <= MAX_WIDTH else [*_comment(remark), entry]
+    beside = f"{entry:<{column}} # {remark}"
+    return [beside] if len(beside) <= width else [*comment_lines(remark, width), entry]

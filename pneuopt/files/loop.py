@@ -5,7 +5,7 @@ Words in braces in a unit stand for the units of the loop's signals (`signal_uni
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from enum import Enum
 from functools import partial
@@ -77,23 +77,7 @@ def bound_units(loop: ClosedLoop) -> dict[str, str]:
 
 
 def read_bound(key: str, given: Any, unit: str, where: str) -> float:
-    """Read a requirement's bound.
-
-    Parameters
-    ----------
-    key : str
-    given : object
-        As written: "5 %", "150 N", 1.4, "2 l(ANR)".
-    unit : str
-        Of `bound_units`.
-    where : str
-        What the message of an error begins with.
-
-    Raises
-    ------
-    UnitError
-        If it cannot be read.
-    """
+    """Read a requirement's bound, "5 %", 1.4 or "2 l(ANR)", in a unit of `bound_units`."""
     if REQUIREMENTS_BY_KEY[key].metric.unit.endswith(NORMAL_VOLUME):
         normal = isinstance(given, str) and given.strip().endswith(NORMAL_VOLUME)
         require(normal, f'{where}: {given!r}: air is counted at 20 degC and 100 kPa (ANR): "2 l(ANR)"', UnitError)
@@ -220,22 +204,7 @@ def read_draw(given: Mapping[str, Any], where: str) -> Draw:
 
 
 def read_spreads(entries: Mapping[str, Any], where: str, parameters: ParameterSet) -> dict[str, Spread]:
-    """Read by which fraction, or between which values, each pattern of parameters spreads.
-
-    Parameters
-    ----------
-    entries : mapping
-        Names or patterns to "30 %", or to ["3 kg", "7 kg"].
-    where : str
-        What the message of an error begins with.
-    parameters : ParameterSet
-        Gives the units.
-
-    Raises
-    ------
-    InputError
-        If a name is unknown, or a value cannot be read.
-    """
+    """Read by which fraction, "30 %", or between which values, ["3 kg", "7 kg"], each pattern of names spreads."""
     return {
         pattern: _read_spread(given, pattern, where, parameters)
         for pattern, given in _flatten(entries, parameters).items()
@@ -292,13 +261,6 @@ REPLACED_METHODS = {
 }  # in files of older versions
 
 
-def _option_keys(name: str) -> dict[str, Key]:
-    """The options of a method that a file can state: numbers, and lists of them."""
-    meanings, condition = argument_meanings(METHODS[name]), f'with kind = "{name}"'
-    own = [f for f in fields(METHODS[name]) if isinstance(f.default, int | float | tuple)]
-    return {f.name: _option_key(f.default, meanings.get(f.name, ""), condition) for f in own}
-
-
 def _option_key(usual: Any, meaning: str = "", condition: str = "") -> Key:
     if isinstance(usual, tuple):
         return Key(meaning, Takes.LIST, usual=usual, condition=condition, of=_option_key(usual[0]))
@@ -307,8 +269,15 @@ def _option_key(usual: Any, meaning: str = "", condition: str = "") -> Key:
     return Key(meaning, Takes.COUNT, usual=usual, condition=condition, least=-MAX_OPTION, most=MAX_OPTION)
 
 
-METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {name: _option_keys(name) for name in METHODS}
-"""The options of each method."""
+METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {
+    name: {
+        f.name: _option_key(f.default, argument_meanings(kind).get(f.name, ""), f'with kind = "{name}"')
+        for f in fields(kind)
+        if isinstance(f.default, int | float | tuple)
+    }
+    for name, kind in METHODS.items()
+}
+"""The options of each method that a file can state: numbers, and lists of them."""
 
 
 def _join_options() -> dict[str, Key]:
@@ -325,24 +294,7 @@ METHOD_SECTION = table(
 
 
 def read_method(entries: Mapping[str, Any], where: str) -> Method | None:
-    """Read a tuning method.
-
-    Parameters
-    ----------
-    entries : mapping
-        "kind", a key of `METHODS`, and options of that class: numbers, or lists of them. Empty: no method.
-    where : str
-        What the message of an error begins with.
-
-    Returns
-    -------
-    Method or None
-        None: the loop decides.
-
-    Raises
-    ------
-    InputError
-        Or its kind; the message names the key.
+    """Read a tuning method; None, so that the loop decides, of an empty section.
 
     Examples
     --------
@@ -529,6 +481,13 @@ def signal_units(command: str, measured: str, position: str = "m") -> dict[str, 
     }
 
 
+def signal_units_of(loop: ClosedLoop) -> dict[str, str]:
+    """The units that the words in braces stand for in a loop."""
+    axis, units = loop.plant.axis, {q.name: q.unit for q in loop.plant.outputs}
+    position = "m" if axis is None else units.get(axis.position, "m")
+    return signal_units(loop.command.unit, loop.feedback.unit, position)
+
+
 LIMIT_KEYS: Mapping[str, Key] = {**{n: limit_key(n) for n in REQUIREMENTS_BY_KEY}, NO_HUNTING_KEY: _NO_HUNTING}
 """What [limits] may hold."""
 TUNING_KEYS: Mapping[str, Key] = {
@@ -572,17 +531,7 @@ FIRST_PARAMETERS: Mapping[str, str] = {
 
 
 def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping[str, Key]:
-    """All sections of a tuning.toml with all their keys.
-
-    Parameters
-    ----------
-    command, measured : str
-        Units of the loop's signals; by default these words stand for them.
-
-    Returns
-    -------
-    mapping of str to Key
-    """
+    """All sections of a tuning.toml with all their keys, for signals of these units."""
     signal = SensedSignal(Quantity("measured", measured), {}, SAMPLE_TIME)
     parts = {
         "pid": _pid_keys(command, measured),
@@ -635,34 +584,7 @@ _GAIN_CORRECTIONS: Mapping[Form, Mapping[str, str]] = {
 def read_loop_sections(
     table: TuningSections, plant: System, path: str | Path, centre: float = 0.0
 ) -> tuple[ClosedLoop, ParameterSet]:
-    """The loop of a tuning's sections.
-
-    Parameters
-    ----------
-    table : mapping of str to mapping
-        The sections; others than `LOOP_SECTIONS` are not read.
-    plant : System
-    path : str or Path
-        What the messages of errors begin with.
-    centre : float
-        Of the plant's valve [the command's unit]; limits in the file are those of the wire, the loop's are about it.
-
-    Returns
-    -------
-    loop : ClosedLoop
-    parameters : ParameterSet
-        Those of its controller, sensor and dither, the free ones within finite bounds.
-
-    Raises
-    ------
-    InputError
-        Or its kind; the message names file, section and key.
-    """
-    loop = _loop(table, plant, path)
-    return loop, _parameters(table, loop, path, centre)
-
-
-def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
+    """The loop and its parameters; limits in the file are those of the wire, the loop's are about `centre`."""
     wiring = {n: s for n, s in read_table(LOOP_KEYS["loop"], table.get("loop", {}), f"{path}: [loop]").items() if s}
     for section, first in FIRST_PARAMETERS.items():
         told = f"{path}: [{section}] has no {first}, without which it does nothing; write {first}"
@@ -671,28 +593,23 @@ def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
     dither = _dither(table["dither"], f"{path}: [dither]") if "dither" in table else None
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
     lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
-    parts = tuple(_compensator(n, table[n], f"{path}: [{n}]") for n in COMPENSATORS if n in table)
+    parts = list[Compensator]()
+    for section in (n for n in COMPENSATORS if n in table):
+        where = f"{path}: [{section}]"
+        kind: Callable[..., Compensator] = COMPENSATORS[section]
+        chosen = read_table(LOOP_KEYS[section], table[section], where, partial=True)
+        parts.append(construct_at(partial(kind, **chosen), where))
     outer = PositionLoop() if PositionLoop.section in table else None
     schedule = _schedule(table["schedule"], plant, f"{path}: [schedule]") if "schedule" in table else None
-    loop = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
-    return construct_at(lambda: loop(feedforward=lead, compensators=parts, outer=outer), str(path))
+    made = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor, schedule=schedule)
+    loop = construct_at(lambda: made(feedforward=lead, compensators=tuple(parts), outer=outer), str(path))
+    return loop, _parameters(table, loop, path, centre)
 
 
 def _pid(table: Mapping[str, Any], where: str) -> PID:
     keys = {n: key for n, key in LOOP_KEYS["pid"].items() if n != "limits"}  # their unit is the loop's
     read = read_table(keys, table, where, partial=True)
-    _check_gains(table, read["form"], where)
-    banded, resets = "dead_band" in table, "reset_ratio" in table
-    told = "reset_band is that of resets; write reset_ratio, too, 1 for the whole integral"
-    require(resets or "reset_band" not in table, f"{where} {told}")
-    unwinds = read["anti_windup"]
-    told = "Tt is back-calculation's; clamping has none; leave it out"
-    require("Tt" not in table or unwinds is AntiWindup.BACK_CALCULATION, f"{where} {told}")
-    made = partial(PID, read["sample_time"], "limits" in table, read["form"], read["delay"], banded, unwinds, resets)
-    return construct_at(made, where)
-
-
-def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
+    form: Form = read["form"]
     own, first = (*form.gains, *_SHARED_PID_KEYS), form.gains[0]
     for key in table:
         meant = _GAIN_CORRECTIONS[form].get(key)
@@ -700,6 +617,14 @@ def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
         require(meant is None, f"{where} {message}")
     require(first in table, f"{where} has no gain; write at least {first}")
     require("Tt" not in table or "limits" in table, f"{where} Tt unwinds the integral at limits; write limits, too")
+    banded, resets = "dead_band" in table, "reset_ratio" in table
+    told = "reset_band is that of resets; write reset_ratio, too, 1 for the whole integral"
+    require(resets or "reset_band" not in table, f"{where} {told}")
+    unwinds = read["anti_windup"]
+    told = "Tt is back-calculation's; clamping has none; leave it out"
+    require("Tt" not in table or unwinds is AntiWindup.BACK_CALCULATION, f"{where} {told}")
+    made = partial(PID, read["sample_time"], "limits" in table, form, read["delay"], banded, unwinds, resets)
+    return construct_at(made, where)
 
 
 def _dither(table: Mapping[str, Any], where: str) -> Dither:
@@ -744,17 +669,15 @@ def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedu
     return construct_at(lambda: GainSchedule(gains, low, high, load, axis.position), where)
 
 
-def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensator:
-    """A compensator, whose fields are choices of an enum."""
-    chosen = read_table(LOOP_KEYS[section], table, where, partial=True)
-    return construct_at(lambda: COMPENSATORS[section](**chosen), where)
-
-
 def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centre: float) -> ParameterSet:
     own = loop.controller.parameters
     read = _read_limits(table["pid"], own, centre, f"{path}: [pid] limits")
     for section in TUNABLE_SECTIONS:
-        read |= _section_parameters(table.get(section, {}), section, own, f"{path}: [{section}]")
+        entries, where, first = table.get(section, {}), f"{path}: [{section}]", len(section) + 1
+        keys = [n[first:] for n in own if n.startswith(f"{section}.") and n[first:] not in _LIMITS]
+        check_names("key", entries, (*LOOP_KEYS[section], *keys), where)
+        names = {k: f"{section}.{k}" for k in keys if k in entries}
+        read |= {name: read_parameter(entries[k], own[name], f"{where} {k}") for k, name in names.items()}
     read = _fault_values(read, loop, centre, f"{path}: [pid]")
     for name in (n for n, p in read.items() if p.free):
         section, _, key = name.partition(".")
@@ -776,16 +699,6 @@ def _fault_values(read: dict[str, Parameter], loop: ClosedLoop, centre: float, w
     require(whole, f"{where} fault_samples is a whole number of samples, 1 at least; the default is {FAULT_SAMPLES:g}")
     safe = read.get("pid.fault_output")
     return read | ({"pid.fault_output": replace(safe, value=safe.value - centre)} if safe else {})
-
-
-def _section_parameters(
-    entries: Mapping[str, Any], section: str, own: ParameterSet, where: str
-) -> dict[str, Parameter]:
-    keys = [n.removeprefix(f"{section}.") for n in own if n.startswith(f"{section}.")]
-    keys = [k for k in keys if k not in ("lower", "upper")]
-    check_names("key", entries, (*LOOP_KEYS[section], *keys), where)
-    names = {k: f"{section}.{k}" for k in keys if k in entries}
-    return {name: read_parameter(entries[k], own[name], f"{where} {k}") for k, name in names.items()}
 
 
 def _read_limits(entries: Mapping[str, Any], own: ParameterSet, centre: float, where: str) -> dict[str, Parameter]:

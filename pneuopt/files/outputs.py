@@ -53,25 +53,13 @@ class Holds(Enum):
 
 @dataclass(frozen=True)
 class Member:
-    """A member of an output.
-
-    Attributes
-    ----------
-    meaning : str
-    holds : Holds
-    members : mapping of str to Member
-        Of a record, or of each row of a table.
-    is_open : bool
-        Whether a row has further columns, which are named after metrics, parameters or references.
-    is_optional : bool
-        Whether it is there only where there is something to say.
-    """
+    """A member of an output."""
 
     meaning: str
     holds: Holds = Holds.NUMBER
-    members: Mapping[str, "Member"] = field(default_factory=dict)
-    is_open: bool = False
-    is_optional: bool = False
+    members: Mapping[str, "Member"] = field(default_factory=dict)  # of a record, or of each row of a table
+    is_open: bool = False  # whether a row has further columns, which are named after metrics, parameters or references
+    is_optional: bool = False  # whether it is there only where there is something to say
 
 
 def output_schema() -> dict[str, Any]:
@@ -101,14 +89,12 @@ def describe_member(member: Member) -> str:
     return f"{member.meaning}{': ' if own else ''}{own}{further}{optional}"
 
 
-def _schema(member: Member) -> dict[str, Any]:
-    return {"description": member.meaning, **_SCHEMAS[member.holds](member)}
-
-
 def _record(member: Member) -> dict[str, Any]:
     return {
         "type": "object",
-        "properties": {name: _schema(own) for name, own in member.members.items()},
+        "properties": {
+            name: {"description": own.meaning, **_SCHEMAS[own.holds](own)} for name, own in member.members.items()
+        },
         "required": [name for name, own in member.members.items() if not own.is_optional],
         "additionalProperties": _ANY if member.is_open else False,
     }
@@ -166,22 +152,7 @@ _HOLDS: Mapping[Any, Holds] = {
 
 
 def members_of(kind: type, only: Sequence[str] = (), *, are_optional: bool = False) -> dict[str, Member]:
-    """The members that a result's type declares, by the annotations of its fields and their lines in its docstring.
-
-    Parameters
-    ----------
-    kind : type
-        A dataclass, or a TypedDict that declares the rows of a table.
-    only : sequence of str
-        Names of fields and properties, where not every field is written, in the order in which they are.
-    are_optional : bool
-        Whether the whole record may be empty.
-
-    Raises
-    ------
-    TypeError
-        If a field is of a type that no output holds.
-    """
+    """The members that a dataclass or TypedDict declares: `only` these fields and properties, in this order."""
     meanings = argument_meanings(kind)
     names = only or tuple(kind.__annotations__)
     return {n: _member_of(kind, n, meanings.get(n, ""), are_optional) for n in names}

@@ -59,57 +59,31 @@ RIG_KEYS: Mapping[str, Key] = {
 
 
 def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
-    """Read the rig around a loop; its dry friction sticks and slips, its sensors stand in for the loop's own.
-
-    Parameters
-    ----------
-    path : str or Path
-        A rig.toml.
-    drive : Drive
-    loop : ClosedLoop
-        Of that drive. Where the file has no sensors, the loop's own is taken.
-
-    Returns
-    -------
-    Rig
-
-    Raises
-    ------
-    InputError
-        Or its kind; the message names file, section and key.
-    """
+    """Read the rig around a loop; its dry friction sticks and slips, its sensors stand in for the loop's own."""
     sections = read_toml(path).unwrap()
     check_sections(RIG_KEYS, sections, path)
     own = construct_at(lambda: replace(loop, plant=stick_slip_drive(drive).system(), sensor=None), str(path))
     actuator = _read_numbers(
         sections.get("actuator", {}), RIG_KEYS["actuator"], Actuator(), loop.command.unit, f"{path}: [actuator]"
     )
-    encoder = _read_encoder(sections.get("encoder", {}), loop, f"{path}: [encoder]")
-    sensors = _read_sensors(sections.get("sensors", {}), loop, f"{path}: [sensors") or _own_sensors(loop)
-    return construct_at(lambda: Rig(own, sensors, actuator, encoder), str(path))
-
-
-def _read_sensors(entries: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Sensor]:
-    units = {q.name: q.unit for q in loop.plant.outputs}
-    check_names("output", entries, units, f"{where}]")
+    units, usual = {q.name: q.unit for q in loop.plant.outputs}, Encoder()
+    entries = sections.get("sensors", {})
+    check_names("output", entries, units, f"{path}: [sensors]")
     for name, entry in entries.items():
-        require(isinstance(entry, dict), f"{where}] must hold sections, [sensors.{name}]")
-    return {n: _read_numbers(entry, _SENSOR, Sensor(), units[n], f"{where}.{n}]") for n, entry in entries.items()}
-
-
-def _read_encoder(entries: Mapping[str, Any], loop: ClosedLoop, where: str) -> Encoder:
-    axis = loop.plant.axis
-    usual = loop.sensor if isinstance(loop.sensor, Encoder) else Encoder()
-    usual = replace(usual, position=axis.position) if axis is not None else usual
-    unit = {q.name: q.unit for q in loop.plant.outputs}.get(usual.position, "m")
-    return _read_numbers(entries, RIG_KEYS["encoder"], usual, unit, where)
-
-
-def _own_sensors(loop: ClosedLoop) -> dict[str, Sensor]:
-    """The sensor of the loop as the rig's."""
+        require(isinstance(entry, dict), f"{path}: [sensors] must hold sections, [sensors.{name}]")
+    sensors = {
+        n: _read_numbers(entry, _SENSOR, Sensor(), units[n], f"{path}: [sensors.{n}]") for n, entry in entries.items()
+    }
     if isinstance(loop.sensor, Encoder):
-        return {loop.sensor.position: Sensor()}
-    return {loop.feedback.name: Sensor(lag=loop.sensor.lag if isinstance(loop.sensor, SensorLag) else 0.0)}
+        usual, sensors = loop.sensor, sensors or {loop.sensor.position: Sensor()}
+    elif isinstance(loop.sensor, SensorLag):
+        sensors = sensors or {loop.feedback.name: Sensor(lag=loop.sensor.lag)}
+    if loop.plant.axis is not None:
+        usual = replace(usual, position=loop.plant.axis.position)
+    unit, where = units.get(usual.position, "m"), f"{path}: [encoder]"
+    encoder = _read_numbers(sections.get("encoder", {}), RIG_KEYS["encoder"], usual, unit, where)
+    sensors = sensors or {loop.feedback.name: Sensor()}
+    return construct_at(lambda: Rig(own, sensors, actuator, encoder), str(path))
 
 
 def _read_numbers(entries: Mapping[str, Any], section: Key, usual: Part, unit: str, where: str) -> Part:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.evaluation.plants import monte_carlo
 from pneuopt.evaluation.scenarios import SampleSpreads, corners
-from pneuopt.files.drive import ambient_pressure, read_fit
+from pneuopt.files.drive import StoredFit, ambient_pressure
 from pneuopt.files.loop import (
     CORNERS_KEY,
     SAMPLE_KEYS,
@@ -21,7 +21,7 @@ from pneuopt.files.loop import (
     read_sample_spreads,
     read_spreads,
 )
-from pneuopt.files.tolerances import DEFAULT_POINTS, MAX_CASES
+from pneuopt.files.tolerances import MAX_CASES
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, check_sections, flag, read_table, table
@@ -65,46 +65,18 @@ SENSITIVITY_KEY = table(
 
 @dataclass(frozen=True)
 class CaseSource:
-    """What the reader of a section needs beside it.
+    """What the reader of a section needs beside it."""
 
-    Attributes
-    ----------
-    where : str
-        What messages begin with.
-    folder : Path
-        To which files are relative.
-    drive : Path
-    parameters : ParameterSet
-        The nominal values.
-    """
-
-    where: str
-    folder: Path
-    drive: Path
-    parameters: ParameterSet
+    where: str  # what messages begin with
+    folder: Path  # to which files are relative
+    fit: StoredFit
+    parameters: ParameterSet  # the nominal values
 
 
-def read_study_cases(study: "Study", parameters: ParameterSet) -> Cases:
-    """Read the cases that a study's file asks for in place of a grid.
-
-    Parameters
-    ----------
-    study : Study
-        With `cases`.
-    parameters : ParameterSet
-        The nominal values.
-
-    Returns
-    -------
-    dict of str to dict of str to float
-
-    Raises
-    ------
-    InputError
-        The message names file, section and key.
-    """
+def read_study_cases(study: "Study", fit: StoredFit, parameters: ParameterSet) -> Cases:
+    """Read the cases that a study's file asks for in place of a grid, of the drive in `fit`."""
     ((kind, given),) = study.cases.items()
-    source = CaseSource(f"{study.path}: [{kind}]", study.path.parent, study.drive, parameters)
+    source = CaseSource(f"{study.path}: [{kind}]", study.path.parent, fit, parameters)
     try:
         cases = _READERS[kind](given, source)
     except InputError as error:
@@ -115,42 +87,16 @@ def read_study_cases(study: "Study", parameters: ParameterSet) -> Cases:
 
 @dataclass(frozen=True)
 class SensitivityTask:
-    """What a [sensitivity] asks for.
+    """What a [sensitivity] asks for."""
 
-    Attributes
-    ----------
-    spreads : mapping
-        As for `samples`.
-    count, seed : int
-    local : bool
-        Whether derivatives at the design are asked for, too.
-    """
-
-    spreads: SampleSpreads
+    spreads: SampleSpreads  # as for `samples`
     count: int
     seed: int
-    local: bool
+    local: bool  # whether derivatives at the design are asked for, too
 
 
 def read_sensitivity(study: "Study", parameters: ParameterSet) -> SensitivityTask:
-    """Read the [sensitivity] of a study.
-
-    Parameters
-    ----------
-    study : Study
-        With `sensitivity`.
-    parameters : ParameterSet
-        The nominal values.
-
-    Returns
-    -------
-    SensitivityTask
-
-    Raises
-    ------
-    InputError
-        The message names file, section and key.
-    """
+    """Read the [sensitivity] of a study."""
     entries, where = dict(study.sensitivity or {}), f"{study.path}: [sensitivity]"
     read = read_table(SENSITIVITY_KEY.keys, entries, where, partial=True)
     count, entries = read["count"], {n: entry for n, entry in entries.items() if n not in read}
@@ -166,15 +112,14 @@ def read_sensitivity(study: "Study", parameters: ParameterSet) -> SensitivityTas
 def _read_samples(given: Mapping[str, Any], source: CaseSource) -> Cases:
     where, draw = source.where, read_table(CASE_KEYS["samples"].keys, given, source.where, partial=True)
     entries, from_fit = {n: entry for n, entry in given.items() if n not in draw}, draw["fit"]
-    fit = read_fit(source.drive) if from_fit else None
-    covariance = None if fit is None else fit.covariance
-    needed = f"{where} fit = true needs a fit.toml, which identify writes; {source.drive} has no estimates"
+    covariance = source.fit.covariance if from_fit else None
+    needed = f"{where} fit = true needs a fit.toml, which identify writes; {source.fit.path} has no estimates"
     require(not from_fit or covariance is not None, needed)
     return monte_carlo(
         source.parameters,
         draw["count"],
         covariance=covariance,
-        estimates=None if fit is None else fit.estimates,
+        estimates=source.fit.estimates if from_fit else None,
         spreads=read_sample_spreads(entries, where, source.parameters),
         seed=draw["seed"],
         sampling=draw["sampling"],
@@ -252,7 +197,7 @@ STUDY_KEYS: Mapping[str, Key] = {
                 of=Key("a requirement", Takes.TEXT),
                 counts=(2, 2),
             ),
-            "points": Key("designs of the front", Takes.COUNT, usual=DEFAULT_POINTS, least=2, most=MAX_CASES),
+            "points": Key("designs of the front", Takes.COUNT, usual=9, least=2, most=MAX_CASES),
             "lower": Key("where the second ends; by default the least that can be", unit="{own}", example='"100 N"'),
             "upper": Key("where it begins; by default the tuning's limit", unit="{own}", example='"250 N"'),
         },
@@ -263,64 +208,34 @@ STUDY_KEYS: Mapping[str, Key] = {
 
 @dataclass(frozen=True)
 class Study:
-    """What a study.toml says.
-
-    Attributes
-    ----------
-    path, drive, tuning : Path
-        The file itself, and those that it names, which are relative to its folder.
-    axes : mapping of str to list, or to mapping with from, to and steps
-        As written; `read_axes` reads them.
-    band : float or None
-        Half width of the settling band, a fraction of the step; None: as the tuning says.
-    show : tuple of str
-        The metrics on screen and in the figure.
-    cases : mapping of str to mapping
-        In place of axes, the section that says which cases there are, by its name: as written; `read_study_cases`
-        reads it.
-    pareto : mapping of str to object, optional
-        A front is asked for in place of a grid: as written; `read_pareto` reads it.
-    tune : bool
-        Whether each cell of the grid is tuned, from the gains of its neighbours, and not only certified.
-    batch : bool
-        Whether the cases run many at once in SIMD lanes (`evaluate_batch`), and only the worst and a share are
-        certified.
-    sensitivity : mapping of str to object, optional
-        It is asked which tolerances matter: as written; `read_sensitivity` reads it.
-    """
+    """What a study.toml says."""
 
     path: Path
-    drive: Path
+    drive: Path  # relative to the file's folder, as is the tuning
     tuning: Path
-    axes: Mapping[str, Any]
-    band: float | None
-    show: tuple[str, ...]
+    axes: Mapping[str, Any]  # as written; `read_axes` reads them
+    band: float | None  # half width of the settling band, a fraction of the step; None: as the tuning says
+    show: tuple[str, ...]  # the metrics on screen and in the figure
+    # a front is asked for in place of a grid: as written; `read_pareto` reads it
     pareto: Mapping[str, Any] | None = None
+    # whether each cell of the grid is tuned, from the gains of its neighbours, and not only certified
     tune: bool = False
+    # in place of axes, the section that says which cases there are, as written; `read_study_cases` reads it
     cases: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    # whether the cases run many at once in SIMD lanes (`evaluate_batch`), and only the worst and a share are certified
     batch: bool = False
+    # it is asked which tolerances matter: as written; `read_sensitivity` reads it
     sensitivity: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
 class SweptAxis:
-    """A parameter and its values.
-
-    Attributes
-    ----------
-    name : str
-    points : tuple of float
-        Its values [SI]
-    unit : str
-        In which the first one is written.
-    factor, offset : float
-        ``SI = factor * number + offset``.
-    """
+    """A parameter and its values."""
 
     name: str
-    points: tuple[float, ...]
-    unit: str
-    factor: float
+    points: tuple[float, ...]  # its values [SI]
+    unit: str  # in which the first one is written
+    factor: float  # ``SI = factor * number + offset``
     offset: float
 
     def in_axis_unit(self, values: ArrayLike) -> NDArray[np.float64]:
@@ -330,39 +245,17 @@ class SweptAxis:
 
 @dataclass(frozen=True)
 class Pareto:
-    """A front between two requirements.
+    """A front between two requirements."""
 
-    Attributes
-    ----------
-    between : tuple of str
-        Their keys, as in a tuning.toml; the second is limited step by step.
-    points : int
-    lower, upper : float or None
-        From where to where the second one goes, in the SI unit of its bound; None: as the tuning and the drive allow.
-    """
-
-    between: tuple[str, str]
+    between: tuple[str, str]  # their keys, as in a tuning.toml; the second is limited step by step
     points: int
+    # from where to where the second one goes, in the SI unit of its bound; None: as the tuning and the drive allow
     lower: float | None
     upper: float | None
 
 
 def read_study(path: str | Path) -> Study:
-    """Read a study; the files that it names are not opened.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Study
-
-    Raises
-    ------
-    InputError
-        UnitError, UnknownNameError or other; the message names file, section and key.
-    """
+    """Read a study; the files that it names are not opened."""
     path, sections = Path(path), read_toml(path).unwrap()
     check_sections(STUDY_KEYS, sections, path)
     metrics, given = (
@@ -403,22 +296,7 @@ def read_study(path: str | Path) -> Study:
 
 
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
-    """Read a study's axes in the units of the parameters.
-
-    Parameters
-    ----------
-    study : Study
-    parameters : ParameterSet
-
-    Returns
-    -------
-    tuple of SweptAxis
-
-    Raises
-    ------
-    InputError
-        If a parameter is unknown, or a value cannot be read.
-    """
+    """Read a study's axes in the units of the parameters."""
     check_names("parameter", study.axes, parameters, f"{study.path}: [axes]")
     with count_gauge_from(ambient_pressure(parameters)):
         axes = tuple(
@@ -442,24 +320,7 @@ def swept_axes(parameters: ParameterSet, cases: Mapping[str, Mapping[str, float]
 
 
 def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
-    """Read the front that a study asks for.
-
-    Parameters
-    ----------
-    study : Study
-        With `pareto`.
-    units : mapping of str to str
-        Of `bound_units`.
-
-    Returns
-    -------
-    Pareto
-
-    Raises
-    ------
-    InputError
-        If a requirement is unknown or there twice, or a value cannot be read.
-    """
+    """Read the front that a study asks for."""
     given, where = study.pareto or {}, f"{study.path}: [pareto]"
     plain = {n: key for n, key in STUDY_KEYS["pareto"].keys.items() if n not in ("lower", "upper")}
     read = read_table(plain, given, where, partial=True)
@@ -490,12 +351,8 @@ def _read_axis(name: str, entry: Any, unit: str, where: str) -> SweptAxis:
     if isinstance(entry, list):
         first, values = entry[0], [read_value(e, unit, where=where) for e in entry]
     else:
-        first, values = entry.get("from"), _read_range(entry, unit, where)
+        said = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
+        first, values = entry.get("from"), [float(v) for v in np.linspace(said["from"], said["to"], said["steps"])]
     written = read_unit(first, unit)
     factor, offset = si_conversion(written, unit, where=where)
     return SweptAxis(name, tuple(values), written, factor, offset)
-
-
-def _read_range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
-    said = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
-    return [float(v) for v in np.linspace(said["from"], said["to"], said["steps"])]

@@ -13,6 +13,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Table
 
+from pneuopt.files.tolerances import FILE_DIGITS
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import PARAMETER_KEYS, Takes
 from pneuopt.quantities.output import MAX_REASON, plain_value, read_toml_source
@@ -28,21 +29,7 @@ _KEY_LINE = re.compile(r"\s*([\w\"'. -]+?)\s*=")
 
 
 def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
-    """Read a TOML file with its comments.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    TOMLDocument
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is not TOML; the message names the line.
-    """
+    """Read a TOML file with its comments."""
     raw = read_toml_source(path)
     try:
         return tomlkit.parse(raw.decode("utf-8-sig"))
@@ -54,17 +41,10 @@ def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
 
 @dataclass(frozen=True)
 class FileLocations:
-    """The lines of sections and keys in a TOML file, for messages; as text it is the file's name.
-
-    Parameters
-    ----------
-    path : str or Path
-    text : str
-        What the file holds.
-    """
+    """The lines of sections and keys in a TOML file, for messages; as text it is the file's name."""
 
     path: str | Path
-    text: str
+    text: str  # what the file holds
 
     def __str__(self) -> str:
         return str(self.path)
@@ -89,25 +69,7 @@ class FileLocations:
 
 
 def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
-    """Read a value, or a table with bounds and flags; what it leaves out is as in `default`.
-
-    Parameters
-    ----------
-    entry : str, float or mapping
-    default : Parameter
-        Its unit counts.
-    where : str
-        What the message of an error begins with: file, section, key.
-
-    Returns
-    -------
-    Parameter
-
-    Raises
-    ------
-    InputError
-        If a value cannot be read, a key is unknown, or the value lies outside its bounds.
-    """
+    """Read a value, or a table with bounds and flags, in the unit of `default`, which says what it leaves out."""
     fields = entry if isinstance(entry, dict) else {"value": entry}
     check_names("key", fields, PARAMETER_KEYS, where)
     numbers: dict[str, Any] = {
@@ -125,16 +87,7 @@ def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
 
 
 def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter, given: Parameter) -> None:
-    """Put what differs from `given` in its place; a table only where the user chose one or more than a value differs.
-
-    Parameters
-    ----------
-    document : TOMLDocument
-        Changed in place.
-    name : str
-        "section.key".
-    found, given : Parameter
-    """
+    """Write what differs from `given`, as a table only where the user chose one or more than the value differs."""
     section, _, key = name.partition(".")
     if section not in document:
         document[section] = tomlkit.table()
@@ -184,7 +137,7 @@ def _field_differs(field: str, found: Parameter, given: Parameter) -> bool:
 
 
 def _format_value(value: float, parameter: Parameter) -> str:
-    """Round to nine digits, unless the rounded value would cross a bound."""
-    text = write_value(value, parameter.unit, 9)
+    """Round to `FILE_DIGITS`, unless the rounded value would cross a bound."""
+    text = write_value(value, parameter.unit, FILE_DIGITS)
     inside = parameter.lower <= read_value(text, parameter.unit) <= parameter.upper
     return text if inside else write_value(value, parameter.unit, 17)

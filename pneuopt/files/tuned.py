@@ -13,7 +13,7 @@ from pneuopt.evaluation.response import cases
 from pneuopt.files.certificate import CHECKSUM, checksum_section
 from pneuopt.files.drive import StoredFit, read_fit
 from pneuopt.files.loop import TUNABLE_SECTIONS
-from pneuopt.files.tolerances import SAME_GAINS
+from pneuopt.files.tolerances import FILE_DIGITS
 from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.files.tuning import TUNED_SECTIONS, move_paths, read_tuning_table
 from pneuopt.quantities.errors import InputError, require
@@ -62,7 +62,12 @@ def write_tuned(
     for name in TUNED_SECTIONS:
         document.pop(name, None)
     move_paths(document.get("reference", []), Path(source).parent, Path(path).parent)
-    _write_gains(document, gains, source)
+    for section in TUNABLE_SECTIONS:
+        for key, entry in document.unwrap().get(section, {}).items():
+            if isinstance(entry, dict) and entry.get("free", False):
+                found = gains[f"{section}.{key}"]
+                given = read_parameter(entry, replace(found, free=True), f"{source}: [{section}] {key}")
+                write_parameter(document, f"{section}.{key}", replace(given, value=found.value), given)  # in its unit
     status: dict[str, Any] = {"code": result.status.code.value, "message": result.status.message}
     if result.status.converged:
         rows = result.certified.to_dict(orient="dict")
@@ -80,16 +85,6 @@ def write_tuned(
     write_text(path, tomlkit.dumps(document))
 
 
-def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:
-    """Write the tuned values of the free parameters into a document, in the units that the user gave them in."""
-    for section in TUNABLE_SECTIONS:
-        for key, entry in document.unwrap().get(section, {}).items():
-            if isinstance(entry, dict) and entry.get("free", False):
-                found = tuned[f"{section}.{key}"]
-                given = read_parameter(entry, replace(found, free=True), f"{source}: [{section}] {key}")
-                write_parameter(document, f"{section}.{key}", replace(given, value=found.value), given)
-
-
 def _check_subject(
     table: Mapping[str, Any], path: str | Path, fit: StoredFit, result: "TuningResult", gains: ParameterSet
 ) -> None:
@@ -98,7 +93,7 @@ def _check_subject(
     task = read_tuning_table(table, path, fit.drive.system(), plant)
     known = plant | task.parameters
     for n, p in known.items():
-        same = n not in gains or isclose(gains.value(n), p.value, rel_tol=SAME_GAINS)
+        same = n not in gains or isclose(gains.value(n), p.value, rel_tol=10.0 ** (1 - FILE_DIGITS))
         values = f"{write_value(p.value, p.unit)}, the result was made with {write_value(gains[n].value, p.unit)}"
         require(same, f"{path}: {n} is {values}" if n in task.parameters else f"{fit.path}: {n} is {values}")
     labels = [case.label for case in cases(task.references, task.scenarios(known), known)]

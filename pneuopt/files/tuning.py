@@ -16,7 +16,7 @@ from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.rest_check import NoHunting
-from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, further, samples, tolerances
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios, corners, further, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.evaluation.tolerances import PLANT_COUNT
 from pneuopt.files.loop import (
@@ -55,40 +55,22 @@ TUNED_SECTIONS = ("certified", "wire", "status", "provenance", "checksum")
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """A tuning.toml as read: the loop, its references and parameters, what is asked of it, and how it is tuned.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-    references : tuple of Reference
-    parameters : ParameterSet
-        "pid.*", "dither.*", "sensor.*", "feedforward.*", the compensators'; the free ones within finite bounds.
-    specification : Specification
-        Objective and limits, checked; without terms of an objective where the file only describes a loop.
-    scenarios : callable
-        It maps the nominal parameters to the plants and tolerances beside them.
-    validation_scenarios : callable
-        It maps them to other plants and tolerances from the same boxes, on which a design is validated.
-    method : Method, optional
-        None: the first that suits the loop.
-    max_steps : float
-        Steps of the simulations that are refused as too many.
-    accept : tuple of Defect
-        Defects with which a design is certified all the same.
-    centre : float
-        What is on the wire to the valve while the loop's command is zero [the command's unit].
-    """
+    """A tuning.toml as read: the loop, its references and parameters, what is asked of it, and how it is tuned."""
 
     loop: ClosedLoop
     references: tuple[Reference, ...]
+    # "pid.*", "dither.*", "sensor.*", "feedforward.*", the compensators'; the free ones within finite bounds
     parameters: ParameterSet
+    # objective and limits, checked; without terms of an objective where the file only describes a loop
     specification: Specification
+    # it maps the nominal parameters to the plants and tolerances beside them
     scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
+    # it maps them to other plants and tolerances from the same boxes, on which a design is validated
     validation_scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
-    method: Method | None = None
-    max_steps: float = MAX_STEPS
-    accept: tuple[Defect, ...] = ()
-    centre: float = 0.0
+    method: Method | None = None  # None: the first that suits the loop
+    max_steps: float = MAX_STEPS  # steps of the simulations that are refused as too many
+    accept: tuple[Defect, ...] = ()  # defects with which a design is certified all the same
+    centre: float = 0.0  # what is on the wire to the valve while the loop's command is zero [the command's unit]
 
     @property
     def wire(self) -> dict[str, str]:
@@ -139,37 +121,17 @@ def read_tuning_table(
 
 
 def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
-    """Read [scenarios]: corners and samples of the plant, and tolerances of the gains, in one mapping.
-
-    Parameters
-    ----------
-    table : mapping
-        The section, by kind: names or patterns to "30 %", or to ["3 kg", "7 kg"]; under samples also count, and seed.
-    where : str
-        The file.
-    parameters : ParameterSet
-        The nominal values.
-
-    Returns
-    -------
-    mapping of str to mapping
-
-    Raises
-    ------
-    InputError
-        The message names file, section and key.
-    """
+    """Read [scenarios]: corners and samples of the plant, and tolerances of the gains, in one mapping."""
     return {name: values for part in _read_kinds(table, where, parameters, None) for name, values in part.items()}
 
 
 def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
     """Draw plants from the boxes of [scenarios], others than `read_scenarios` gives, each with all that it varies."""
     kinds = [list(part.values()) for part in _read_kinds(table, where, parameters, PLANT_COUNT)]
-    return {f"new {k}": _merge_scenarios(own) for k, own in enumerate(zip(*kinds, strict=True), 1)}
-
-
-def _merge_scenarios(parts: Sequence[Mapping[str, float | Factor]]) -> dict[str, float | Factor]:
-    return {n: value for part in parts for n, value in part.items()}
+    return {
+        f"new {k}": {n: value for part in own for n, value in part.items()}
+        for k, own in enumerate(zip(*kinds, strict=True), 1)
+    }
 
 
 def _read_objective(table: TuningSections, loop: ClosedLoop, path: str | Path) -> dict[Requirement, float]:
@@ -245,13 +207,7 @@ def _read_kind(
 
 
 def read_references(entries: Any, loop: ClosedLoop, path: str | Path) -> tuple[Reference, ...]:
-    """Read the [[reference]] sections, in the units of the loop's signals.
-
-    Raises
-    ------
-    InputError
-        Or its kind; the message names file, section and key.
-    """
+    """Read the [[reference]] sections, in the units of the loop's signals."""
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
     require(several, f"{path}: write each reference as a section of its own, [[reference]]")
     require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
@@ -277,15 +233,7 @@ _REFERENCE_KINDS: Mapping[str, _Kind] = {"step": _STEP, "move": _MOVE, "moves": 
 
 
 def move_paths(entries: Any, old: Path, new: Path) -> None:
-    """Rewrite the tables that [[reference]] sections name, beside a file in one folder, for a file in another.
-
-    Parameters
-    ----------
-    entries : list of dict
-        Of a TOML document, changed in place.
-    old, new : Path
-        The folders.
-    """
+    """Rewrite the tables that [[reference]] sections name, beside a file in one folder, for a file in another."""
     if old.resolve() == new.resolve():
         return
     for entry in entries:
@@ -311,7 +259,9 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: i
         require(key in kind.keys, message)
     for key in ("horizon",) if "disturbance" in entry and kind is _STEP else kind.needed:
         require(key in entry, f"{where} has no {key}")
-    known = _read_stated(kind.keys, entry, loop, where) | _circumstances(entry, loop, where)
+    known, outputs = _read_stated(kind.keys, entry, loop, where), {q.name: q.unit for q in loop.plant.outputs}
+    known["start"] = read_named(REFERENCE_KEYS["start"], entry.get("start", {}), outputs, f"{where} start")
+    known["disturbance"] = _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")
     if kind is _PATH:
         table = file.parent / known.pop("path")
         known = {"dwell": Move.dwell, **known}
@@ -343,13 +293,6 @@ def _chain_moves(each: Sequence[Mapping[str, Any]], settings: Mapping[str, Any])
     last = {"disturbance": settings.get("disturbance", {})}
     moves = [Move(**{**shared, **own, **(last if k == len(others) else {})}) for k, own in enumerate(others, 1)]
     return MoveSequence([Move(**{**begins, **shared, **first}), *moves])
-
-
-def _circumstances(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Any]:
-    """Read how the plant starts, and its disturbance."""
-    outputs = {q.name: q.unit for q in loop.plant.outputs}
-    begun = read_named(REFERENCE_KEYS["start"], entry.get("start", {}), outputs, f"{where} start")
-    return {"start": begun, "disturbance": _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")}
 
 
 def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
@@ -395,15 +338,7 @@ def read_path(path: str | Path, *, channel: str | None = None, **settings: Any) 
 
 
 def read_path_of(measured: str, path: str | Path, **settings: Any) -> MotionPath:
-    """The path that a loop shall follow, from the column of its measured signal's reference, or of the signal itself.
-
-    Parameters
-    ----------
-    measured : str
-        The loop's measured signal.
-    path, **settings
-        As for `read_path`.
-    """
+    """The path that a loop shall follow: the column of its measured signal's reference, or of the signal itself."""
     return _make_path(path, read_log(path).trajectory, (f"{measured}_reference", measured), settings)
 
 

@@ -26,8 +26,7 @@ from pneuopt.quantities.report import Line, Report, Table, Tone, number_columns,
 from pneuopt.quantities.status import report_status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
-from pneuopt.report.page import Page, Picture, Section, data_section, provenance_section
-from pneuopt.report.tolerances import MIN_CORRELATED
+from pneuopt.report.page import Page, Picture, Section, data_section, log_hashes, provenance_section
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,20 +34,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Source:
-    """What a page says beside its result.
-
-    Attributes
-    ----------
-    title : str
-    hashes : mapping of str to str
-        Of the files that the provenance does not name, "sha256[drive.toml]".
-    warnings : tuple of str
-        What was said before or beside the result.
-    """
+    """What a page says beside its result."""
 
     title: str
+    # of the files that the provenance does not name, "sha256[drive.toml]"
     hashes: Mapping[str, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # what was said before or beside the result
 
 
 def fit_page(
@@ -61,39 +52,27 @@ def fit_page(
     findings: Sequence[LogFinding] = (),
     trial: Report | None = None,
 ) -> Page:
-    """The page of a fit.
-
-    Parameters
-    ----------
-    source : Source
-    result : IdentificationResult
-    experiments : sequence of Experiment
-        Those that it was made from; figures are drawn where they are given.
-    model : drive, System or ClosedLoop, optional
-        For the friction map and held-out logs.
-    held_out : sequence of Experiment
-        Logs that the fit has not seen, to be predicted; needs the model.
-    findings : sequence of LogFinding
-        What the log doctor found.
-    trial : Report, optional
-        What became of it when logs were simulated with it and fitted again.
-    """
+    """The page of a fit: its logs are drawn, `held_out` ones predicted by the model; `trial` is of simulated logs."""
     system = None if model is None else as_runnable(model)
     marks = result.estimates["mark"]
     biased = [str(n) for n, mark in marks.items() if mark == Mark.BIAS_POSSIBLE]
     doubts = [f"a model error may bias {join_names(biased)}: the intervals do not hold it"] if biased else []
     unknown = result.verdict.sentences if result.verdict else ()
+    runs = list(result.trajectories.values())
+    compared = (_comparison(runs, experiments, "fitted"),) if experiments and runs else ()
+    rows = result.fit.reset_index().to_dict(orient="records")
+    counted = {(str(row["log"]), str(row["channel"])): float(row["noise"]) for row in rows}
     sections = (
         _estimate_section(result),
-        _agreement_section(result, experiments),
+        Section("Agreement with the logs", (report_agreement(result.fit), *compared)),
         _held_out_section(result, system, held_out),
         _friction_section(result, system, experiments),
-        _residual_section(result, experiments),
+        Section("Residuals", (_residual_picture(runs, experiments),) if compared else ()),
         Section("Simulated and fitted again", () if trial is None else (trial,)),
         _finding_section(findings),
         _known_section(result),
-        data_section((*experiments, *held_out), noise=_counted_noise(result)),
-        provenance_section(result.provenance, {**source.hashes, **_hashes(held_out)}),
+        data_section((*experiments, *held_out), noise=counted),
+        provenance_section(result.provenance, {**source.hashes, **log_hashes(held_out)}),
     )
     warnings = tuple(dict.fromkeys((*unknown, *doubts, *source.warnings)))
     return Page(source.title, report_status(result.status), sections, warnings)
@@ -114,7 +93,7 @@ def refusal_page(
     sections = (
         Section("What shows it", tuple(pictures)),
         data_section(experiments),
-        provenance_section({}, {**_hashes(experiments), **source.hashes}),
+        provenance_section({}, {**log_hashes(experiments), **source.hashes}),
     )
     return Page(source.title, verdict, sections, source.warnings)
 
@@ -122,17 +101,7 @@ def refusal_page(
 def prediction_page(
     source: Source, table: "pd.DataFrame", runs: Sequence[Trajectory], experiments: Sequence[Experiment]
 ) -> Page:
-    """The page of logs that are predicted in open loop.
-
-    Parameters
-    ----------
-    source : Source
-    table : DataFrame
-        Of `validate`.
-    runs : sequence of Trajectory
-        The prediction of each log.
-    experiments : sequence of Experiment
-    """
+    """The page of logs that are predicted in open loop."""
     verdict = Line("the prediction diverges, or there is nothing to compare it with", Tone.BAD)
     if len(table) and table["nrmse"].notna().all():
         worst = table.reset_index().sort_values("nrmse").iloc[-1]
@@ -142,7 +111,7 @@ def prediction_page(
         Section("Agreement with the logs", (report_agreement(table), _comparison(runs, experiments, "predicted"))),
         Section("Residuals", (_residual_picture(runs, experiments),)),
         data_section(experiments),
-        provenance_section({}, {**_hashes(experiments), **source.hashes}),
+        provenance_section({}, {**log_hashes(experiments), **source.hashes}),
     )
     return Page(source.title, Report((verdict,)), sections, source.warnings)
 
@@ -153,7 +122,7 @@ def _estimate_section(result: IdentificationResult) -> Section:
     parts: list[Report | Picture] = [report_estimates(result.estimates, result.widths), Report(said)]
     if result.window is not None:
         parts.append(Report((Line(str(result.window)),)))
-    if int(result.estimates["stderr"].notna().sum()) >= MIN_CORRELATED:
+    if int(result.estimates["stderr"].notna().sum()) > 1:
         alt = "A cell for each pair of estimates with their correlation, from -1 to 1."
         caption = "Correlation of the estimates; near 1 or -1 the logs tell little more than a combination of two."
         parts.append(Picture(partial(plot_correlation, result), alt, caption))
@@ -168,12 +137,6 @@ def _known_section(result: IdentificationResult) -> Section:
     lead = Line("not estimated: as the files state them, or by default")
     heads = *text_columns("parameter"), *number_columns("value"), *text_columns("source")
     return Section("Known values", (Report((lead, Table(heads, rows))),) if rows else ())
-
-
-def _agreement_section(result: IdentificationResult, experiments: Sequence[Experiment]) -> Section:
-    runs = list(result.trajectories.values())
-    pictures = (_comparison(runs, experiments, "fitted"),) if experiments and runs else ()
-    return Section("Agreement with the logs", (report_agreement(result.fit), *pictures))
 
 
 def _held_out_section(
@@ -199,11 +162,6 @@ def _friction_section(
     alt = "Friction force over speed: points that the logs imply, the fitted curve through them and its 95 % band."
     caption = "Friction over speed: what the logs imply (points), the fitted curve and its 95 % band."
     return Section("Friction", (Picture(partial(plot_friction, system, result, experiments), alt, caption),))
-
-
-def _residual_section(result: IdentificationResult, experiments: Sequence[Experiment]) -> Section:
-    runs = list(result.trajectories.values())
-    return Section("Residuals", (_residual_picture(runs, experiments),) if experiments and runs else ())
 
 
 def _residual_picture(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Picture:
@@ -236,15 +194,6 @@ def _finding_section(findings: Sequence[LogFinding]) -> Section:
 def _finding_picture(finding: LogFinding) -> Picture:
     alt = f"The signals of {finding.log or 'the log'} that show it: {finding.message}"
     return Picture(partial(plot_finding, finding), alt, f"What shows it: {finding.message}.")
-
-
-def _counted_noise(result: IdentificationResult) -> dict[tuple[str, str], float]:
-    rows = result.fit.reset_index().to_dict(orient="records")
-    return {(str(row["log"]), str(row["channel"])): float(row["noise"]) for row in rows}
-
-
-def _hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
-    return {f"sha256[{e.name}]": e.sha256 for e in experiments}
 
 
 def _names(experiments: Sequence[Experiment]) -> str:

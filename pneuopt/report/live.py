@@ -1,6 +1,6 @@
-"""`live_script`: what moves in a page, a closed loop in JavaScript with sliders; a page is whole without it.
+"""`live_script`: a closed loop in JavaScript with sliders; a page is whole without it.
 
-`RestFinder`: what a page needs to find the rest, or steady motion, that a slider changes.
+`RestFinder` prepares how the script finds the rest, or steady motion, that a slider changes.
 """
 
 import json
@@ -29,9 +29,9 @@ from pneuopt.report.tolerances import (
     INCLINE,
     INDEPENDENT,
     LOG_RANGE,
-    RANGE,
     RESIDUAL,
     SHRINKAGES,
+    SLIDER_RANGE,
     UNCHANGED_LEAST,
     UNCHANGED_RATIO,
 )
@@ -45,18 +45,11 @@ class RestFinder:
     """The residuals of a loop that vanish where it rests, or moves steadily, before a reference.
 
     A page solves them by Newton's method; `is_singular` says when it could not.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-    reference : Step
-    parameters : ParameterSet
-        Every parameter of the loop, as designed.
     """
 
     loop: ClosedLoop
     reference: Step
-    parameters: ParameterSet
+    parameters: ParameterSet  # every parameter of the loop, as designed
 
     @cached_property
     def start(self) -> Array:
@@ -139,7 +132,7 @@ PLANT_SECTIONS = ("load", "supply", "friction")
 NOT_MOVED = ("pid.Tt", "pid.lower", "pid.upper", "pid.fault_samples", "pid.fault_output", "friction.smoothing")
 """Parameters without a slider: limits of hardware, what only a fault shows, and what makes a loop too stiff here."""
 RANGES = {"supply.pressure": 1.5}
-"""The same where hardware varies less: no shop's air has three times its pressure."""
+"""`SLIDER_RANGE` where hardware varies less: no shop's air has three times its pressure."""
 
 
 def live_script(
@@ -155,20 +148,6 @@ def live_script(
 
     Where a parameter moves the rest, or steady motion, at which a response begins (a load's force, a supply's
     pressure), the script finds it anew; it has no slider where the script could not.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : sequence of Reference
-        Steps that begin at rest or in steady motion are offered, with their disturbances.
-    parameters : ParameterSet
-        Every parameter of the loop.
-    band : float
-        Half width of the settling band, a fraction of the step.
-    limits : mapping of str to float, optional
-        Of `metric_limits`.
-    certified : DataFrame, optional
-        Metrics of the references, one a column, in their order; a limit is watched where the script agrees with them.
     """
     loop = add_disturbances(loop, references)
     steps = {k: r for k, r in enumerate(references) if isinstance(r, Step)}
@@ -274,7 +253,7 @@ def _ends(parameters: ParameterSet, name: str) -> tuple[float, float]:
     p = parameters[name]
     if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
         return p.lower, p.upper
-    ends = sorted((p.value / (ratio := RANGES.get(name, RANGE)), p.value * ratio))
+    ends = sorted((p.value / (ratio := RANGES.get(name, SLIDER_RANGE)), p.value * ratio))
     if name == "load.force" and "load.mass" in parameters:
         reach = INCLINE * GRAVITY * parameters.value("load.mass")
         ends = [p.value - reach, p.value + reach]

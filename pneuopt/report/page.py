@@ -1,16 +1,13 @@
-"""`Page`: what a page holds, and how it becomes HTML. The template beside this file says how it looks.
+"""`Page`: what a page holds and how it becomes HTML, by the template beside this file.
 
-What pages say of their data: the logs with their channels, the hashes of what was read, the versions.
-
-`report_forms`: a controller's gains in every form that controllers take, and its settings that are not tuned.
-
-Responses of a closed loop, and the figures that show it: steps before and after, the Bode plot, the diagram.
+Below it what pages share: their data and provenance, a controller's gains in every form, and the figures of a loop.
 """
 
 import base64
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
@@ -46,7 +43,6 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import unit_ratio, write_value
-from pneuopt.report.tolerances import GAIN_DIGITS
 
 if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure
@@ -57,32 +53,17 @@ _SEVERITY = [tone.value for tone in (Tone.PLAIN, Tone.HEADING, Tone.GOOD, Tone.D
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a page.
+    """A figure of a page."""
 
-    Attributes
-    ----------
-    draw : callable
-        Makes the figure; one that raises `InputError` leaves its reason in the figure's place.
-    alt : str
-        What it shows, for those who do not see it.
-    caption : str
-        What stands below it.
-    """
-
+    # makes the figure; one that raises `InputError` leaves its reason in the figure's place
     draw: Callable[[], "Figure"]
-    alt: str
-    caption: str
+    alt: str  # what it shows, for those who do not see it
+    caption: str  # what stands below it
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page under a heading; it is left out where it holds nothing.
-
-    Attributes
-    ----------
-    title : str
-    parts : tuple of Report or Picture
-    """
+    """A part of a page under a heading; it is left out where it holds nothing."""
 
     title: str
     parts: tuple[Report | Picture, ...]
@@ -90,48 +71,23 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A result for a reader who has nothing but this page.
+    """A result for a reader who has nothing but this page."""
 
-    Attributes
-    ----------
-    title : str
-        What was done with what: "Identification of drive.toml".
-    verdict : Report
-        What stands first: how it ended, in colour, with details and remedies.
-    sections : tuple of Section
-    warnings : tuple of str
-        What to know before any figure is believed; stands below the verdict.
-    script : callable, optional
-        Makes what moves the page's last part, `live_script`; no other script runs in the page.
-    """
-
-    title: str
-    verdict: Report
+    title: str  # what was done with what: "Identification of drive.toml"
+    verdict: Report  # what stands first: how it ended, in colour, with details and remedies
     sections: tuple[Section, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # what to know before any figure is believed; stands below the verdict
+    # makes what moves the page's last part, `live_script`; no other script runs in the page
     script: Callable[[], str] | None = None
 
 
 def write_page(path: str | Path, page: Page, *, draws: bool = True) -> None:
-    """Write a page, whole or not at all.
-
-    Parameters
-    ----------
-    path : str or Path
-    page : Page
-    draws : bool
-        Whether its figures are drawn and its script is made; an interrupted command leaves them out.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Write a page, whole or not at all; without figures and script for an interrupted command."""
     write_text(path, render_page(page, draws=draws))
 
 
 def render_page(page: Page, *, draws: bool = True) -> str:
-    """The page as HTML; parameters as for `write_page`."""
+    """The page as HTML."""
     from importlib import resources
 
     from jinja2 import Environment, StrictUndefined
@@ -187,14 +143,7 @@ _HASH = "sha256["
 
 
 def data_section(experiments: Sequence[Experiment], noise: Mapping[tuple[str, str], float] | None = None) -> Section:
-    """Logs, a row each, and their channels with range and noise.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    noise : mapping, optional
-        By log and channel, the noise that a fit has counted with [SI] where the log states none.
-    """
+    """Logs, a row each, and their channels with range and noise, as stated or as a fit found it."""
     if not experiments:
         return Section("Data", ())
     logs, channels = [], []
@@ -210,6 +159,11 @@ def data_section(experiments: Sequence[Experiment], noise: Mapping[tuple[str, st
     remarks = (Line(f"{e.name}: {remark}") for e in experiments for remark in e.remarks)
     table = Table((*heads, *text_columns("file")), tuple(logs))
     return Section("Data", (Report((table, Table(own, tuple(channels)), *known, *remarks)),))
+
+
+def log_hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
+    """The hashes of logs, by their names in a provenance."""
+    return {f"{_HASH}{e.name}]": e.sha256 for e in experiments}
 
 
 def provenance_section(provenance: Mapping[str, str], hashes: Mapping[str, str]) -> Section:
@@ -241,6 +195,7 @@ LAW_TEXTS = {
     "series": "K (1~+~1/(Ti~s)) (1~+~Td~s/(Tf~s~+~1))~e",
 }
 """The forms and their laws; no line ends at a tilde."""
+_CONVERSIONS: Mapping[str, Callable[[ParallelForm], object]] = {"standard (ISA)": to_standard, "series": to_series}
 EXPORTS = {
     "st": "a PLC (IEC 61131-3 structured text)",
     "c": "a microcontroller (C99, with a test)",
@@ -253,27 +208,21 @@ N_NOTE = "N of the standard form is ISA's ratio Td/Tf. Simulink's N is the filte
 
 
 def report_forms(controller: Controller, parameters: ParameterSet) -> Report:
-    """The gains in the parallel, the standard and the series form; why one of them has none.
-
-    Parameters
-    ----------
-    controller : Controller
-    parameters : ParameterSet
-        Every parameter of the controller.
-    """
+    """The gains in the parallel, the standard and the series form; why one of them has none."""
     parallel = controller.parallel_form(parameters)
     unit = unit_ratio(controller.command.unit, controller.pid_signal.unit)
     units = {"Kp": unit, "K": unit, "Ki": unit_ratio(unit, "s"), "Kd": unit_ratio(f"({unit})*s", "1"), "N": "1"}
     rows, refused = [], []
-    for (name, law), convert in zip(LAW_TEXTS.items(), (_as_given, to_standard, to_series), strict=True):
+    for name, law in LAW_TEXTS.items():
         try:
-            gains = vars(convert(parallel))
+            gains = vars(_CONVERSIONS[name](parallel) if name in _CONVERSIONS else parallel)
         except InputError as error:
             refused.append(Line(str(error)))
             continue
         if gains.get("Td") == 0:
-            gains = {**gains, "N": math.nan} if "N" in gains else gains  # of no derivative there is no ratio
-        rows.append((name, *(_cell(n, value, units.get(n, "s")) for n, value in gains.items()), law.replace("~", TIED)))
+            gains = {n: math.nan if n == "N" else v for n, v in gains.items()}  # of no derivative there is no ratio
+        written = {n: write_value(v, units.get(n, "s")) for n, v in gains.items() if not math.isnan(v)}
+        rows.append((name, *(f"{n} {written.get(n, '-')}" for n in gains), law.replace("~", TIED)))
     return Report((Table(text_columns("form", "", "", "", "", "law"), tuple(rows)), *refused, Line(N_NOTE)))
 
 
@@ -285,19 +234,7 @@ def report_exports(
     fit: Path,
     tuned: Path,
 ) -> Report:
-    """The commands that take a design to a controller, and the makers whose block cannot hold it.
-
-    Parameters
-    ----------
-    controller : Controller
-    parameters : ParameterSet
-        Of the design.
-    references : sequence of Reference
-    centre : float
-        On the wire while the command is zero [the command's unit].
-    fit, tuned : Path
-        The files of the plant and of the design.
-    """
+    """The commands that take a design to a controller, and the makers whose block cannot hold it."""
     if controller.pid.sample_time is None:
         return Report((Line("A continuous controller has no export: give it a sample_time, and tune it so."),))
     refused = [block for block in Block if describe_refusal(controller, parameters, block, references, centre)]
@@ -321,14 +258,6 @@ def report_settings(controller: Controller, parameters: ParameterSet) -> Report:
     return Report((Line("; ".join(lines)), *([Table(text_columns("setting", "value"), rows)] if rows else [])))
 
 
-def _cell(name: str, value: float, unit: str) -> str:
-    return f"{name} -" if math.isnan(value) else f"{name} {write_value(value, unit, GAIN_DIGITS)}"
-
-
-def _as_given(gains: ParallelForm) -> ParallelForm:
-    return gains
-
-
 def simulate_responses(
     loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, before: ParameterSet | None = None
 ) -> list[Response]:
@@ -337,7 +266,10 @@ def simulate_responses(
     found = []
     for reference in references:
         run = _simulate_response(loop, reference, parameters)
-        earlier = None if before is None else _simulate_initial_response(loop, reference, before)
+        earlier = None
+        if before is not None:
+            with suppress(ConvergenceError, InputError):
+                earlier = _simulate_response(loop, reference, before)
         period, push = loop.dither_period(parameters), loop.plant.axis.force if loop.plant.axis else "N"
         found.append(Response(run, reference, loop.feedback.name, units, earlier, period, push))
     return found
@@ -351,18 +283,7 @@ def loop_figures(
     *,
     band: Band = 0.02,
 ) -> dict[str, "Figure"]:
-    """The steps, "", and the Bode plot, "bode", at the first one's operating point with the largest sensitivity.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : sequence of Reference
-    parameters : ParameterSet
-    before : ParameterSet, optional
-        With the gains before tuning, which are drawn beside.
-    band : float
-        Half width of the settling band, a fraction of the step.
-    """
+    """The steps, "", and the Bode plot, "bode", at the first one's operating point with the largest sensitivity."""
     responses = simulate_responses(loop, references, parameters, before)
     first, earlier = responses[0], None
     if first.before is not None and before is not None:
@@ -372,15 +293,7 @@ def loop_figures(
 
 
 def loop_pictures(draw: Callable[[], Mapping[str, "Figure"]], *, compared: bool) -> tuple[Picture, Picture]:
-    """The steps and the Bode plot for a page; both are simulated when the first one is drawn.
-
-    Parameters
-    ----------
-    draw : callable
-        As `loop_figures`.
-    compared : bool
-        Whether gains before are drawn beside.
-    """
+    """The steps and the Bode plot for a page; both are simulated when the first one is drawn."""
     drawn: dict[str, Figure] = {}
 
     def figure(name: str) -> "Figure":
@@ -423,13 +336,6 @@ def _simulate_response(loop: ClosedLoop, reference: Reference, parameters: Param
     others = {q.name: np.zeros(len(run)) for q in plant.inputs if q.name not in run}
     whole = run.with_columns({**others, loop.command.name: run["control"]})
     return run.with_columns({"friction.force": friction_force(plant, whole, parameters)})
-
-
-def _simulate_initial_response(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> Trajectory | None:
-    try:
-        return _simulate_response(loop, reference, parameters)
-    except (ConvergenceError, InputError):
-        return None
 
 
 def _open_loop(loop: ClosedLoop, parameters: ParameterSet, reference: Reference, run: Trajectory) -> Linearisation:

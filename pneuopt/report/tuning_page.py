@@ -1,11 +1,4 @@
-"""The pages of a tuned loop, and of one that is simulated with the gains it has.
-
-The page of a study: a map over its cases, or a Pareto front.
-
-`summary_page`: the page of a result that has none of its own, its summary and what may be drawn of it.
-
-`write_report`: a result as one page of HTML.
-"""
+"""`write_report`, and the pages of loops: tuned, simulated, studied; and of results that have no page of their own."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,6 +31,7 @@ from pneuopt.report.page import (
     Section,
     data_section,
     diagram_picture,
+    log_hashes,
     loop_figures,
     loop_pictures,
     provenance_section,
@@ -45,7 +39,6 @@ from pneuopt.report.page import (
     report_settings,
     write_page,
 )
-from pneuopt.report.tolerances import MOST_NAMES
 from pneuopt.studies.sensitivity import Sensitivity
 from pneuopt.tuning.result import TuningResult, report_active, report_certificate_status, report_gains, report_refusal
 from pneuopt.tuning.validation import report_validation, report_validation_verdict
@@ -56,6 +49,92 @@ if TYPE_CHECKING:
     from pneuopt.plotting.canvas import Figure
 
 
+LOGS = "an Experiment or several, as read_log(path) gives them"
+
+
+_TITLES: dict[type, str] = {IdentificationResult: "Identification", TuningResult: "Tuning", Certificate: "Certificate"}
+
+
+def write_report(
+    result: Shown,
+    path: str | Path,
+    *,
+    title: str = "",
+    model: HasSystem | ClosedLoop | None = None,
+    experiments: Experiment | Sequence[Experiment] = (),
+    held_out: Experiment | Sequence[Experiment] = (),
+    references: Reference | Sequence[Reference] = (),
+    parameters: ParameterSet | None = None,
+    band: Band = 0.02,
+) -> None:
+    """Write a result as one page of HTML that needs no network: verdict first, figures where they belong, hashes.
+
+    The same result gives the same page, to the letter. A result that did not converge gets its page, too, which says
+    so first. Results hold no models and no logs: what is to be drawn of these is given here. The page of a loop ends
+    with sliders, which a script within it follows by simulating the loop; without scripts only they are missing.
+
+    Parameters
+    ----------
+    result : Shown
+        Whatever `identify`, `tune`, `certificate`, `bootstrap`, `track` or another verb returns.
+    path : str or Path
+    title : str
+        By default the kind of the result.
+    model : drive, System or ClosedLoop, optional
+        Of a fit: draws its friction, and predicts held-out logs. Of a tuning or a certificate the loop: draws steps,
+        the Bode plot and the diagram, and gives the gains in every form.
+    experiments : Experiment or sequence of Experiment
+        Of a fit: the logs that it was made from, in their order.
+    held_out : Experiment or sequence of Experiment
+        Logs that the fit has not seen.
+    references : Reference or sequence of Reference
+        Those of the loop.
+    parameters : ParameterSet, optional
+        Of a certificate: every parameter of its loop. Of a tuning: those before, to be drawn beside.
+    band : float
+        Half width of the settling band, a fraction of the step.
+
+    Raises
+    ------
+    InputError
+        If the result is no such object, a figure lacks what it is drawn from, or the file cannot be written; no file is
+        left then.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pneuopt.quantities.report import Line, Report
+    >>> class Found(Shown):
+    ...     def summary(self):
+    ...         return Report((Line("nothing is wrong"),))
+    >>> place = Path(tempfile.mkdtemp()) / "found.html"
+    >>> write_report(Found(), place)
+    >>> "nothing is wrong" in place.read_text("utf-8")
+    True
+    """
+    require(isinstance(result, Shown), f"a report is written of a result, got {type(result).__name__}")
+    steps = as_references(references)
+    logs, others = (
+        as_tuple(n, given, Experiment, LOGS) for n, given in (("experiments", experiments), ("held_out", held_out))
+    )
+    require(not others or model is not None, "held-out logs are predicted with the model: give both")
+    source = Source(title or _TITLES.get(type(result), type(result).__name__))
+    if isinstance(result, IdentificationResult):
+        page = fit_page(source, result, logs, model, held_out=others)
+    elif isinstance(result, TuningResult):
+        page = tuning_page(source, result, _view(model, steps, result.parameters, parameters, band))
+    elif isinstance(result, Certificate):
+        require(model is None or parameters is not None, "a certificate holds no gains: give parameters with the loop")
+        page = simulation_page(source, result, _view(model, steps, parameters, None, band))
+    else:
+        pictures = (tracking_picture(result),) if isinstance(result, Tracking) else ()
+        if isinstance(result, Sensitivity):
+            alt = "For each figure the share of its variance that each parameter brings, with its 95 % interval."
+            pictures = (Picture(partial(plot_sensitivity, result), alt, "Shares of the variance."),)
+        page = summary_page(source, result.summary(), pictures, (), getattr(result, "provenance", {}))
+    write_page(path, page)
+
+
 MARGINS = {
     "MaxSensitivity": "Ms",
     "MaxComplementarySensitivity": "Mt",
@@ -63,31 +142,21 @@ MARGINS = {
     "GainMargin": "gain margin\n[1]",
 }
 """What a page shows of an operating point's linear loop, and how it is called there."""
+
+
 DOUBTS = (Tone.DOUBTFUL, Tone.BAD)
 """Tones of a verdict on a dither that belongs beside the verdict on the design."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopView:
-    """What figures, forms and the diagram of a loop are made from.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-    references : sequence of Reference
-    parameters : ParameterSet
-        Every parameter of the loop.
-    before : ParameterSet, optional
-        With the gains before tuning.
-    band : float
-        Half width of the settling band, a fraction of the step.
-    """
+    """What figures, forms and the diagram of a loop are made from."""
 
     loop: ClosedLoop
     references: Sequence[Reference]
-    parameters: ParameterSet
-    before: ParameterSet | None = None
-    band: Band = 0.02
+    parameters: ParameterSet  # every parameter of the loop
+    before: ParameterSet | None = None  # with the gains before tuning
+    band: Band = 0.02  # half width of the settling band, a fraction of the step
 
     def figures(self) -> dict[str, "Figure"]:
         """The steps and the Bode plot, see `loop_figures`."""
@@ -104,6 +173,19 @@ class LoopView:
         )
 
 
+def _view(
+    model: object, steps: Sequence[Reference], parameters: ParameterSet | None, before: ParameterSet | None, band: Band
+) -> LoopView | None:
+    """What a loop's figures are drawn from; None without a loop."""
+    if model is None or parameters is None:
+        return None
+    require(isinstance(model, ClosedLoop), f"the model of this result is a ClosedLoop, got {type(model).__name__}")
+    assert isinstance(model, ClosedLoop)
+    require(bool(steps), "a loop is drawn with its references: give both")
+    earlier = None if before is None else model.complete(before)
+    return LoopView(model, steps, model.complete(parameters), earlier, band)
+
+
 def tuning_page(
     source: Source,
     result: TuningResult,
@@ -114,23 +196,7 @@ def tuning_page(
     dither: Report | None = None,
     exports: Report | None = None,
 ) -> Page:
-    """The page of a tuning, of a design that was found or of gains that stand.
-
-    Parameters
-    ----------
-    source : Source
-    result : TuningResult
-    view : LoopView, optional
-        For figures, forms and diagram.
-    stands : str
-        What stands where the tuning failed; empty where the given gains were certified or refused.
-    was : DataFrame, optional
-        Metrics with the gains before.
-    dither : Report, optional
-        The verdict on the dither.
-    exports : Report, optional
-        How the design gets to a controller, of `report_exports`.
-    """
+    """The page of a tuning: of a design, or of the gains that stand; of certified given ones `stands` is empty."""
     found, certificate, tried = result.status.converged, result.certificate, result.validation
     verdict = report_status(result.status) if stands else report_certificate_status(result.status)
     if found and tried is not None:
@@ -162,19 +228,7 @@ def simulation_page(
     *,
     standing: Report | None = None,
 ) -> Page:
-    """The page of a loop with the gains it has.
-
-    Parameters
-    ----------
-    source : Source
-    found : Certificate
-    view : LoopView, optional
-        For figures, forms and diagram.
-    limits : mapping of str to float, optional
-        Of `metric_limits`.
-    standing : Report, optional
-        Whether the certificate that the gains were written with holds.
-    """
+    """The page of a loop with the gains it has."""
     count, cases = len(found.findings), len(found.metrics.columns)
     word = f"{count} defect{'s' if count > 1 else ''}" if count else "no defect"
     lead = Line(f"simulated: {word} in {cases} case{'s' if cases > 1 else ''}", Tone.BAD if count else Tone.GOOD)
@@ -265,22 +319,7 @@ def study_page(
     alt: str,
     design: tuple[ClosedLoop, ParameterSet] | None = None,
 ) -> Page:
-    """The page of a study.
-
-    Parameters
-    ----------
-    source : Source
-    report : Report
-        How many cases hold, in its first line; then the cases, or the designs of a front.
-    draw : callable, optional
-        Makes the map or the front; None where there are too many axes for one.
-    what : str
-        Heading: "Pareto front".
-    alt : str
-        What the figure shows, for those who see it and those who do not.
-    design : (ClosedLoop, ParameterSet), optional
-        The controller that all cases share, where they do.
-    """
+    """The page of a study: its verdict, a map or a front, its tables, and the design that all cases share."""
     verdict, table = Report(report.parts[:1]), Report(report.parts[1:])
     pictures = () if draw is None else (Picture(draw, alt, alt),)
     settings = () if design is None else (report_settings(design[0].controller, design[1].fixed("*")),)
@@ -295,18 +334,7 @@ def summary_page(
     experiments: Sequence[Experiment] = (),
     provenance: Mapping[str, str] | None = None,
 ) -> Page:
-    """The page of a summary, whose first line is the verdict.
-
-    Parameters
-    ----------
-    source : Source
-    found : Report
-    pictures : sequence of Picture
-    experiments : sequence of Experiment
-        Logs of which the page lists what was read, and their hashes.
-    provenance : mapping of str to str, optional
-        The result's own.
-    """
+    """The page of a summary, whose first line is the verdict."""
     first, *others = found.parts or (Line(""),)
     is_line = isinstance(first, Line)
     details = Report(tuple(others) if is_line else (first, *others))
@@ -314,13 +342,9 @@ def summary_page(
         Section("Figures", tuple(pictures)),
         Section("Result", (details,)),
         *((data_section(experiments),) if experiments else ()),
-        provenance_section(dict(provenance or {}), {**source.hashes, **_hashes(experiments)}),
+        provenance_section(dict(provenance or {}), {**source.hashes, **log_hashes(experiments)}),
     )
     return Page(source.title, Report((first,) if is_line else ()), sections, source.warnings)
-
-
-def _hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
-    return {f"sha256[{e.name}]": e.sha256 for e in experiments if e.sha256}
 
 
 def tracking_picture(found: Tracking) -> Picture:
@@ -329,108 +353,7 @@ def tracking_picture(found: Tracking) -> Picture:
     return Picture(partial(plot_tracking, found), alt, "Estimates over time.")
 
 
-def title_of(what: str, file: Path, logs: Sequence[Path]) -> str:
+def title_of(what: str, file: Path, logs: Sequence[Path], most: int = 3) -> str:
     """What a page is of: "Check of drive.toml with run_01.csv"; of many logs their number."""
-    names = ", ".join(log.name for log in logs) if len(logs) <= MOST_NAMES else f"{len(logs)} logs"
+    names = ", ".join(log.name for log in logs) if len(logs) <= most else f"{len(logs)} logs"
     return f"{what} of {file.name}" + (f" with {names}" if logs else "")
-
-
-LOGS = "an Experiment or several, as read_log(path) gives them"
-_TITLES: dict[type, str] = {IdentificationResult: "Identification", TuningResult: "Tuning", Certificate: "Certificate"}
-
-
-def write_report(
-    result: Shown,
-    path: str | Path,
-    *,
-    title: str = "",
-    model: HasSystem | ClosedLoop | None = None,
-    experiments: Experiment | Sequence[Experiment] = (),
-    held_out: Experiment | Sequence[Experiment] = (),
-    references: Reference | Sequence[Reference] = (),
-    parameters: ParameterSet | None = None,
-    band: Band = 0.02,
-) -> None:
-    """Write a result as one page of HTML that needs no network: verdict first, figures where they belong, hashes.
-
-    The same result gives the same page, to the letter. A result that did not converge gets its page, too, which says
-    so first. Results hold no models and no logs: what is to be drawn of these is given here. The page of a loop ends
-    with sliders, which a script within it follows by simulating the loop; without scripts only they are missing.
-
-    Parameters
-    ----------
-    result : Shown
-        Whatever `identify`, `tune`, `certificate`, `bootstrap`, `track` or another verb returns.
-    path : str or Path
-    title : str
-        By default the kind of the result.
-    model : drive, System or ClosedLoop, optional
-        Of a fit: draws its friction, and predicts held-out logs. Of a tuning or a certificate the loop: draws steps,
-        the Bode plot and the diagram, and gives the gains in every form.
-    experiments : Experiment or sequence of Experiment
-        Of a fit: the logs that it was made from, in their order.
-    held_out : Experiment or sequence of Experiment
-        Logs that the fit has not seen.
-    references : Reference or sequence of Reference
-        Those of the loop.
-    parameters : ParameterSet, optional
-        Of a certificate: every parameter of its loop. Of a tuning: those before, to be drawn beside.
-    band : float
-        Half width of the settling band, a fraction of the step.
-
-    Raises
-    ------
-    InputError
-        If the result is no such object, a figure lacks what it is drawn from, or the file cannot be written; no file is
-        left then.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from pneuopt.quantities.report import Line, Report
-    >>> class Found(Shown):
-    ...     def summary(self):
-    ...         return Report((Line("nothing is wrong"),))
-    >>> place = Path(tempfile.mkdtemp()) / "found.html"
-    >>> write_report(Found(), place)
-    >>> "nothing is wrong" in place.read_text("utf-8")
-    True
-    """
-    require(isinstance(result, Shown), f"a report is written of a result, got {type(result).__name__}")
-    steps = as_references(references)
-    logs, others = (
-        as_tuple(n, given, Experiment, LOGS) for n, given in (("experiments", experiments), ("held_out", held_out))
-    )
-    require(not others or model is not None, "held-out logs are predicted with the model: give both")
-    source = Source(title or _TITLES.get(type(result), type(result).__name__))
-    if isinstance(result, IdentificationResult):
-        page = fit_page(source, result, logs, model, held_out=others)
-    elif isinstance(result, TuningResult):
-        page = tuning_page(source, result, _view(model, steps, result.parameters, parameters, band))
-    elif isinstance(result, Certificate):
-        require(model is None or parameters is not None, "a certificate holds no gains: give parameters with the loop")
-        page = simulation_page(source, result, _view(model, steps, parameters, None, band))
-    else:
-        page = summary_page(source, result.summary(), _pictures(result), (), getattr(result, "provenance", {}))
-    write_page(path, page)
-
-
-def _view(
-    model: object, steps: Sequence[Reference], parameters: ParameterSet | None, before: ParameterSet | None, band: Band
-) -> LoopView | None:
-    """What a loop's figures are drawn from; None without a loop."""
-    if model is None or parameters is None:
-        return None
-    require(isinstance(model, ClosedLoop), f"the model of this result is a ClosedLoop, got {type(model).__name__}")
-    assert isinstance(model, ClosedLoop)
-    require(bool(steps), "a loop is drawn with its references: give both")
-    earlier = None if before is None else model.complete(before)
-    return LoopView(model, steps, model.complete(parameters), earlier, band)
-
-
-def _pictures(result: Shown) -> tuple[Picture, ...]:
-    """Of a result without a page of its own."""
-    if isinstance(result, Sensitivity):
-        alt = "For each figure the share of its variance that each parameter brings, with its 95 % interval."
-        return (Picture(partial(plot_sensitivity, result), alt, "Shares of the variance."),)
-    return (tracking_picture(result),) if isinstance(result, Tracking) else ()

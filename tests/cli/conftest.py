@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomlkit
 from jsonschema import Draft202012Validator
 
 from pneuopt.files.outputs import OUTPUTS, output_schema
@@ -31,6 +32,19 @@ def _outputs_keep_their_schema(monkeypatch: pytest.MonkeyPatch) -> None:
         assert [] in problems.values(), problems
 
     monkeypatch.setattr("pneuopt.cli.shared.write_json", write)
+
+
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The texts of the TOML files that are parsed."""
+    texts, parse = list[str](), tomlkit.parse
+
+    def parse_counted(text: str) -> tomlkit.TOMLDocument:
+        texts.append(text)
+        return parse(text)
+
+    monkeypatch.setattr(tomlkit, "parse", parse_counted)
+    return texts
 
 
 def _definition(name: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import tomllib
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -15,6 +16,7 @@ from typer.testing import CliRunner
 from pneuopt.cli import info
 from pneuopt.cli.app import app
 from pneuopt.dynamics.compiled.compiler import find_compiler
+from pneuopt.dynamics.compiled.self_check import SelfCheck, check_machine_code
 from pneuopt.files.keys import list_keys
 from pneuopt.files.outputs import OUTPUTS
 from tests.cli.test_app import run
@@ -48,11 +50,19 @@ def test_without_a_compiler_it_says_what_to_install(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_self_check_that_fails_is_said_with_exit_status_1(monkeypatch: pytest.MonkeyPatch) -> None:
-    good = info._check_itself()
+    found = list[SelfCheck]()
+
+    def keep(*given: Any) -> SelfCheck:
+        found.append(check_machine_code(*given))
+        return found[-1]
+
+    monkeypatch.setattr(info, "check_machine_code", keep)
+    assert run("info").exit_code == 0
+    (good,) = found
     assert good.is_good
     assert good.derivative_error > 0
     for bad in (replace(good, distance=1e-6), replace(good, derivative_error=1e-3)):
-        monkeypatch.setattr(info, "_check_itself", lambda bad=bad: bad)
+        monkeypatch.setattr(info, "check_machine_code", lambda *_, bad=bad: bad)
         result = run("info")
         assert result.exit_code == 1
         assert "FAILED: please report it" in result.stdout

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import Outputs, finish, warn_of_status
-from pneuopt.cli.tolerances import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.files.drive import read_fit
 from pneuopt.quantities.status import Code, Status
 
@@ -13,11 +13,11 @@ from pneuopt.quantities.status import Code, Status
 @pytest.mark.parametrize(
     ("code", "expected"),
     [
-        (None, EXIT_SUCCESS),
-        (Code.CONVERGED, EXIT_SUCCESS),
-        (Code.MISFIT, EXIT_FAILURE),
-        (Code.NOT_CERTIFIED, EXIT_FAILURE),
-        (Code.INTERRUPTED, EXIT_INTERRUPTED),
+        (None, ExitStatus.SUCCESS),
+        (Code.CONVERGED, ExitStatus.SUCCESS),
+        (Code.MISFIT, ExitStatus.FAILURE),
+        (Code.NOT_CERTIFIED, ExitStatus.FAILURE),
+        (Code.INTERRUPTED, ExitStatus.INTERRUPTED),
     ],
 )
 def test_a_fit_far_beyond_its_noise_is_no_success(code: Code | None, expected: int) -> None:

@@ -44,12 +44,13 @@ def logs(folder: Path) -> Path:
     return folder
 
 
-def test_a_drift_is_status_1_and_says_when_to_tune_again(logs: Path) -> None:
+def test_a_drift_is_status_1_and_says_when_to_tune_again(logs: Path, parsed: list[str]) -> None:
     Path("tuned.toml").write_text(TUNED, encoding="utf-8")
     files = "--tuned tuned.toml -o history.csv --json drift.json --plot drift.png --report page.html"
     result = run(f"track drive.toml run_2026*.csv --parameter friction.coulomb -q {files}")
     said = " ".join(result.stdout.split())
     assert (result.exit_code, result.stderr) == (1, "")
+    assert parsed.count(Path("drive.toml").read_text("utf-8")) == 1
     assert said.startswith("drift of friction.coulomb: identify and tune again")
     assert "tune again: the tuned loop will fail by 2026-04-19 (PeakControl)" in said
     history = pd.read_csv("history.csv")
@@ -136,7 +137,9 @@ def test_what_is_wrong_is_said_in_a_line(words: tuple[str, ...], message: str) -
 
 
 def test_each_run_has_a_file_that_is_named(tmp_path: Path) -> None:
-    words = ("--noise", "position=20um", "--budget", "1", "-q", "--runs", "2", "-o", str(tmp_path / "run.csv"))
+    place = tmp_path / "runs"
+    place.mkdir()
+    words = ("--noise", "position=20um", "--budget", "1", "-q", "--runs", "2", "-o", str(place / "run.csv"))
     result = run_of_next_experiment(*USUAL, *words)
-    assert sorted(p.name for p in tmp_path.glob("*.csv")) == ["run_1.csv", "run_2.csv"]
+    assert sorted(p.name for p in place.iterdir()) == ["run_1.csv", "run_2.csv"]
     assert "run_2.csv" in result.output.replace("\n", "")

@@ -13,7 +13,6 @@ from pneuopt.files.rig import read_rig
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
-from pneuopt.quantities.errors import InputError
 
 DRIVE = ForceDrive(Stribeck())
 LOOP = ClosedLoop(DRIVE.system(), PID(sample_time=1e-3), sensor=SensorLag(5e-3))
@@ -43,28 +42,6 @@ def test_without_sensors_the_loop_s_own_stands_there(tmp_path: Path) -> None:
     counts = ClosedLoop(DRIVE.system(), PID(sample_time=1e-3), sensor=Encoder(1e-5))
     rig = read(tmp_path, "", counts)
     assert (rig.sensors, rig.encoder.resolution) == ({"position": Sensor()}, 1e-5)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[valve]\n", "unknown section 'valve'"),
-        ('[actuator]\nhysterese = "1 N"\n', r"\[actuator\]: unknown key 'hysterese'; did you mean 'hysteresis'"),
-        ('[sensors.speeed]\nnoise = "1 mm/s"\n', r"\[sensors\]: unknown output 'speeed'; did you mean 'speed'"),
-        ('[sensors.speed]\nnoise = "1 mm"\n', r"\[sensors.speed\] noise"),
-        ('[sensors.speed]\nnoise = "-1 mm/s"\n', "noise must not be negative"),
-        ("actuator = 3\n", r"actuator must be a section, \[actuator\]"),
-        ('[sensors.position]\nnoise = "1 um"\n[encoder]\nresolution = "-1 um"\n', "resolution must not be negative"),
-    ],
-)
-def test_bad_entries_name_file_section_and_key(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=f"rig.toml.*{message}"):
-        read(tmp_path, text)
-
-
-def test_a_continuous_loop_has_no_rig(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"rig.toml: a rig's controller is sampled"):
-        read(tmp_path, "", ClosedLoop(DRIVE.system(), PID()))
 
 
 @pytest.mark.parametrize("name", ["force_rig", "pneumatic_rig"])

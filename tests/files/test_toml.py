@@ -1,3 +1,5 @@
+"""What all TOML files share: a syntax error names its line, and places are found whatever the style."""
+
 from pathlib import Path
 
 import pytest

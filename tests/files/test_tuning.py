@@ -169,87 +169,6 @@ def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
     assert second == Step(0.0, at=0.2, scale=0.05, disturbance={"load.force": -5.0})
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("[pid]", "[pd]", ": unknown section 'pd'; did you mean 'pid'?"),
-        ("[minimise]", "[wishes]", ": unknown section 'wishes'"),
-        ('"parallel"', '"paralel"', "[pid]: unknown form 'paralel'; did you mean 'parallel'?"),
-        ("Tf = ", "Tff = ", "[pid]: unknown key 'Tff'; did you mean 'Tf'?"),
-        ("Tf = ", "Td = ", "[pid] Td does not belong to the parallel form, which has Kp, Ki, Kd, Tf, b, c, Tt"),
-        ('"1 ms"', '"1"', "[pid] sample_time: '1' has no unit"),
-        ('"1 ms"', '"0 ms"', "[pid]: PID: sample_time must be positive"),
-        ('"1 ms"', '"10 ms"', "dither.frequency 160 Hz cannot be sampled every 10 ms"),
-        ('"2 V*s/m", lower', '"2 V", lower', "[pid] Kp: unit 'V' does not measure 'V*s/m'"),
-        ('"2 V*s/m", lower', '"99 V*s/m", lower', "[pid] Kp: value 99 V*s/m lies outside its bounds [0.2, 60]"),
-        (', upper = "60 V*s/m"', "", "[pid] Kp is free, so it needs both bounds: lower and upper"),
-        ("upper = ", "uper = ", "[pid] Kp: unknown key 'uper'; did you mean 'upper'?"),
-        ('["-5 V", "5 V"]', '"5 V"', "[pid] limits must be a list, got '5 V'"),
-        ('["-5 V", "5 V"]', '["5 V", "-5 V"]', "[pid] limits: 5 V is not below -5 V"),
-        ('limits = ["-5 V", "5 V"]', 'Tt = "1 s"', "[pid] Tt unwinds the integral at limits; write limits, too"),
-        ('"sine"', '"square"', "[dither]: unknown waveform 'square'"),
-        ('frequency = "160 Hz"', "", "[dither] has no frequency"),
-        ('"160 Hz"', '"1000 rad/s"', "[dither] frequency: unit 'rad/s' does not measure 'Hz'; write it in Hz"),
-        ("offset = ", "ofset = ", "[dither]: unknown key 'ofset'; did you mean 'offset'?"),
-        ('waveform = "sine"', "analogue = 1", "[dither] analogue must be true or false"),
-        (
-            'horizon = "1 s"\n\n[[ref',
-            'horizon = "1 s"\nstart = "250 mm"\n[[ref',
-            "[[reference]] 1 start must be a table",
-        ),
-        (
-            'horizon = "1 s"\n\n[[ref',
-            'horizon = "1 s"\nstart = { positon = "250 mm" }\n[[ref',
-            "[[reference]] 1 start: unknown output 'positon'",
-        ),
-        ("horizon", "horizn", "[[reference]] 1: unknown key 'horizn'; did you mean 'horizon'?"),
-        ('horizon = "1 s"\n\n[[ref', "\n[[ref", "[[reference]] 1 has no horizon"),
-        ('"0.2 m/s"\nhorizon', '"0 m/s"\nhorizon', "[[reference]] 1: Step: size must not be zero"),
-        ('step = "-100 mm/s"\ninitial = "0.2 m/s"', 'step = "0.2 m/s"', "two references step between the same values"),
-        ("[[reference]]   #", "[reference2]   #", ": unknown section 'reference2'; did you mean 'reference'?"),
-        ("overshoot = {", "overshot = {", "[minimise]: unknown requirement 'overshot'; did you mean 'overshoot'?"),
-        (
-            "{ weight = 2 }",
-            "2",
-            "[minimise] overshoot: write overshoot = { weight = 1.0 }; a limit belongs under [limits]",
-        ),
-        ("{ weight = 2 }", "{ weight = 0 }", "[minimise] overshoot weight must be positive, got 0"),
-        ("{ weight = 2 }", "{ band = 0.1 }", "[minimise] overshoot: unknown key 'band'"),
-        ('band = "2 %"', 'band = "3 %"', "[minimise] and [limits]: settling bands differ: [0.02, 0.03]"),
-        ('"5 %"', '"5 mm"', "[limits] overshoot: unit 'mm' does not measure '1'"),
-        ('"5 %"', '"500 %"', "[limits] overshoot: Overshoot: max must be above 0 and below 1, a fraction"),
-        ("= 1.6", "= 0.9", "[limits] max_sensitivity: MaxSensitivity: max must be above 1"),
-        ('max = "500 ms", ', "", "[limits] settling_time has no max"),
-        ('band = "2 %"', 'band = "2 mm"', "unit 'mm' does not measure 'm/s'"),
-        ('band = "2 %"', 'band = "-2 mm/s"', "Tolerance: half_width must be positive"),
-        ('"4500 mV"', "4.5", '[limits] peak_control: 4.5 has no unit; write "4.5 V"'),
-        ("[limits]\n", "[[limits]]\n", ": limits must be a section, [limits]"),
-    ],
-)
-def test_refuses_a_tuning_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
-    assert old in TUNING
-    path = written(tmp_path, TUNING.replace(old, new, 1))
-    with pytest.raises(InputError) as error:
-        read_tuning(path, PLANT)
-    assert str(error.value).startswith(f"{path}: ")
-    assert said in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("# nothing\n", "no pid; add a section [pid]"),
-        ('[pid]\nKi = "1 V/m"\n[[reference]]\n', "[pid] has no gain; write at least Kp"),
-        ('[pid]\nKp = "2 V*s/m"\n', "no reference; add a section [[reference]]"),
-        ('[pid]\nKp = "2 V*s/m"\n[reference]\nstep = "1 m/s"\n', "write each reference as a section of its own, [[ref"),
-    ],
-)
-def test_refuses_what_is_missing(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(InputError) as error:
-        read_tuning(written(tmp_path, text), PLANT)
-    assert said in str(error.value)
-
-
 def read_all(folder: Path, tuned: Mapping[str, float]) -> tuple[Tuning, ParameterSet]:
     given = read_tuning(written(folder, TUNING), PLANT)
     return given, given.parameters.with_values(tuned)
@@ -299,23 +218,6 @@ def test_a_sensor_lags_what_the_controller_sees(tmp_path: Path) -> None:
     assert tuning.loop.feedback.name == "speed"
 
 
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [
-        ("[sensor]\n", r'\[sensor\] has no lag; write lag = "5 ms", or of an encoder resolution = "10 um"'),
-        ('[sensor]\nlag = "0 ms"\n', r"\[sensor\]: SensorLag: lag must be at least"),
-        ('[sensor]\nlag = "5 mm"\n', r"\[sensor\] lag"),
-        ('[sensor]\ndelay = "5 ms"\n', r"\[sensor\].*delay"),
-        ('[sensor]\nlag = { value = "5 ms", free = true }\n', r"\[sensor\] lag"),
-    ],
-)
-def test_a_bad_sensor_is_refused(tmp_path: Path, section: str, message: str) -> None:
-    path = tmp_path / "tuning.toml"
-    path.write_text(TUNING + section, encoding="utf-8")
-    with pytest.raises(InputError, match=message):
-        read_tuning(path, PLANT)
-
-
 KINDS = """
 [minimise]
 iae = { weight = 1.0 }
@@ -355,28 +257,6 @@ def test_every_kind_of_requirement_has_a_key_and_its_units(tmp_path: Path) -> No
     assert again.specification.limits[-1] == NoiseGain(0.5)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("gain_margin = 2.5", "gain_margin = { max = 2.5 }", "[limits] gain_margin: unknown key 'max'"),
-        ("gain_margin = 2.5", "gain_margin = {}", "[limits] gain_margin has no min"),
-        ("gain_margin = 2.5", "gain_margin = 0.5", "[limits] gain_margin: GainMargin: min must be above 1"),
-        ('"45 deg"', "45", '[limits] phase_margin min: 45 has no unit; write "45 deg"'),
-        ('"2 V/ms"', '"2 V"', "[limits] control_rate: unit 'V' does not measure 'V/s'"),
-        ('[["0 s", "-10 %", "110 %"],', '[["0 s", "-10 %"],', "bounds: write instants with a lower and an upper"),
-        ("step_envelope = {", "step_envelope = { band = 0.1,", "[limits] step_envelope: unknown key 'band'"),
-        ('"300 ms", 0.9', '"300 ms", 1.9', "[limits] step_envelope: StepEnvelope: at 0.3 s the bounds"),
-        ("rise_time", "risetime", "[limits]: unknown requirement 'risetime'; did you mean 'rise_time'?"),
-    ],
-)
-def test_refuses_a_bad_requirement_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
-    assert old in KINDS
-    path = written(tmp_path, TUNING[: TUNING.index("[minimise]")] + KINDS.replace(old, new, 1))
-    with pytest.raises(InputError) as error:
-        read_tuning(path, PLANT)
-    assert said in str(error.value)
-
-
 def test_a_triangle_and_a_limit_on_the_air(tmp_path: Path) -> None:
     text = TUNING.replace('waveform = "sine"', 'waveform = "triangle"').replace(
         "max_sensitivity = 1.6", 'air_use = "2 l(ANR)"'
@@ -386,25 +266,12 @@ def test_a_triangle_and_a_limit_on_the_air(tmp_path: Path) -> None:
     assert AirUse(2.0) in tuning.specification.limits
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ('waveform = "sine"', 'waveform = "square"', "unknown waveform 'square'.*sine, triangle"),
-        ("max_sensitivity = 1.6", 'air_use = "2 l"', r"air_use.*'2 l': air is counted at 20 degC.*\"2 l\(ANR\)\""),
-        ("max_sensitivity = 1.6", "air_use = 2.0", r"air_use.*air is counted at 20 degC"),
-    ],
-)
-def test_air_needs_its_conditions_and_a_waveform_its_name(tmp_path: Path, old: str, new: str, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        read_tuning(written(tmp_path, TUNING.replace(old, new)), PLANT)
-
-
-LOOP = '[pid]\nKp = "2 V*s/m"\n[[reference]]\nstep = "0.2 m/s"\nhorizon = "1 s"\n'
+ACCEPT = '[pid]\nKp = "2 V*s/m"\n[[reference]]\nstep = "0.2 m/s"\nhorizon = "1 s"\n'
 
 
 def read_accept(folder: Path, line: str) -> tuple[Defect, ...]:
     path = folder / "tuning.toml"
-    path.write_text(f"{line}\n{LOOP}", encoding="utf-8")
+    path.write_text(f"{line}\n{ACCEPT}", encoding="utf-8")
     return read_tuning(path, SecondOrder().system()).accept
 
 
@@ -412,20 +279,6 @@ def test_defects_are_accepted_by_their_words(tmp_path: Path) -> None:
     assert read_accept(tmp_path, "") == ()
     every = ", ".join(f'"{defect.value}"' for defect in Defect)
     assert read_accept(tmp_path, f"accept = [{every}]") == tuple(Defect)
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ('accept = ["hunt"]', "tuning.toml: accept.*unknown defect 'hunt'; did you mean 'hunts'"),
-        ('accept = "hunts"', "tuning.toml: accept must be a list"),
-        ("accept = [1]", "tuning.toml: accept must be text"),
-        ('acept = ["hunts"]', "unknown section 'acept'.*accept"),
-    ],
-)
-def test_another_word_is_refused_with_the_nearest_one(tmp_path: Path, line: str, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        read_accept(tmp_path, line)
 
 
 REST_TUNING = """
@@ -461,28 +314,14 @@ def test_a_file_says_for_how_long_and_how_near(tmp_path: Path, written: str, exp
     assert (found.duration, found.repeatability) == pytest.approx((expected.duration, expected.repeatability))
 
 
-@pytest.mark.parametrize(
-    ("written", "message"),
-    [
-        ('"20 mm"', r"\[limits\] no_hunting: unit 'mm' does not measure 's'"),
-        ('{ repeatability = "1 V" }', r"\[limits\] no_hunting repeatability: unit 'V' does not measure 'm'"),
-        ('{ repeatability = "0 mm" }', r"\[limits\] no_hunting: NoHunting: repeatability must be positive, got 0"),
-        ('{ time = "20 s" }', r"\[limits\] no_hunting: unknown key 'time'"),
-    ],
-)
-def test_what_it_cannot_be_is_said(tmp_path: Path, written: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_rest(tmp_path, written)
-
-
-RIG = ParameterSet({"load.mass": Parameter(5.0, "kg", 1.0, 20.0), "friction.coulomb": Parameter(40.0, "N")})
-RIG = RIG | ParameterSet({"pid.Kp": Parameter(2.0, "V*s/m", free=True)})
+BOXES = ParameterSet({"load.mass": Parameter(5.0, "kg", 1.0, 20.0), "friction.coulomb": Parameter(40.0, "N")})
+BOXES = BOXES | ParameterSet({"pid.Kp": Parameter(2.0, "V*s/m", free=True)})
 
 
 def read_boxes(tmp_path: Path, text: str) -> Scenarios:
     path = tmp_path / "tuning.toml"
     path.write_text(text, encoding="utf-8")
-    return read_scenarios(read_toml(path).unwrap()["scenarios"], "tuning.toml", RIG)
+    return read_scenarios(read_toml(path).unwrap()["scenarios"], "tuning.toml", BOXES)
 
 
 def test_corners_samples_and_tolerances_join(tmp_path: Path) -> None:
@@ -502,28 +341,11 @@ seed = 7
     )
     spreads: dict[str, Spread] = {"load.mass": 0.3, "friction.*": (30.0, 60.0)}
     assert found == {
-        **corners(RIG, spreads),
-        **samples(RIG, {"load.mass": 0.1}, 3, seed=7),
-        **tolerances(RIG, {"pid.*": 0.01}),
+        **corners(BOXES, spreads),
+        **samples(BOXES, {"load.mass": 0.1}, 3, seed=7),
+        **tolerances(BOXES, {"pid.*": 0.01}),
     }
     assert found["pid.* high"] == {"pid.Kp": Factor(1.01)}
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ('[scenarios.corner]\n"load.mass" = "30 %"', r"tuning\.toml: \[scenarios\].*corner"),
-        ('[scenarios]\ncorners = "30 %"', r"\[scenarios\.corners\] must be a section"),
-        ('[scenarios.corners]\n"load.mas" = "30 %"', r"\[scenarios\.corners\] .*load\.mas"),
-        ('[scenarios.corners]\n"load.mass" = ["3 kg"]', r"\[scenarios\.corners\] load\.mass: write a fraction"),
-        ('[scenarios.corners]\n"load.mass" = "3 kg"', r"\[scenarios\.corners\] load\.mass"),
-        ('[scenarios.tolerances]\n"pid.Kp" = ["1 V*s/m", "3 V*s/m"]', "a tolerance is a fraction"),
-        ('[scenarios.samples]\ncount = "many"\n"load.mass" = "30 %"', "count must be a whole number"),
-    ],
-)
-def test_what_is_wrong_is_named_with_its_section(tmp_path: Path, text: str, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        read_boxes(tmp_path, text)
 
 
 def test_a_tuning_gives_the_scenarios_of_a_fit(tmp_path: Path) -> None:
@@ -558,7 +380,7 @@ def test_new_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> None:
     text = '[scenarios.samples]\ncount = 3\n"load.mass" = "30 %"\n[scenarios.tolerances]\n"pid.Kp" = "1 %"'
     path.write_text(text, encoding="utf-8")
     said = read_toml(path).unwrap()["scenarios"]
-    seen, fresh = (found(said, "tuning.toml", RIG) for found in (read_scenarios, read_validation_scenarios))
+    seen, fresh = (found(said, "tuning.toml", BOXES) for found in (read_scenarios, read_validation_scenarios))
     assert len(fresh) == 100
     masses = [v["load.mass"] for v in fresh.values()]
     factors = [v["pid.Kp"] for v in fresh.values()]
@@ -588,22 +410,6 @@ def test_a_tuning_with_scenarios_is_validated_on_new_plants(tmp_path: Path, monk
     assert 0.5 * worst_corner < settling["median"] <= settling["p95"] <= settling["worst"]
     assert settling["worst"] <= 1.05 * worst_corner, "friction and the gain vary beside the mass: by 10 % and by 1 %"
     assert settling["certified"] == pytest.approx(settling["worst"], rel=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("[scenarios.samples]\ncount = 100000000\n'load.mass' = '30 %'", "count must be from 1 to 20000"),
-        ("[scenarios.samples]\ncount = 3\nseed = -1\n'load.mass' = '30 %'", "seed must be at least 0"),
-        (
-            "[scenarios.corners]\n" + "".join(f"'friction.{k}' = '30 %'\n" for k in range(20)),
-            "20 parameters have too many corners; take",
-        ),
-    ],
-)
-def test_more_plants_than_can_be_computed_are_refused_at_once(text: str, said: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=said):
-        read_boxes(tmp_path, text)
 
 
 def written_tuning(folder: Path, text: str) -> Path:
@@ -663,35 +469,6 @@ def test_a_reference_may_be_a_move(tmp_path: Path) -> None:
     assert found == replace(move, jerk=math.inf, profile=MoveProfile.MINIMUM_JERK)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ('dwell = "2 s"', 'horizon = "2 s"', "horizon does not belong to a move, which ends by dwell"),
-        ('move = "-200 mm"', 'step = "-200 mm"', "speed does not belong to a step, which ends by horizon"),
-        ('move = "-200 mm"', 'step = "1 mm"\nmove = "1 mm"', "has more than one of step, move, moves and path"),
-        ('move = "-200 mm"', 'moves = "-200 mm"', "moves must be a list"),
-        ('move = "-200 mm"', 'moves = ["-200 mm", "0 mm"]', "Move: distance must not be zero"),
-        ('move = "-200 mm"', 'moves = ["1 mm", { speed = "1 m/s" }]', "moves 2 has no distance"),
-        ('move = "-200 mm"', 'moves = ["1 mm", { distance = "1 mm", at = "1 s" }]', "unknown key 'at'"),
-        ('speed = "0.5 m/s"', "", "[[reference]] 1 has no speed"),
-        ('jerk = "100 m/s^3"', 'profile = "ramp"', "unknown profile 'ramp'"),
-        (
-            'jerk = "100 m/s^3"',
-            'jerk = "9 m/s^3"\nprofile = "trapezoid"',
-            "the acceleration of a trapezoid steps",
-        ),
-        ('"0.5 m/s"', '"0.5 m"', "speed: unit 'm' does not measure 'm/s'"),
-        ('"0.5 m/s"', '"-0.5 m/s"', "Move: speed is a limit on its size and must be positive"),
-    ],
-)
-def test_refuses_a_move_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
-    assert old in MOVE
-    with pytest.raises(InputError) as error:
-        read_tuning(written_tuning(tmp_path, MOVE.replace(old, new, 1)), ForceDrive(Coulomb()).system())
-    assert "[[reference]] 1" in str(error.value)
-    assert said in str(error.value)
-
-
 CAM = '[loop]\nmeasured = "position"\n[pid]\nKp = "200 N/m"\n[[reference]]\npath = "cams/cam.csv"\ndwell = "0.4 s"\n'
 
 
@@ -723,28 +500,6 @@ def test_a_reference_may_be_a_path_from_a_table(tmp_path: Path) -> None:
     table(tmp_path, "time [ms],position [mm]", 1e3 * points)
     (found,) = read_tuning(written_tuning(tmp_path, CAM.replace('dwell = "0.4 s"\n', "")), drive).references
     assert found.horizon == pytest.approx(points[-1, 0] + Move.dwell)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("cams/cam.csv", "cam.csv", "path: {folder}/cam.csv: cannot be read (No such file or directory)"),
-        ('"cams/cam.csv"', "3", "[[reference]] 1 path must be text, got 3"),
-        ('dwell = "0.4 s"', 'horizon = "1 s"', "horizon does not belong to a path, which ends by dwell"),
-        ('dwell = "0.4 s"', 'speed = "1 m/s"', "speed does not belong to a path, which ends by dwell"),
-        ('dwell = "0.4 s"', 'step = "1 mm"', "has more than one of step, move, moves and path"),
-        ('dwell = "0.4 s"', 'dwell = "-2 s"', "MotionPath: dwell -2 s ends the experiment before it begins"),
-        ('"position"', '"speed"', "no column of a path; name one speed [m/s]"),
-    ],
-)
-def test_refuses_a_path_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
-    cam(tmp_path, "time [ms],position [mm]")
-    text = CAM.replace("N/m", "N*s/m") if new == '"speed"' else CAM
-    assert old in text
-    with pytest.raises(InputError) as error:
-        read_tuning(written_tuning(tmp_path, text.replace(old, new, 1)), ForceDrive(Coulomb()).system())
-    assert "[[reference]] 1" in str(error.value)
-    assert said.format(folder=tmp_path) in str(error.value)
 
 
 def test_a_tuned_file_elsewhere_names_the_same_table(tmp_path: Path) -> None:
