@@ -126,15 +126,15 @@ def _certify(
     loop: ClosedLoop, references: Reference | Sequence[Reference], parameters: ParameterSet, spec: Specification
 ) -> dict[str, float | str]:
     """The worst metrics of a design, and why it fails."""
-    tracking = certificate(loop, references, parameters, band=spec.band, envelope=spec.envelope)
-    failures = list(dict.fromkeys(finding.defect.value for finding in tracking.findings))
-    for case in tracking.metrics:
+    proof = certificate(loop, references, parameters, band=spec.band, envelope=spec.envelope)
+    failures = list(dict.fromkeys(finding.defect.value for finding in proof.findings))
+    for case in proof.metrics:
         violated = spec.violations(
-            requirement_values({str(n): float(v) for n, v in tracking.metrics[case].items()}), SLACK
+            requirement_values({str(n): float(v) for n, v in proof.metrics[case].items()}), SLACK
         )
         failures += [n for n in map(metric_name, violated) if n not in failures]
     row: dict[str, float | str] = {}
-    for name in (n for n in spec.metric_names if n in tracking.metrics.index):
+    for name in (n for n in spec.metric_names if n in proof.metrics.index):
         worst = np.min if larger_is_better(name) else np.max
-        row[name] = float(worst(tracking.metrics.loc[name].to_numpy(dtype=float)))
+        row[name] = float(worst(proof.metrics.loc[name].to_numpy(dtype=float)))
     return {**row, "fails": ", ".join(failures)}
