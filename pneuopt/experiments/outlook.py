@@ -62,7 +62,7 @@ class DesignOutlook(Shown):
 
 
 def predict_loss(
-    found: Tracking,
+    tracking: Tracking,
     loop: ClosedLoop,
     references: Reference | Sequence[Reference],
     parameters: ParameterSet,
@@ -74,9 +74,12 @@ def predict_loss(
 
     Parameters
     ----------
-    found : Tracking
+    tracking : Tracking
+        Whose drift moves the plant.
     loop : ClosedLoop
+        The loop that was tuned, with its gains among the parameters.
     references : Reference or sequence of Reference
+        As of `tune`.
     parameters : ParameterSet
         The design's gains and the plant's other values.
     objective : Specification, Requirement or mapping
@@ -95,26 +98,26 @@ def predict_loss(
         If a tracked parameter is none of the loop's.
     """
     spec = objective if isinstance(objective, Specification) else specify(objective)
-    unknown = [n for n in found.table.index if n not in loop.plant.parameters]
+    unknown = [n for n in tracking.table.index if n not in loop.plant.parameters]
     require(not unknown, f"{', '.join(map(str, unknown))}: no parameter of the loop's plant; track what it has")
     rows = {}
-    for date, is_ahead, values in _plants(found, ahead):
+    for date, is_ahead, values in _plants(tracking, ahead):
         known = parameters.with_values({n: v for n, v in values.items() if np.isfinite(v)})
         rows[date] = {"ahead": is_ahead, **_certify(loop, references, known, spec)}
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("date")
     return DesignOutlook(table)
 
 
-def _plants(found: Tracking, ahead: int) -> "list[tuple[pd.Timestamp, bool, dict[str, float]]]":
+def _plants(tracking: Tracking, ahead: int) -> "list[tuple[pd.Timestamp, bool, dict[str, float]]]":
     """Date, whether it is ahead, and the values of the tracked parameters."""
-    own = {str(n): found.history.loc[n].to_dict(orient="list") for n in found.table.index}
-    dates = [pd.Timestamp(d) for d in found.history.loc[found.table.index[0]].index]
+    own = {str(n): tracking.history.loc[n].to_dict(orient="list") for n in tracking.table.index}
+    dates = [pd.Timestamp(d) for d in tracking.history.loc[tracking.table.index[0]].index]
     plants = [(d, False, {n: float(column["value"][k]) for n, column in own.items()}) for k, d in enumerate(dates)]
     for share in np.arange(1, ahead + 1) / max(ahead, 1):
         moved = {}
         for name, column in own.items():
             first, last = float(column["line"][0]), float(column["line"][-1])
-            moved[name] = last + (share * (last - first) if name in found.drifting else 0.0)
+            moved[name] = last + (share * (last - first) if name in tracking.drifting else 0.0)
         plants.append((dates[-1] + share * (dates[-1] - dates[0]), True, moved))
     return plants
 
@@ -123,15 +126,15 @@ def _certify(
     loop: ClosedLoop, references: Reference | Sequence[Reference], parameters: ParameterSet, spec: Specification
 ) -> dict[str, float | str]:
     """The worst metrics of a design, and why it fails."""
-    found = certificate(loop, references, parameters, band=spec.band, envelope=spec.envelope)
-    failures = list(dict.fromkeys(finding.defect.value for finding in found.findings))
-    for case in found.metrics:
+    proof = certificate(loop, references, parameters, band=spec.band, envelope=spec.envelope)
+    failures = list(dict.fromkeys(finding.defect.value for finding in proof.findings))
+    for case in proof.metrics:
         violated = spec.violations(
-            requirement_values({str(n): float(v) for n, v in found.metrics[case].items()}), SLACK
+            requirement_values({str(n): float(v) for n, v in proof.metrics[case].items()}), SLACK
         )
         failures += [n for n in map(metric_name, violated) if n not in failures]
     row: dict[str, float | str] = {}
-    for name in (n for n in spec.metric_names if n in found.metrics.index):
+    for name in (n for n in spec.metric_names if n in proof.metrics.index):
         worst = np.min if larger_is_better(name) else np.max
-        row[name] = float(worst(found.metrics.loc[name].to_numpy(dtype=float)))
+        row[name] = float(worst(proof.metrics.loc[name].to_numpy(dtype=float)))
     return {**row, "fails": ", ".join(failures)}

@@ -88,68 +88,6 @@ class Assumption:
         return f'"{self.value if isinstance(self.value, str) else write_value(self.value, self.unit, 6)}"'
 
 
-def list_assumptions(
-    system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
-) -> tuple[Assumption, ...]:
-    """The noise, the behaviour between samples and the fixed parameters that nobody has stated."""
-    logs = (*_noise_levels(system, given, checked), *_behaviour(system, given), *_gauge_zero(system, given))
-    return (*logs, *_defaults(system.parameters, parameters))
-
-
-def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> Iterator[Assumption]:
-    units = {q.name: q.unit.partition("(")[0] for q in system.outputs}
-    found: dict[str, float] = {}
-    for log, full in zip(given, checked, strict=True):
-        for channel in outputs_in_log(system, full):
-            if channel not in log.noise and channel not in found:
-                found[channel] = float(f"{full.noise[channel]:.3g}")
-                shown = estimate_noise(full.trajectory[channel], full.trajectory.t)
-                how = "its resolution, as the logs show" if shown.is_quantisation else "white, as the logs show"
-                yield Assumption(
-                    f"noise of {channel}", found[channel], units[channel], f"[noise] {channel}", SIDECAR, how
-                )
-
-
-def _behaviour(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
-    said: dict[str, str] = {}
-    for log in given:
-        for channel, kind in input_behaviour(system, log).items():
-            if channel not in log.intersample:
-                said[channel] = kind.value
-    for channel, word in said.items():
-        why = "as a command runs between samples" if word == "held" else "as a measured channel runs between samples"
-        yield Assumption(f"{channel} between samples", word, "", f"[intersample] {channel}", SIDECAR, why)
-
-
-def _gauge_zero(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
-    """The zero of gauge pressures in logs of a drive that has no ambient pressure."""
-    if AMBIENT_PRESSURE in system.parameters:
-        return
-    columns = [column for log in given if log.source for column in log.source.columns.values()]
-    if any("(g)" in column.unit for column in columns):
-        yield Assumption("zero of gauge pressures", ATMOSPHERE, "Pa(a)", "bar(a)", "the log's units", "the standard's")
-
-
-def _defaults(defaults: ParameterSet, given: ParameterSet) -> Iterator[Assumption]:
-    for name, usual in defaults.items():
-        used = given.get(name, usual)
-        if used.free or used.stated or used != usual:
-            continue
-        section, _, key = name.partition(".")
-        reason = f"{used.meaning} ({used.source})" if used.source else used.meaning
-        if used.source == DEFAULT_WIDTH:
-            reason = f"{used.meaning}; identify chooses it by the logs"
-        yield Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason)
-
-
-MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
-"""Names of findings that no check of the log doctor makes: by the model's equations, of what was mended in a log, of
-parameters of which none is free, and of two columns that are exchanged."""
-OTHER_CHECKS = (MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK)
-_NUMBER_AND_UNIT = re.compile(r"(?<=\d) (?=(?:[a-zA-Z]?(?:m|s|N|V|g|Hz|Pa|bar|rad|J|K|W)|%)(?![a-z]))")
-_TONES = {Severity.FAULT: Tone.BAD, Severity.DOUBT: Tone.DOUBTFUL, Severity.NOTE: Tone.PLAIN}
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Checkup(Shown):
     """What `check` finds.
@@ -252,7 +190,9 @@ def check(
     Parameters
     ----------
     system : drive, System or ClosedLoop
+        As of `identify`; its own parameters count where none are given.
     experiments : Experiment or sequence of Experiment
+        The logs, as read.
     parameters : ParameterSet
         As for `identify`.
 
@@ -287,6 +227,68 @@ def check(
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
     verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates()[0])
     return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
+
+
+def list_assumptions(
+    system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
+) -> tuple[Assumption, ...]:
+    """The noise, the behaviour between samples and the fixed parameters that nobody has stated."""
+    logs = (*_noise_levels(system, given, checked), *_behaviour(system, given), *_gauge_zero(system, given))
+    return (*logs, *_defaults(system.parameters, parameters))
+
+
+def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> Iterator[Assumption]:
+    units = {q.name: q.unit.partition("(")[0] for q in system.outputs}
+    found: dict[str, float] = {}
+    for log, full in zip(given, checked, strict=True):
+        for channel in outputs_in_log(system, full):
+            if channel not in log.noise and channel not in found:
+                found[channel] = float(f"{full.noise[channel]:.3g}")
+                shown = estimate_noise(full.trajectory[channel], full.trajectory.t)
+                how = "its resolution, as the logs show" if shown.is_quantisation else "white, as the logs show"
+                yield Assumption(
+                    f"noise of {channel}", found[channel], units[channel], f"[noise] {channel}", SIDECAR, how
+                )
+
+
+def _behaviour(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
+    said: dict[str, str] = {}
+    for log in given:
+        for channel, kind in input_behaviour(system, log).items():
+            if channel not in log.intersample:
+                said[channel] = kind.value
+    for channel, word in said.items():
+        why = "as a command runs between samples" if word == "held" else "as a measured channel runs between samples"
+        yield Assumption(f"{channel} between samples", word, "", f"[intersample] {channel}", SIDECAR, why)
+
+
+def _gauge_zero(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
+    """The zero of gauge pressures in logs of a drive that has no ambient pressure."""
+    if AMBIENT_PRESSURE in system.parameters:
+        return
+    columns = [column for log in given if log.source for column in log.source.columns.values()]
+    if any("(g)" in column.unit for column in columns):
+        yield Assumption("zero of gauge pressures", ATMOSPHERE, "Pa(a)", "bar(a)", "the log's units", "the standard's")
+
+
+def _defaults(defaults: ParameterSet, given: ParameterSet) -> Iterator[Assumption]:
+    for name, usual in defaults.items():
+        used = given.get(name, usual)
+        if used.free or used.stated or used != usual:
+            continue
+        section, _, key = name.partition(".")
+        reason = f"{used.meaning} ({used.source})" if used.source else used.meaning
+        if used.source == DEFAULT_WIDTH:
+            reason = f"{used.meaning}; identify chooses it by the logs"
+        yield Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason)
+
+
+MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
+"""Names of findings that no check of the log doctor makes: by the model's equations, of what was mended in a log, of
+parameters of which none is free, and of two columns that are exchanged."""
+OTHER_CHECKS = (MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK)
+_NUMBER_AND_UNIT = re.compile(r"(?<=\d) (?=(?:[a-zA-Z]?(?:m|s|N|V|g|Hz|Pa|bar|rad|J|K|W)|%)(?![a-z]))")
+_TONES = {Severity.FAULT: Tone.BAD, Severity.DOUBT: Tone.DOUBTFUL, Severity.NOTE: Tone.PLAIN}
 
 
 def _model_finding(sentence: str, logs: Sequence[Experiment]) -> LogFinding:

@@ -73,11 +73,13 @@ def compare_logs(
     Parameters
     ----------
     system : drive, System or ClosedLoop
+        The model that all logs are fitted with, as of `identify`.
     experiments : sequence of Experiment
         At least two.
     parameters : ParameterSet
         As for `identify`; `per_log` parameters and conditions may differ and are not compared.
     method : LeastSquares, optional
+        As of `identify`.
 
     Returns
     -------

@@ -45,7 +45,9 @@ def examine_logs(
     Parameters
     ----------
     system : drive, System or ClosedLoop
+        As of `identify`.
     experiments : Experiment or sequence of Experiment
+        The logs, as read.
     parameters : ParameterSet
         Masses and forces that are not free are stated, and a log may contradict them.
 

@@ -70,10 +70,13 @@ def identifiability(
     Parameters
     ----------
     system : drive, System or ClosedLoop
+        As of `identify`.
     experiments : Experiment or sequence of Experiment
+        The logs, as read.
     parameters : ParameterSet
         As for `identify`.
     method : LeastSquares, optional
+        Its segments and integration steps count.
 
     Returns
     -------

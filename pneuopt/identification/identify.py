@@ -104,6 +104,7 @@ def identify(
     parameters : ParameterSet
         The free ones are estimated; the others are known, unless a log's conditions override them.
     method : LeastSquares, optional
+        The length of segments, the stages of a search, its integration steps.
     loss : Loss, optional
         For logs with outliers: `Huber()` or `SoftL1()`; by default every residual counts with its square.
     estimate_noise : bool
@@ -247,9 +248,11 @@ def validate(
     Parameters
     ----------
     system : drive, System or ClosedLoop
+        As of `identify`.
     experiments : Experiment or sequence of Experiment
         Preferably runs that no fit has seen.
     parameters : ParameterSet
+        Those of a fit, for instance; none is estimated.
     window : float, optional
         Start the simulation anew after this time [s], from a fitted state: a plant that integrates runs away from a
         long log for the smallest misfit.
@@ -294,8 +297,11 @@ def predict(
     Parameters
     ----------
     system : drive, System or ClosedLoop
+        As of `identify`.
     experiment : Experiment
+        Its inputs drive the simulation, its outputs give the start state.
     parameters : ParameterSet
+        As of `validate`.
     window, progress
         As of `validate`.
 

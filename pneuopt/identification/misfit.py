@@ -59,6 +59,120 @@ from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 
 @dataclass(frozen=True, eq=False)
+class Misfit:
+    """What the residuals of a fit tell about its intervals."""
+
+    covariance: Array | None  # of all free parameters; NaN for those that the fit has not determined
+    dof: Array  # degrees of freedom of each variance, for Student's t
+    inflation: float  # mean ratio of the variances to those of white residuals
+    # the least and the largest change of each estimate when a sixth of the logs, a log, or a class of the motion is
+    # left out
+    ranges: Array
+    level: float  # residuals over the noise, root mean squares [1]
+    noisy_states: bool  # whether gaps between segments stand for noise of the states
+    is_excessive: bool  # whether the residuals are so large that there is no interval
+    widened: bool = False  # whether parts of the logs disagree on the parameters more than chance lets them
+    signals: tuple[str, ...] = ()  # the simulated signals on which the residuals depend, the clearest first
+    is_slow: bool = False  # whether it varies as slowly as the logs, or from log to log
+    lone: tuple[str, ...] = ()
+    rejected_widths: tuple[str, ...] = ()  # the widths of the model that the logs reject
+    biased: Mask | None = None  # the estimates that such a width biases; None without one
+    restarts: bool = False  # whether windows that start anew follow the logs where the model, over whole logs, does not
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether parts of the logs disagree, or residuals exceed the noise: a width of the model may be behind it.
+
+        A signal on which residuals depend already marks all estimates.
+        """
+        return (self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO) and not self.signals
+
+    def mark(self, index: int, *, is_optimum: bool) -> Mark:
+        """The mark of an estimate, which may be at an optimum or at a bound."""
+        is_missed = self.noisy_states or self.restarts or self.level > MODEL_ERROR_LEVEL
+        is_biased = self.biased is not None and bool(self.biased[index])
+        if self.signals or is_biased or is_missed or not is_optimum:
+            return Mark.BIAS_POSSIBLE
+        return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
+
+    def assess(self, status: Status) -> Status:
+        """The status of a fit with what its residuals tell."""
+        status = status.with_details(*self.sentences)
+        if not (self.is_excessive and status.converged):
+            return status
+        verdict = f"residuals are {self.level:.3g} times the noise, so that estimates have ranges and no intervals"
+        remedy = "check sensors, units and conditions; then try a richer model"
+        return Status(Code.MISFIT, (verdict, *status.sentences, remedy))
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What a user should know, and what would help."""
+        found = []
+        if self.signals:
+            found.append(f"residuals depend on {join_names(self.signals)}: model error, estimates may be biased")
+        if self.restarts:
+            found.append("over whole logs the model misses more than their noise: estimates from windows may be biased")
+        if self.rejected_widths:
+            widths = f"{join_names(self.rejected_widths)} that the logs reject"
+            found.append(f"the model has a value of {widths}: the estimates that it moves may be biased")
+        if self.is_slow:
+            found.append("the misfit is as slow as the logs, or different from log to log: log more or longer runs")
+        if self.lone:
+            found.append(f"one log alone determines {join_names(self.lone)}: log more runs like it")
+        return tuple(found)
+
+
+def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: float) -> Misfit:
+    """Diagnose the residuals of a fit from their variance, in noise variances, and its degrees of freedom."""
+    k, free = len(fit.parameters.free_names), fit.parameters.free_names
+    scores = None if fit.optimum is None else fit_scores(fit.optimum)
+    white = None if fit.covariance is None else fit.covariance * variance * fit.variance_inflation
+    size = math.sqrt(variance), fit.jumps is not None, _is_excessive(problem, fit, variance)
+    if fit.optimum is None or scores is None or white is None:
+        return Misfit(white, np.full(k, dof), 1.0, np.full((k, 2), np.nan), *size)
+    keep = np.flatnonzero(fit.optimum.keep)
+    blocks = _clusters(scores, _split_in_time(fit.optimum.equations.segments, TIME_BLOCKS), simulate=fit.jumps is None)
+    signals = _signals_behind_residuals(scores, names((*problem.system.states, *problem.system.inputs)))
+    classes = [_clusters(scores, _classes(signals[0].values, of_size=True))] if signals else []
+    square = np.ix_(keep, keep)
+    found = robust_covariance(blocks, white[square], variance * fit.variance_inflation, dof, classes=classes)
+    covariance, degrees, ranges = white.copy(), np.full(k, dof), np.full((k, 2), np.nan)
+    covariance[square], degrees[keep] = found.covariance, found.dof
+    parts = [blocks.halve().halve(), blocks.by_log(), *classes]
+    if changes := [jackknife(c).changes for c in parts if c.count > 1]:
+        each = np.concatenate(changes)
+        ranges[keep] = np.stack([each.min(axis=0), each.max(axis=0)], axis=1)
+    own = {n for n in free if n not in problem.parameters}
+    return Misfit(
+        covariance,
+        degrees,
+        float(np.mean(np.diag(found.covariance) / np.diag(white[square]))),
+        ranges,
+        *size,
+        found.widened,
+        tuple(s.name for s in signals),
+        found.is_slow,
+        tuple(free[i] for i, alone in zip(keep, found.lone, strict=True) if alone and free[i] not in own),
+    )
+
+
+def degrees_of_freedom(problem: EstimationProblem, fit: Fit) -> int:
+    """Residuals of a fit less the parameters and the start states that it has taken from them; at least one.
+
+    A log has a start state, and another one behind each hole in its inputs and in each window. States that no output
+    shows are not fitted, and a part takes no more than it has samples.
+    """
+    if fit.optimum is None:
+        segments = segment(problem.transcription(problem.start_from(fit)))
+    else:
+        segments = fit.optimum.equations.segments
+    heads = np.flatnonzero(np.append(True, ~segments.linked[:-1]))
+    samples = np.add.reduceat(np.isfinite(segments.measured).sum(axis=(1, 2)), heads)
+    starts = np.minimum(np.isnan(segments.fixed_start[heads]).sum(axis=1), samples)
+    return max(1, fit.count - len(fit.parameters.free_names) - int(starts.sum()))
+
+
+@dataclass(frozen=True, eq=False)
 class Clusters:
     """Residuals in K clusters, as k parameters see them."""
 
@@ -231,120 +345,6 @@ def _widest(white: Array, dof: float, spreads: Sequence[tuple[Spread, Mask]]) ->
         together += spread.covariance
     stretch = np.sqrt(variance / np.diag(together))
     return together * np.outer(stretch, stretch), freedom
-
-
-@dataclass(frozen=True, eq=False)
-class Misfit:
-    """What the residuals of a fit tell about its intervals."""
-
-    covariance: Array | None  # of all free parameters; NaN for those that the fit has not determined
-    dof: Array  # degrees of freedom of each variance, for Student's t
-    inflation: float  # mean ratio of the variances to those of white residuals
-    # the least and the largest change of each estimate when a sixth of the logs, a log, or a class of the motion is
-    # left out
-    ranges: Array
-    level: float  # residuals over the noise, root mean squares [1]
-    noisy_states: bool  # whether gaps between segments stand for noise of the states
-    is_excessive: bool  # whether the residuals are so large that there is no interval
-    widened: bool = False  # whether parts of the logs disagree on the parameters more than chance lets them
-    signals: tuple[str, ...] = ()  # the simulated signals on which the residuals depend, the clearest first
-    is_slow: bool = False  # whether it varies as slowly as the logs, or from log to log
-    lone: tuple[str, ...] = ()
-    rejected_widths: tuple[str, ...] = ()  # the widths of the model that the logs reject
-    biased: Mask | None = None  # the estimates that such a width biases; None without one
-    restarts: bool = False  # whether windows that start anew follow the logs where the model, over whole logs, does not
-
-    @property
-    def is_suspect(self) -> bool:
-        """Whether parts of the logs disagree, or residuals exceed the noise: a width of the model may be behind it.
-
-        A signal on which residuals depend already marks all estimates.
-        """
-        return (self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO) and not self.signals
-
-    def mark(self, index: int, *, is_optimum: bool) -> Mark:
-        """The mark of an estimate, which may be at an optimum or at a bound."""
-        is_missed = self.noisy_states or self.restarts or self.level > MODEL_ERROR_LEVEL
-        is_biased = self.biased is not None and bool(self.biased[index])
-        if self.signals or is_biased or is_missed or not is_optimum:
-            return Mark.BIAS_POSSIBLE
-        return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
-
-    def assess(self, status: Status) -> Status:
-        """The status of a fit with what its residuals tell."""
-        status = status.with_details(*self.sentences)
-        if not (self.is_excessive and status.converged):
-            return status
-        verdict = f"residuals are {self.level:.3g} times the noise, so that estimates have ranges and no intervals"
-        remedy = "check sensors, units and conditions; then try a richer model"
-        return Status(Code.MISFIT, (verdict, *status.sentences, remedy))
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """What a user should know, and what would help."""
-        found = []
-        if self.signals:
-            found.append(f"residuals depend on {join_names(self.signals)}: model error, estimates may be biased")
-        if self.restarts:
-            found.append("over whole logs the model misses more than their noise: estimates from windows may be biased")
-        if self.rejected_widths:
-            widths = f"{join_names(self.rejected_widths)} that the logs reject"
-            found.append(f"the model has a value of {widths}: the estimates that it moves may be biased")
-        if self.is_slow:
-            found.append("the misfit is as slow as the logs, or different from log to log: log more or longer runs")
-        if self.lone:
-            found.append(f"one log alone determines {join_names(self.lone)}: log more runs like it")
-        return tuple(found)
-
-
-def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: float) -> Misfit:
-    """Diagnose the residuals of a fit from their variance, in noise variances, and its degrees of freedom."""
-    k, free = len(fit.parameters.free_names), fit.parameters.free_names
-    scores = None if fit.optimum is None else fit_scores(fit.optimum)
-    white = None if fit.covariance is None else fit.covariance * variance * fit.variance_inflation
-    size = math.sqrt(variance), fit.jumps is not None, _is_excessive(problem, fit, variance)
-    if fit.optimum is None or scores is None or white is None:
-        return Misfit(white, np.full(k, dof), 1.0, np.full((k, 2), np.nan), *size)
-    keep = np.flatnonzero(fit.optimum.keep)
-    blocks = _clusters(scores, _split_in_time(fit.optimum.equations.segments, TIME_BLOCKS), simulate=fit.jumps is None)
-    signals = _signals_behind_residuals(scores, names((*problem.system.states, *problem.system.inputs)))
-    classes = [_clusters(scores, _classes(signals[0].values, of_size=True))] if signals else []
-    square = np.ix_(keep, keep)
-    found = robust_covariance(blocks, white[square], variance * fit.variance_inflation, dof, classes=classes)
-    covariance, degrees, ranges = white.copy(), np.full(k, dof), np.full((k, 2), np.nan)
-    covariance[square], degrees[keep] = found.covariance, found.dof
-    parts = [blocks.halve().halve(), blocks.by_log(), *classes]
-    if changes := [jackknife(c).changes for c in parts if c.count > 1]:
-        each = np.concatenate(changes)
-        ranges[keep] = np.stack([each.min(axis=0), each.max(axis=0)], axis=1)
-    own = {n for n in free if n not in problem.parameters}
-    return Misfit(
-        covariance,
-        degrees,
-        float(np.mean(np.diag(found.covariance) / np.diag(white[square]))),
-        ranges,
-        *size,
-        found.widened,
-        tuple(s.name for s in signals),
-        found.is_slow,
-        tuple(free[i] for i, alone in zip(keep, found.lone, strict=True) if alone and free[i] not in own),
-    )
-
-
-def degrees_of_freedom(problem: EstimationProblem, fit: Fit) -> int:
-    """Residuals of a fit less the parameters and the start states that it has taken from them; at least one.
-
-    A log has a start state, and another one behind each hole in its inputs and in each window. States that no output
-    shows are not fitted, and a part takes no more than it has samples.
-    """
-    if fit.optimum is None:
-        segments = segment(problem.transcription(problem.start_from(fit)))
-    else:
-        segments = fit.optimum.equations.segments
-    heads = np.flatnonzero(np.append(True, ~segments.linked[:-1]))
-    samples = np.add.reduceat(np.isfinite(segments.measured).sum(axis=(1, 2)), heads)
-    starts = np.minimum(np.isnan(segments.fixed_start[heads]).sum(axis=1), samples)
-    return max(1, fit.count - len(fit.parameters.free_names) - int(starts.sum()))
 
 
 class Signal(NamedTuple):

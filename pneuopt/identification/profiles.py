@@ -43,10 +43,13 @@ class Profile(Shown):
     Attributes
     ----------
     name, unit : str
+        Of the parameter.
     estimate : float
+        The value of the fit [unit].
     low, high : float
         Ends of the confidence interval; infinite where the logs set no limit within the parameter's bounds.
     level : float
+        Of confidence [1].
     curve : DataFrame
         A row a refit, by rising value: value, deviance (twice the cost above the least, in units that make its
         curvature at the estimate that of the estimate's standard error), and what the other parameters became.
@@ -106,6 +109,7 @@ def profile(
     Parameters
     ----------
     system : drive, System or ClosedLoop
+        The one that `result` was made with.
     experiments : Experiment or sequence of Experiment
         Those that `result` was made from.
     result : IdentificationResult
@@ -342,6 +346,7 @@ def propagate_error(result: IdentificationResult, function: Callable[[ParameterV
     Parameters
     ----------
     result : IdentificationResult
+        Whose estimates and covariance count.
     function : callable
         Takes all parameters' values by name, "name[log]" for one of a log; returns a number.
 

@@ -280,8 +280,11 @@ class IdentificationResult(Result):
     trajectories : mapping of str to Trajectory
         Fitted states and outputs of each log.
     status : Status
+        How the fit ended, and the remedies.
     stats : mapping of str to float
+        Figures of the search: iterations, cost, gaps, chi_square_ratio, variance_inflation.
     provenance : mapping of str to str
+        Versions, options, start, and the logs' sha256.
     verdict : Verdict
         What the logs do not identify, why, and which run would: ``print(result.verdict)``.
     widths : tuple of ChosenWidth

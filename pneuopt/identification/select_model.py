@@ -115,6 +115,7 @@ def select_model(
     candidates : mapping of str to drive or System
         By name, say ``{n: ForceDrive(f) for n, f in friction_ladder().items()}``.
     experiments : Experiment or sequence of Experiment
+        The logs that all candidates are fitted to.
     parameters : ParameterSet
         Known values; a candidate takes those that it has. What is free among them stays so.
     free : sequence of str
@@ -122,6 +123,7 @@ def select_model(
     held_out : Experiment or sequence of Experiment, optional
         Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
     method : LeastSquares, optional
+        As of `identify`, for all candidates.
     window : float, optional
         As of `identify`; by default whole logs, or the windows of the candidate that follows them best.
     progress : callable, optional

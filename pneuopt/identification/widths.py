@@ -49,33 +49,6 @@ COMMON_WIDTH = "common to all candidates"
 TRIAL_STAGE = Stage(3e-3, 6)
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """A short search with some widths: its cost, that foreseen with the gaps that confirm a width, what it found."""
-
-    widths: dict[str, float]
-    cost: float
-    foreseen: float
-    count: int
-    parameters: ParameterSet
-    too_stiff: bool
-
-    def is_better_than(self, other: "_Trial") -> bool:
-        """Whether the cost is lower beyond chance."""
-        if not self.cost < inf:
-            return False
-        return other.cost - self.cost > self.significant_fall
-
-    @property
-    def significant_fall(self) -> float:
-        return max(0.5 * SIGNIFICANT_FALL * max(1.0, self.misfit), MIN_RELATIVE_FALL * self.cost)
-
-    @property
-    def misfit(self) -> float:
-        """Squared residuals over the noise's [1]."""
-        return 2 * self.cost / max(1, self.count)
-
-
 def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[ChosenWidth, ...]]:
     """Choose the widths that nobody has stated."""
     open_names = {n for w in _present(problem) if _is_open(problem, w.name) for n in _names(w) if _is_open(problem, n)}
@@ -111,6 +84,33 @@ def advise_widths(problem: EstimationProblem) -> tuple[str, ...]:
         for n, v in found.items()
         if v != given.value(n)
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A short search with some widths: its cost, that foreseen with the gaps that confirm a width, what it found."""
+
+    widths: dict[str, float]
+    cost: float
+    foreseen: float
+    count: int
+    parameters: ParameterSet
+    too_stiff: bool
+
+    def is_better_than(self, other: "_Trial") -> bool:
+        """Whether the cost is lower beyond chance."""
+        if not self.cost < inf:
+            return False
+        return other.cost - self.cost > self.significant_fall
+
+    @property
+    def significant_fall(self) -> float:
+        return max(0.5 * SIGNIFICANT_FALL * max(1.0, self.misfit), MIN_RELATIVE_FALL * self.cost)
+
+    @property
+    def misfit(self) -> float:
+        """Squared residuals over the noise's [1]."""
+        return 2 * self.cost / max(1, self.count)
 
 
 def _race_widths(problem: EstimationProblem, names: Set[str]) -> tuple[_Trial, set[str]]:

@@ -37,49 +37,6 @@ from pneuopt.shooting.tolerances import MAX_GAP_SHARE
 Windowed = tuple[EstimationProblem, Fit, ChosenWindow]
 
 
-class _Trial(NamedTuple):
-    """The fit in windows of one length."""
-
-    length: float
-    problem: EstimationProblem
-    fit: Fit
-    misfit: Misfit
-
-    @property
-    def rank(self) -> tuple[int, bool, float]:
-        """Parameters without a variance, whether residuals are too large for intervals, and the mean log of these."""
-        if self.misfit.covariance is None:
-            return len(self.fit.parameters.free_names), True, math.inf
-        half_widths = self.half_widths[np.isfinite(self.half_widths)]
-        unknown = len(self.half_widths) - len(half_widths)
-        return unknown, self.misfit.is_excessive, float(np.log(half_widths).sum())
-
-    @property
-    def half_widths(self) -> Array:
-        """Half of each interval, infinite where a parameter has no variance, shape (k,)."""
-        if self.misfit.covariance is None:
-            return np.full(len(self.fit.parameters.free_names), np.inf)
-        variances = np.diag(self.misfit.covariance)
-        widths = t_quantile(self.misfit.dof) * np.sqrt(np.maximum(variances, 0.0))
-        return np.where(variances > 0, widths, np.inf)
-
-    @property
-    def is_answer(self) -> bool:
-        """Whether it is an optimum that tells most parameters better than their own size."""
-        sizes = np.abs([self.fit.parameters.value(n) for n in self.fit.parameters.free_names])
-        known = float(np.mean(self.half_widths < sizes)) if sizes.size else 1.0
-        return self.fit.status.converged and known > MIN_KNOWN_SHARE
-
-    def agrees(self, shorter: "_Trial") -> bool:
-        """Whether its estimates agree with those of shorter windows, in which the model's errors add up less."""
-        names = [n for n in self.fit.parameters.free_names if n in shorter.fit.parameters.free_names]
-        apart = np.abs([self.fit.parameters.value(n) - shorter.fit.parameters.value(n) for n in names])
-        free, others = self.fit.parameters.free_names, shorter.fit.parameters.free_names
-        own, other = self.half_widths, shorter.half_widths
-        widths = [own[free.index(n)] + other[others.index(n)] for n in names]
-        return bool(np.all(apart <= np.array(widths)))
-
-
 def check_window(problem: EstimationProblem) -> None:
     """Refuse a window of fewer than two samples, longer than every log, or in a loop whose controller goes on."""
     if problem.window == math.inf:
@@ -130,6 +87,49 @@ def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
     nodes, q = start_nodes(segments), np.array([p.value for p in segments.transcription.parameters.values()])
     segments, substeps = choose_integration(segments, nodes, q, int(fit.stats["substeps"]))
     return segments.trajectories(segments.run(nodes, q, substeps, states=True))
+
+
+class _Trial(NamedTuple):
+    """The fit in windows of one length."""
+
+    length: float
+    problem: EstimationProblem
+    fit: Fit
+    misfit: Misfit
+
+    @property
+    def rank(self) -> tuple[int, bool, float]:
+        """Parameters without a variance, whether residuals are too large for intervals, and the mean log of these."""
+        if self.misfit.covariance is None:
+            return len(self.fit.parameters.free_names), True, math.inf
+        half_widths = self.half_widths[np.isfinite(self.half_widths)]
+        unknown = len(self.half_widths) - len(half_widths)
+        return unknown, self.misfit.is_excessive, float(np.log(half_widths).sum())
+
+    @property
+    def half_widths(self) -> Array:
+        """Half of each interval, infinite where a parameter has no variance, shape (k,)."""
+        if self.misfit.covariance is None:
+            return np.full(len(self.fit.parameters.free_names), np.inf)
+        variances = np.diag(self.misfit.covariance)
+        widths = t_quantile(self.misfit.dof) * np.sqrt(np.maximum(variances, 0.0))
+        return np.where(variances > 0, widths, np.inf)
+
+    @property
+    def is_answer(self) -> bool:
+        """Whether it is an optimum that tells most parameters better than their own size."""
+        sizes = np.abs([self.fit.parameters.value(n) for n in self.fit.parameters.free_names])
+        known = float(np.mean(self.half_widths < sizes)) if sizes.size else 1.0
+        return self.fit.status.converged and known > MIN_KNOWN_SHARE
+
+    def agrees(self, shorter: "_Trial") -> bool:
+        """Whether its estimates agree with those of shorter windows, in which the model's errors add up less."""
+        names = [n for n in self.fit.parameters.free_names if n in shorter.fit.parameters.free_names]
+        apart = np.abs([self.fit.parameters.value(n) - shorter.fit.parameters.value(n) for n in names])
+        free, others = self.fit.parameters.free_names, shorter.fit.parameters.free_names
+        own, other = self.half_widths, shorter.half_widths
+        widths = [own[free.index(n)] + other[others.index(n)] for n in names]
+        return bool(np.all(apart <= np.array(widths)))
 
 
 def _has_failed_by_gaps(problem: EstimationProblem, fit: Fit) -> bool:
