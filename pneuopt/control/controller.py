@@ -20,24 +20,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.control.compensators import (
-    Compensator,
-    ControllerSnapshot,
-    check_compensators,
-    check_values,
-    compensate,
-)
+from pneuopt.control.compensators import Compensator, ControllerSnapshot, check_compensators, check_values, compensate
 from pneuopt.control.dither import DITHER_OFFSET, Dither
 from pneuopt.control.gain_schedule import GainSchedule
 from pneuopt.control.pid import BAD_SAMPLES, PID, Form, ParallelForm, parallel_gains
 from pneuopt.control.reset_integral import reset_integral
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag, Signals
-from pneuopt.control.tolerances import (
-    LARGEST_SIGNAL,
-    MAX_BISECTIONS,
-    MAX_DOUBLINGS,
-    SHORTEST_TIME,
-)
+from pneuopt.control.tolerances import LARGEST_SIGNAL, MAX_BISECTIONS, MAX_DOUBLINGS, SHORTEST_TIME
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, stack
 from pneuopt.quantities.arrays import Array
@@ -186,24 +175,24 @@ class Controller:
             self.sensor.check(self.sensed_signal)
         if self.outer is not None:
             position = (self.signals.axis or Axis()).position
-            told = f"a PositionLoop controls the {position}, this loop {self.feedback.name!r}"
-            require(self.feedback.name == position, f"{told}; take measured={position!r}", ModelError)
-            told = "a Feedforward is of jumps of what the PID follows, in a cascade a speed; take MotionFeedforward"
-            require(self.feedforward is None, told, ModelError)
+            other = f"a PositionLoop controls the {position}, this loop {self.feedback.name!r}"
+            require(self.feedback.name == position, f"{other}; take measured={position!r}", ModelError)
+            jumps = "a Feedforward is of jumps of what the PID follows, in a cascade a speed; take MotionFeedforward"
+            require(self.feedforward is None, jumps, ModelError)
         check_compensators(self.compensators, self.sensed_signal, self.signals.axis)
-        own = self.parameters  # raises where a part cannot be built: a dither beyond the Nyquist frequency, say
+        parameters = self.parameters  # raises where a part cannot be built: a dither beyond Nyquist's frequency, say
         if self.schedule:
-            self.schedule.check(own)
+            self.schedule.check(parameters)
 
     def rates(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The law of a continuous controller: the rates of its states, the sensor's apart, and its command."""
         measured = x["sensor.reading"] if self.sensor else y[self.pid_signal.name]
         p = self.schedule_gains(p, measured, {}, y)
         u = self.inner_inputs(u, y[self.feedback.name], p)
-        moved, _, added = self._added_to_command(t, x, u, measured, y, p)
+        part_rates, _, added = self._added_to_command(t, x, u, measured, y, p)
         pid = without_prefix(x, "pid"), u["reference"], measured, added, without_prefix(p, "pid")
-        rates, command = self.pid.rates(*pid)
-        return with_prefix(rates, "pid") | moved, command
+        pid_rates, command = self.pid.rates(*pid)
+        return with_prefix(pid_rates, "pid") | part_rates, command
 
     def sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
         """The rates of the sensor's states between samples."""
@@ -221,7 +210,7 @@ class Controller:
         with what takes a difference or filters counting the time since the last good one; else it begins anew as at a
         start, from the output that was sent last. Time, and a dither with it, goes on.
         """
-        signals = tuple(zip((x, u, y), self._read_names(u), strict=True))
+        signals = tuple(zip((x, u, y), self._read_names(), strict=True))
         is_good = signals_are_good([v for group, read in signals for n, v in group.items() if n in read])
         count = ca.if_else(is_good, 0, x[_COUNT] + 1)
         good = count <= 0  # read where it is needed; the condition above is computed once
@@ -235,9 +224,9 @@ class Controller:
         states = _choose(good, law.states, held) | {_COUNT: count}
         return ControllerUpdate(states, {f"{n}_read": v for n, v in (*u_read.items(), *y_read.items())} | law.terms)
 
-    def _read_names(self, u: Symbols) -> tuple[set[str], set[str], set[str]]:
+    def _read_names(self) -> tuple[set[str], set[str], set[str]]:
         """Which states, inputs and outputs of the plant are signals that the controller reads."""
-        inputs = {"reference", REFERENCE_SPEED, REFERENCE_ACCELERATION} & set(u)
+        inputs = {"reference", REFERENCE_SPEED, REFERENCE_ACCELERATION}
         if isinstance(self.sensor, SensorLag):
             return {"sensor.reading"}, inputs, set(self.readings)
         return set(), inputs, {*self.readings, self.sensor.position if self.sensor else self.pid_signal.name}
@@ -264,25 +253,27 @@ class Controller:
             x |= with_prefix(reset_integral(without_prefix(x, "pid"), u["reference"] - position, gains), "pid")
 
         # The command: the PID's own, and what is added to it, limited.
-        moved, added_terms, added = self._added_to_command(t, x, inner, measured, y, p)
+        part_states, part_terms, added = self._added_to_command(t, x, inner, measured, y, p)
         pid = without_prefix(x, "pid"), inner["reference"], measured
-        states = with_prefix(self.pid.update(*pid, added, gains), "pid") | moved
+        states = with_prefix(self.pid.update(*pid, added, gains), "pid") | part_states
         if not isinstance(self.sensor, SensorLag):  # whose reading moves between samples, by `sensor_rates`
             states = with_prefix(seen, "sensor") | states
-        terms = {"error": inner["reference"] - measured, **self.pid.terms(*pid, gains), **added_terms}
-        parallel = zip(Form.PARALLEL.gains, parallel_gains(self.pid.form, gains), strict=True)
-        terms |= {f"{n}_parallel": value for n, value in parallel}
+        terms = {"error": inner["reference"] - measured, **self.pid.terms(*pid, gains), **part_terms}
+        terms |= {
+            f"{n}_parallel": gain
+            for n, gain in zip(Form.PARALLEL.gains, parallel_gains(self.pid.form, gains), strict=True)
+        }
         return ControllerUpdate(states, terms | {"unlimited": self.pid.output(*pid, gains) + added})
 
     def _read_sensor(self, anew: ca.SX, x: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         """The loop's states, those of an encoder at rest where it begins anew; and the sensor's after the sample."""
         if self.sensor is None:
             return {**x}, {}
-        signal, own = self.sensed_signal, without_prefix(p, "sensor")
+        signal, sensor_p = self.sensed_signal, without_prefix(p, "sensor")
         if isinstance(self.sensor, Encoder):
-            x = {**x, **_choose(anew, with_prefix(self.sensor.rest(y, signal, own), "sensor"), x)}
+            x = {**x, **_choose(anew, with_prefix(self.sensor.rest(y, signal, sensor_p), "sensor"), x)}
         elapsed = self.pid.elapsed_time(without_prefix(x, "pid"))
-        return {**x}, self.sensor.update(without_prefix(x, "sensor"), y, signal, own, elapsed)
+        return {**x}, self.sensor.update(without_prefix(x, "sensor"), y, signal, sensor_p, elapsed)
 
     def _added_to_command(
         self, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
@@ -290,23 +281,25 @@ class Controller:
         """What feedforward, compensators and dither add to the PID's command: their states, each term, the sum."""
         h = self.pid.sample_time
         elapsed = None if h is None else self.pid.elapsed_time(without_prefix(x, "pid"))
-        moved, lead, compensation, wave = Signals(), ca.SX(0), ca.SX(0), ca.SX(0)
+        states, lead, compensation, wave = Signals(), ca.SX(0), ca.SX(0), ca.SX(0)
         if self.feedforward is not None:
-            own = without_prefix(x, "feedforward"), u["reference"], without_prefix(p, "feedforward")
-            filtered, lead = self.feedforward.rates(*own) if elapsed is None else self.feedforward.update(*own, elapsed)
-            moved |= with_prefix(filtered, "feedforward")
+            part, jump = self.feedforward, (without_prefix(x, "feedforward"), u["reference"])
+            feedforward_p = without_prefix(p, "feedforward")
+            law = part.rates(*jump, feedforward_p) if elapsed is None else part.update(*jump, feedforward_p, elapsed)
+            states, lead = with_prefix(law[0], "feedforward"), law[1]
         if self.compensators:
             v = self.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
             rates = {n: u[n] for n in (REFERENCE_SPEED, REFERENCE_ACCELERATION) if n in u}
             error = u.get(ERROR, u["reference"] - measured)
             seen = ControllerSnapshot(t, u["reference"], measured, v + lead, h, rates, y, error, elapsed)
-            remembered, compensation = compensate(self.compensators, seen, x, p)
-            moved |= remembered
-        if self.dither is not None:  # of an analogue one behind a sampled controller its generator adds the wave
-            own_p = without_prefix(p, "dither")
-            is_apart = self.dither.analogue and h is not None
-            wave = own_p["offset"] if is_apart else own_p["offset"] + self.dither.wave(t, own_p)
-        return moved, {"feedforward": lead, "compensation": compensation, "dither": wave}, wave + (lead + compensation)
+            compensator_states, compensation = compensate(self.compensators, seen, x, p)
+            states |= compensator_states
+        if self.dither is not None:
+            dither_p = without_prefix(p, "dither")
+            wave = dither_p["offset"]
+            if h is None or not self.dither.analogue:  # else a generator behind the controller adds it
+                wave = wave + self.dither.wave(t, dither_p)
+        return states, {"feedforward": lead, "compensation": compensation, "dither": wave}, wave + (lead + compensation)
 
     def start(
         self, u: Mapping[str, Any], measured: Any, y: Mapping[str, Any], command: Any, p: Mapping[str, Any]
@@ -321,9 +314,9 @@ class Controller:
         if self.feedforward is not None:
             begun["feedforward.filter"] = u["reference"]
         for part in self.compensators:
-            known = ControllerSnapshot(0.0, u["reference"], measured, command, self.pid.sample_time, {}, y)
-            own = zip(part.states(self.sensed_signal, unit), part.start(self.sensed_signal, known), strict=True)
-            begun |= {f"{part.section}.{q.name}": v for q, v in own}
+            seen = ControllerSnapshot(0.0, u["reference"], measured, command, self.pid.sample_time, {}, y)
+            first = zip(part.states(self.sensed_signal, unit), part.start(self.sensed_signal, seen), strict=True)
+            begun |= {f"{part.section}.{q.name}": v for q, v in first}
         return begun
 
     def rest_states(
@@ -331,9 +324,9 @@ class Controller:
     ) -> list[float]:
         """The states with which it goes on from a command and the plant's outputs at rest, or in steady motion."""
         value: Mapping[str, Any] = self.values(parameters)
-        sensor = (
-            self.sensor.start(y, self.sensed_signal, without_prefix(value, "sensor")) if self.sensor else list[float]()
-        )
+        sensor = list[float]()
+        if self.sensor:
+            sensor = self.sensor.start(y, self.sensed_signal, without_prefix(value, "sensor"))
         seen = sensor[0] if sensor else y[self.pid_signal.name]
         value = self.schedule_gains(value, seen, {}, y)
         wanted = float(self.inner_inputs({"reference": reference}, y[self.feedback.name], value)["reference"])
@@ -345,8 +338,8 @@ class Controller:
         """The inputs as PID and compensators see them: a cascade's reference is a speed, and `ERROR` a position's."""
         if self.outer is None:
             return dict(u)
-        own = without_prefix(p, self.outer.section)
-        speed = self.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, own)
+        outer_p = without_prefix(p, self.outer.section)
+        speed = self.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, outer_p)
         return {**u, "reference": speed, ERROR: u["reference"] - position}
 
     def schedule_gains(
@@ -404,7 +397,7 @@ class Controller:
             outputs, position = self.signals.outputs, self.schedule.position
             check_names("output", [position], outputs, "GainSchedule: position")
             parts["schedule"] = self.schedule.parameters(outputs[position].unit, self.signals.load_unit)
-        return reduce(or_, (own.with_prefix(name) for name, own in parts.items()), ParameterSet())
+        return reduce(or_, (part.with_prefix(section) for section, part in parts.items()), ParameterSet())
 
     @property
     def states(self) -> tuple[Quantity, ...]:

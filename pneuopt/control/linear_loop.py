@@ -117,7 +117,7 @@ def _composed_loops(
     """The open loop and the noise path at an operating point."""
     loop.check(parameters)
     at = np.array([[u.get(n, 0.0) for n in names(loop.plant.inputs)]])
-    found = _composed_function(loop)(loop.parameter_vector(parameters)[None], np.asarray(x, dtype=float)[None], at)
+    found = _composed_loop(loop)(loop.parameter_vector(parameters)[None], np.asarray(x, dtype=float)[None], at)
     plant = names(loop.plant.states)
     own = [f"controller.{k}" for k in range(found.loop[0].shape[-1] - len(plant))]
     A, B, C, D = (M[0] for M in found.loop)
@@ -226,16 +226,8 @@ class ComposedLoops:
         return ca.Function("law", [stack(y), v, stack(p)], [ca.densify(block) for block in blocks])
 
 
-@lru_cache(maxsize=8)
-def _composed_function(loop: ClosedLoop) -> ComposedLoops:
-    """The function of a loop, kept likewise."""
-    return ComposedLoops(loop)
-
-
-@lru_cache(maxsize=8)
-def _averaged_plant(loop: ClosedLoop) -> AveragedPlant:
-    """The function of a loop, kept for the cases and operating points of one evaluation."""
-    return AveragedPlant(loop)
+# the functions of a loop, kept for the cases and operating points of one evaluation
+_composed_loop, _averaged_plant = lru_cache(maxsize=8)(ComposedLoops), lru_cache(maxsize=8)(AveragedPlant)
 
 
 # States that hold the command, as the hold and the delay have their own, and those that nothing moves in normal work.

@@ -215,7 +215,7 @@ def _rows(settings: list[Setting]) -> list[str]:
 
 def _checks(d: BlockNumbers, first: BlockNumbers, maker_block: MakerBlock) -> Iterator[str]:
     """What an engineer tries before the loop is closed."""
-    rest = wire(d.centre, d)
+    rest = d.at_rest
     rises = "rise" if (d.gains.Kp or d.gains.Ki or d.gains.Kd) >= 0 else "fall"
     yield f"1. Centre: in manual ({maker_block.manual}) and at error 0, {rest} stands on the wire and nothing moves."
     yield f"2. Sign: in manual, a little more than {rest} makes the {d.measured} {rises}; else turn a sign, not a gain."

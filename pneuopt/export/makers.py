@@ -71,6 +71,11 @@ class BlockNumbers:
         return 100.0 * (self.centre - self.low) / self.span
 
     @property
+    def at_rest(self) -> str:
+        """The centre as it is on the wire, with its unit."""
+        return wire(self.centre, self)
+
+    @property
     def limits(self) -> tuple[float, float]:
         """Of the command about the centre."""
         return self.low - self.centre, self.high - self.centre
@@ -221,17 +226,6 @@ def _siemens_settings(d: BlockNumbers) -> list[Setting]:
     ]
 
 
-def _siemens_states(d: BlockNumbers) -> list[str]:
-    rest = wire(d.centre, d)
-    return [
-        f"At error 0 from rest: Output = 0 %, {rest} on the wire.",
-        f"Stopped (Inactive, Reset, after a restart): Output = 0 %, {rest}; what Disturbance adds would be gone then.",
-        f"At an error (Input invalid or beyond its limits, a late cycle): Output = 0 %, {rest}; a rising edge at "
-        "ModeActivate starts it again.",
-        f"While the CPU stops: what the output module is set to; its substitute value must be {rest}.",
-    ]
-
-
 def _counts(d: BlockNumbers) -> str:
     """The same in counts of an analogue output of 10 V, which has 27648 of them."""
     if d.command_unit != "V":
@@ -257,7 +251,14 @@ SIEMENS_BLOCK = MakerBlock(
         "How it keeps its integral at bay at a limit is not published: taken as clamping.",
     ),
     _siemens_settings,
-    _siemens_states,
+    lambda d: [
+        f"At error 0 from rest: Output = 0 %, {d.at_rest} on the wire.",
+        f"Stopped (Inactive, Reset, after a restart): Output = 0 %, {d.at_rest}; what Disturbance adds would be gone "
+        "then.",
+        f"At an error (Input invalid or beyond its limits, a late cycle): Output = 0 %, {d.at_rest}; a rising edge at "
+        "ModeActivate starts it again.",
+        f"While the CPU stops: what the output module is set to; its substitute value must be {d.at_rest}.",
+    ],
     "Mode = 4 with ManualValue = 0.0",
     lambda d: (
         f"Disturbance = {number(100.0 / d.span)} %/({d.command_unit}) x sum (INFERRED: it is added before the limits)"
@@ -317,7 +318,7 @@ def _plain_settings(d: BlockNumbers) -> list[Setting]:
         ("MINCV", number(d.low), f"[{on}] {d.goes} at 0 %"),
         ("MAXO", "100", "% the limits are the ends of CV"),
         ("MINO", "0", "%"),
-        ("BIAS", number(d.rest), f"% {wire(d.centre, d)}, {d.zero}{d.sum_words}"),
+        ("BIAS", number(d.rest), f"% {d.at_rest}, {d.zero}{d.sum_words}"),
         ("NOBC", "1", "else a change from manual to auto without an integral moves BIAS"),
         ("DB", "0", "no dead band"),
         ("SO", number(d.rest), f"% the output in software manual: {d.zero}"),
@@ -365,7 +366,7 @@ def _enhanced_settings(d: BlockNumbers) -> list[Setting]:
 
 
 def _rockwell_states(d: BlockNumbers) -> list[str]:
-    rest = f"{number(d.rest)} %, {wire(d.centre, d)} on the wire"
+    rest = f"{number(d.rest)} %, {d.at_rest} on the wire"
     lines = []
     if _can_be_plain(d):
         lines += [
@@ -383,7 +384,7 @@ def _rockwell_states(d: BlockNumbers) -> list[str]:
         lines += [f"PIDE is not for this design: {why}."]
     return [
         *lines,
-        f"While the controller stops or is at fault: what the output module is set to; it must be {wire(d.centre, d)}.",
+        f"While the controller stops or is at fault: what the output module is set to; it must be {d.at_rest}.",
     ]
 
 
@@ -437,7 +438,7 @@ def _codesys_settings(d: BlockNumbers) -> list[Setting]:
 
 
 def _codesys_states(d: BlockNumbers) -> list[str]:
-    rest = wire(d.centre, d)
+    rest = d.at_rest
     block = "Util.PID_FIXCYCLE" if d.integrates else "Util.PD, as there is no integral: TN = 0 has no meaning in PID"
     task = f"it must be called by a task of {number(d.sample_time)} s"
     is_rough = d.differentiates and not d.integrates
@@ -509,17 +510,6 @@ def _beckhoff_settings(d: BlockNumbers) -> list[Setting]:
     ]
 
 
-def _beckhoff_states(d: BlockNumbers) -> list[str]:
-    rest = wire(d.centre, d)
-    return [
-        f"At error 0 from rest: fOut = 0, {rest} on the wire.",
-        f"Stopped (eCTRL_MODE_PASSIVE, eCTRL_MODE_RESET): fOut = 0, {rest}. In manual: fManSyncValue, the same.",
-        "At a fault of the sensor: it goes on with the last value. Set eMode := eCTRL_MODE_PASSIVE by your terminal's "
-        "WcState and status bits, and where bError is TRUE.",
-        f"While the task stops: what the terminal's watchdog is set to (a default output value); it must be {rest}.",
-    ]
-
-
 BECKHOFF_BLOCK = MakerBlock(
     "Beckhoff FB_CTRL_PID (TF4100 Controller Toolbox)",
     "G(s) = fKp (1 + 1/(tTn s) + tTv s/(1 + tTd s))",
@@ -531,7 +521,14 @@ BECKHOFF_BLOCK = MakerBlock(
         "The page draws the anti-reset windup (ARW) as a figure only: taken as clamping. TIME counts in ms.",
     ),
     _beckhoff_settings,
-    _beckhoff_states,
+    lambda d: [
+        f"At error 0 from rest: fOut = 0, {d.at_rest} on the wire.",
+        f"Stopped (eCTRL_MODE_PASSIVE, eCTRL_MODE_RESET): fOut = 0, {d.at_rest}. In manual: fManSyncValue, the same.",
+        "At a fault of the sensor: it goes on with the last value. Set eMode := eCTRL_MODE_PASSIVE by your terminal's "
+        "WcState and status bits, and where bError is TRUE.",
+        "While the task stops: what the terminal's watchdog is set to (a default output value); it must be "
+        f"{d.at_rest}.",
+    ],
     "eMode := eCTRL_MODE_MANUAL with fManSyncValue := 0.0",
     weights=lambda d: (nearest_weight(d.b), nearest_weight(d.c)),
     time_grain=TIME_GRAIN,
@@ -590,16 +587,6 @@ def _limit_settings(low: float, high: float, d: BlockNumbers) -> list[Setting]:
     ]
 
 
-def _simulink_states(d: BlockNumbers) -> list[str]:
-    rest = wire(d.centre, d)
-    return [
-        f"At error 0 from rest: the output is 0, {rest} on the wire behind the Bias block.",
-        "At a fault of the sensor: it goes on with the last value. A Switch behind the block takes 0 in its place, and "
-        "External reset starts its states anew.",
-        f"Before the first sample and after the stop of a target: the value of its output block; it must be {rest}.",
-    ]
-
-
 SIMULINK_BLOCK = MakerBlock(
     "Simulink Discrete PID Controller (2DOF), form Parallel",
     "u = P (b r - y) + I Ts z/(z - 1) (r - y) + D N/(1 + N Ts z/(z - 1)) (c r - y)",
@@ -608,7 +595,13 @@ SIMULINK_BLOCK = MakerBlock(
         "Its back-calculation acts on the next sample where ours acts on this one: a difference of one sample.",
     ),
     _simulink_settings,
-    _simulink_states,
+    lambda d: [
+        f"At error 0 from rest: the output is 0, {d.at_rest} on the wire behind the Bias block.",
+        "At a fault of the sensor: it goes on with the last value. A Switch behind the block takes 0 in its place, and "
+        "External reset starts its states anew.",
+        "Before the first sample and after the stop of a target: the value of its output block; it must be "
+        f"{d.at_rest}.",
+    ],
     "a Manual Switch behind the block at 0",
     clamps=False,
 )

@@ -1,5 +1,6 @@
 """`write_expressions`: the operations of an SX Function as assignments in any language, readable by its engineers.
 
+`write_program_text` words a whole program so, and `make_header` says above it where it comes from and what to mind.
 A walk over the graph, whose operations a `Syntax` words. Symbols keep their names; what has a label gets its name; what
 is used once stands where it is used. Each value is computed at the rarer of two rates: when the parameters are set, or
 at every sample; a division by what is known before the sample becomes a multiplication by its reciprocal, which moves a
@@ -90,7 +91,7 @@ ARITHMETIC: Mapping[int, OperationSyntax] = {
 class Syntax:
     """What a language calls the operations."""
 
-    forms: Mapping[int, OperationSyntax]  # by CasADi's operation, and `SELECT`
+    operations: Mapping[int, OperationSyntax]  # by CasADi's operation, and `SELECT`
     infinity: str  # a number larger than all others
     truth: OperationSyntax  # 1 where a condition holds, else 0
     condition: OperationSyntax  # whether a number is not 0
@@ -208,8 +209,8 @@ class _Writer:
         return self._apply(ca.OP_MUL, [i.sources[0], self.reciprocals[i.sources[-1]]])
 
     def _apply(self, operation: int, sources: Sequence[int]) -> _Value:
-        form = self.syntax.forms.get(operation)
-        if form is None:
+        wording = self.syntax.operations.get(operation)
+        if wording is None:
             raise NotImplementedError(f"CasADi's operation {operation}")
         self.written.operations.add(operation)
         conditional = operation in (SELECT, ca.OP_IF_ELSE_ZERO)
@@ -218,10 +219,10 @@ class _Writer:
         varies = any(v.varies for v in found)
         if varies:
             found = [v if v.varies else self._keep(k, v) for k, v in zip(sources, found, strict=True)]
-        if form.template.count("{0}") > 1 and not found[0].is_atom:
+        if wording.template.count("{0}") > 1 and not found[0].is_atom:
             found[0] = self._name(sources[0], found[0])
-        texts = (v.text if v.binding >= need else f"({v.text})" for v, need in zip(found, form.needs, strict=False))
-        return _Value(form.template.format(*texts), form.binding, operation in COMPARISONS | LOGIC, varies)
+        texts = (v.text if v.binding >= need else f"({v.text})" for v, need in zip(found, wording.needs, strict=False))
+        return _Value(wording.template.format(*texts), wording.binding, operation in COMPARISONS | LOGIC, varies)
 
     def _shorten(self, place: int, value: _Value) -> _Value:
         """The value, under a name of its own where it has a label, is used again, or is long."""
@@ -257,9 +258,9 @@ class _Writer:
         value = self.values[place]
         return value if value.is_condition else self._wrap(self.syntax.condition, value, True)
 
-    def _wrap(self, form: OperationSyntax, value: _Value, is_condition: bool) -> _Value:
-        text = value.text if value.binding >= form.needs[0] else f"({value.text})"
-        return _Value(form.template.format(text), form.binding, is_condition, value.varies)
+    def _wrap(self, wording: OperationSyntax, value: _Value, is_condition: bool) -> _Value:
+        text = value.text if value.binding >= wording.needs[0] else f"({value.text})"
+        return _Value(wording.template.format(text), wording.binding, is_condition, value.varies)
 
 
 def _simplify(instructions: list[Instruction]) -> list[Instruction]:
