@@ -1,7 +1,4 @@
-"""Step responses of closed loops, with reference, band and command, and what goes on inside the drive.
-
-The Bode plot of an open loop with its margins, and the sensitivities that they come from.
-"""
+"""Step responses of closed loops, with what goes on inside the drive, and the Bode plot of an open loop."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +13,7 @@ from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.margins import Margins, frequency_grid, frequency_response, margins
 from pneuopt.evaluation.metric import Band, band_share, describe_band
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, finish_columns, legend_above
-from pneuopt.plotting.tolerances import CURVE_POINTS, MAX_PLOT_COLUMNS, MIN_PLOTTED_SENSITIVITY
+from pneuopt.plotting.tolerances import MAX_PLOT_COLUMNS, MIN_PLOTTED_SENSITIVITY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -113,12 +110,12 @@ def _draw_tracking(axes: "Axes", response: Response, band: Band) -> None:
     _set_view_limits(axes, signal, ends, ends if before is None else before[response.measured])
 
 
-def _reference_curve(reference: Reference, end: float) -> tuple[Array, Array]:
+def _reference_curve(reference: Reference, end: float, points: int = 500) -> tuple[Array, Array]:
     """Points of a reference up to the end of its record; a step stands upright."""
     if isinstance(reference, Step):
         values = [reference.initial, reference.initial, reference.final, reference.final]
         return np.array([0, reference.at, reference.at, end]), np.array(values)
-    t = np.linspace(0, end, CURVE_POINTS)
+    t = np.linspace(0, end, points)
     return t, reference.values(t)
 
 
@@ -176,7 +173,9 @@ def plot_bode(open_loop: Linearisation, before: Linearisation | None = None) -> 
         _draw_curves((top, middle, bottom), before, omega, GREY, "before")
     phase = _draw_curves((top, middle, bottom), open_loop, omega, BLUE, "" if before is None else "tuned")
     _mark_margins(top, middle, m, omega, phase)
-    _mark_peak(bottom, m)
+    bottom.axhline(1, color=GREY, lw=0.8)
+    if math.isfinite(m.max_sensitivity_frequency) and math.isfinite(m.max_sensitivity):
+        bottom.plot([m.max_sensitivity_frequency], [m.max_sensitivity], "o", color=BLUE, ms=4)
     for axes, name in ((top, "gain [dB]"), (middle, "phase [deg]"), (bottom, "|S|, dashed |T|")):
         axes.set_ylabel(name)
     bottom.set_xlabel("frequency [rad/s]")
@@ -221,13 +220,6 @@ def _mark_margins(top: "Axes", middle: "Axes", m: Margins, omega: Array, phase: 
     for level in (-180 + 360 * k for k in (-2, -1, 0, 1) if np.min(phase) - 45 < -180 + 360 * k < np.max(phase) + 45):
         middle.axhline(level, color=GREY, lw=0.8)
     middle.yaxis.set_major_locator(MultipleLocator(90))
-
-
-def _mark_peak(axes: "Axes", m: Margins) -> None:
-    """Where feedback makes things worse the most."""
-    axes.axhline(1, color=GREY, lw=0.8)
-    if math.isfinite(m.max_sensitivity_frequency) and math.isfinite(m.max_sensitivity):
-        axes.plot([m.max_sensitivity_frequency], [m.max_sensitivity], "o", color=BLUE, ms=4)
 
 
 def _plot_frequencies(open_loop: Linearisation, marks: Sequence[float]) -> Array:

@@ -127,6 +127,6 @@ def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.filterwarnings("default")  # dask's own
 def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="dask is not installed: pip install 'pneuopt[cluster]'")
-    monkeypatch.setattr("pneuopt.studies.executors._CONNECT_SECONDS", 0.2)
+    monkeypatch.setattr("pneuopt.studies.executors.CONNECT_SECONDS", 0.2)
     with pytest.raises(InputError, match="there is no dask scheduler"), open_executor("tcp://127.0.0.1:1"):
         pass

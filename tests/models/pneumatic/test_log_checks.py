@@ -18,7 +18,8 @@ import pneuopt as po
 from pneuopt.dynamics.hooks import Log
 from pneuopt.models.catalog import DriveSet, b32, s32, t32
 from pneuopt.models.pneumatic.cylinder import volumes
-from pneuopt.models.pneumatic.log_checks import LEADS, Balance, LinePressureCheck
+from pneuopt.models.pneumatic.log_checks import Balance, LinePressureCheck
+from pneuopt.models.tolerances import LEADS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import without_prefix
 from pneuopt.quantities.trajectories import Trajectory

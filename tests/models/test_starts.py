@@ -9,14 +9,14 @@ from pneuopt.dynamics.system import DiscreteSystem, discretise, names, parameter
 from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.load import Load
-from pneuopt.models.starts.friction import (
-    FILTER_TIMES,
+from pneuopt.models.starts import (
     RegressionRows,
     choose_filter_time,
     filter_motion,
     force_misfit,
     load_columns,
 )
+from pneuopt.models.tolerances import FILTER_TIMES
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
