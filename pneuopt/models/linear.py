@@ -10,7 +10,7 @@ import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -198,7 +198,18 @@ def _build_plant(sections: DriveSections) -> Plant:
     options = sections.options("plant")
     signals = [options["input"], options["output"]]
     check_names("channel", signals, CHANNELS, f"{sections.location('plant', '')}: [plant]")
-    u, y = (_signal(sections, options, key) for key in ("input", "output"))
+    quantities = []
+    for key, name in zip(("input", "output"), signals, strict=True):
+        unit = options[f"{key}_unit"]
+        if unit is None:
+            known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
+            quantities.append(known.get(name, Quantity(name, CHANNELS[name])))
+        else:  # in another unit than the channel's: that of a transducer, say
+            where = sections.place("plant", f"{key}_unit")
+            message = f'{where}: {unit!r} is no SI unit without a prefix, such as "V"'
+            require(read_si(f"1 {unit}", where=where) == 1.0, message)
+            quantities.append(Quantity(name, unit))
+    u, y = quantities
     order = options["pade_order"]
     if order is None:
         order = USUAL_PADE_ORDER if sections.has("plant", "dead_time") else 0
@@ -206,17 +217,6 @@ def _build_plant(sections: DriveSections) -> Plant:
         return SecondOrder(order, read_friction(sections) if sections.has("friction") else None, u, y)
     plant: Plant = options["model"](order, u, y)
     return plant
-
-
-def _signal(sections: DriveSections, options: Mapping[str, Any], key: str) -> Quantity:
-    """The input or the output, in the channel's unit or in another one: that of a transducer, say."""
-    name, unit = options[key], options[f"{key}_unit"]
-    if unit is None:
-        known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
-        return known.get(name, Quantity(name, CHANNELS[name]))
-    where = sections.place("plant", f"{key}_unit")
-    require(read_si(f"1 {unit}", where=where) == 1.0, f'{where}: {unit!r} is no SI unit without a prefix, such as "V"')
-    return Quantity(name, unit)
 
 
 _OWN_UNIT = "parameters then count in it"

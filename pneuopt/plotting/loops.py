@@ -167,7 +167,10 @@ def plot_bode(open_loop: Linearisation, before: Linearisation | None = None) -> 
     Figure
     """
     m = margins(open_loop)
-    omega = _plot_frequencies(open_loop, [m.gain_crossover, m.phase_crossover, m.max_sensitivity_frequency])
+    omega, marks = frequency_grid(open_loop), (m.gain_crossover, m.phase_crossover, m.max_sensitivity_frequency)
+    finite = [w for w in marks if math.isfinite(w) and w > 0]
+    if finite:  # the grid of all features is cut to one and a half decades around the crossovers
+        omega = omega[(omega >= min(finite) / 30) & (omega <= max(finite) * 30)]
     figure, ((top,), (middle,), (bottom,)) = axes_grid(3, 1, [2.0, 2.0, 1.8], sharex="col", width=7.0)
     if before is not None:
         _draw_curves((top, middle, bottom), before, omega, GREY, "before")
@@ -220,15 +223,6 @@ def _mark_margins(top: "Axes", middle: "Axes", m: Margins, omega: Array, phase: 
     for level in (-180 + 360 * k for k in (-2, -1, 0, 1) if np.min(phase) - 45 < -180 + 360 * k < np.max(phase) + 45):
         middle.axhline(level, color=GREY, lw=0.8)
     middle.yaxis.set_major_locator(MultipleLocator(90))
-
-
-def _plot_frequencies(open_loop: Linearisation, marks: Sequence[float]) -> Array:
-    """The grid of all features, cut to one and a half decades around the crossovers."""
-    omega = frequency_grid(open_loop)
-    finite = [w for w in marks if math.isfinite(w) and w > 0]
-    if not finite:
-        return omega
-    return omega[(omega >= min(finite) / 30) & (omega <= max(finite) * 30)]
 
 
 def _mark_frequency(rows: tuple["Axes", "Axes"], omega: float, color: str) -> None:

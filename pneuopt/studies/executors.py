@@ -193,7 +193,7 @@ class CaseQueue:
         return self._left > 0 or bool(self._again or self._suspect)
 
     def take(self, *, alone: bool = True) -> Chunk | None:
-        """The next chunk, or None; those whose process has died come last, and only if nothing runs beside (`alone`)."""
+        """The next chunk, or None; those whose process has died come last, if nothing else runs (`alone`)."""
         if self._again:
             return self._again.popleft()
         size = 1
@@ -256,7 +256,11 @@ def run_in_processes(
             while crew.busy:
                 for run, future in crew.wait():
                     yield from _receive(crew, queue, run, future)
-                yield from _stop_late(crew, queue)
+                for late in crew.stop_late():
+                    if late.chunk is not None:
+                        yield from queue.separate(late.chunk, chosen.time_reason)
+                    if queue:
+                        crew.start()
             while chunk := queue.take():
                 yield from ((name, Outcome(error="no process could be started for it")) for name in chunk.cases)
         finally:
@@ -301,8 +305,8 @@ class _Crew:
         done = wait(self.busy, None if patience == inf else max(patience, 0.0), FIRST_COMPLETED).done
         return [(self.busy.pop(future), future) for future in list(self.busy) if future in done]
 
-    def late(self) -> list[_Run]:
-        """End the processes that had their time; what they computed."""
+    def stop_late(self) -> list[_Run]:
+        """Kill the processes that had their time; returns what they computed."""
         now = time.monotonic()
         late = {future: run for future, run in self.busy.items() if run.deadline <= now and not future.done()}
         for future, run in late.items():
@@ -345,15 +349,6 @@ def _receive(
         crew.give(run.process, chunk)
     if run.chunk is not None:
         yield from zip(run.chunk.cases, outcomes, strict=False)  # fewer outcomes where the last is an interruption
-
-
-def _stop_late(crew: _Crew, queue: CaseQueue) -> Iterator[tuple[str, Outcome]]:
-    """Kill what takes too long, and let other processes go on."""
-    for run in crew.late():
-        if run.chunk is not None:
-            yield from queue.separate(run.chunk, crew.limits.time_reason)
-        if queue:
-            crew.start()
 
 
 @contextmanager

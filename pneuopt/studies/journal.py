@@ -243,9 +243,14 @@ class Journal:
             before = head.get("study") if isinstance(head, dict) else None
             if resume:
                 self._check_study(before, study)
-            entries = _read_entries(lines[1:]) if before == study else {}
-            self._marks = {name: mark for name, (mark, _) in entries.items()}
-            self.known: Mapping[str, Outcome] = {name: outcome for name, (_, outcome) in entries.items()}
+            entries = [entry for entry in map(_parse, lines[1:] if before == study else ()) if isinstance(entry, dict)]
+            whole = [
+                e for e in entries if {"case", "of", "results"} <= e.keys()
+            ]  # of a case there twice, the last counts
+            self._marks = {e["case"]: e["of"] for e in whole}
+            self.known: Mapping[str, Outcome] = {
+                e["case"]: Outcome(e["results"], float(e.get("seconds", 0.0))) for e in whole
+            }
             self._count, self._synced, self._is_cut = len(self.known), 0.0, before == study
             self._file: IO[str] = self.path.open("a" if before == study else "w", encoding="utf-8")
             self._write([] if before == study else [json.dumps({"study": study})])
@@ -325,14 +330,6 @@ class CaseMarks:
 
 def _describe_failure(path: Path, error: OSError) -> str:
     return f"{path}: cannot be written ({error.strerror}); cases are not kept, make room and run the study again"
-
-
-def _read_entries(lines: list[bytes]) -> dict[str, tuple[str, Outcome]]:
-    """Marks and outcomes of the lines that are whole, by case; of a case that is there twice, the last."""
-    entries = [entry for entry in map(_parse, lines) if isinstance(entry, dict) and {"case", "of"} <= entry.keys()]
-    return {
-        e["case"]: (e["of"], Outcome(e["results"], float(e.get("seconds", 0.0)))) for e in entries if "results" in e
-    }
 
 
 def _parse(line: bytes) -> object:

@@ -50,19 +50,15 @@ def evaluate_case(fn: CaseFunction, parameters: ParameterSet, values: CaseValues
         begun = time.perf_counter()
         result, seconds = fn(given), time.perf_counter() - begun
         results = _plain_results(result)
-        return Outcome(results, seconds, _describe_nan(results))
+        numbers = [v for v in results.values() if isinstance(v, float | int) and not isinstance(v, bool)]
+        error = ""  # a NaN among numbers says something, a metric that a response lacks; NaN alone is no result
+        if numbers and all(math.isnan(v) for v in numbers):
+            error = f"{next(iter(results))} is NaN" if len(results) == 1 else "all its numbers are NaN"
+        return Outcome(results, seconds, error)
     except KeyboardInterrupt:
         return Outcome(error=INTERRUPTED_CASE)
     except (Exception, SystemExit) as error:
         return Outcome(seconds=time.perf_counter() - begun, error=describe_error(error))
-
-
-def _describe_nan(results: Mapping[str, Any]) -> str:
-    """What is wrong where no number came out; a NaN among numbers says something: a metric that a response lacks."""
-    numbers = [v for v in results.values() if isinstance(v, float | int) and not isinstance(v, bool)]
-    if not numbers or not all(v != v for v in numbers):  # noqa: PLR0124 - NaN
-        return ""
-    return f"{next(iter(results))} is NaN" if len(results) == 1 else "all its numbers are NaN"
 
 
 def describe_error(error: BaseException) -> str:

@@ -75,7 +75,14 @@ class Sensitivity(Shown):
             mean, spread = (format_number(float(about[n]), 4) for n in ("mean", "std"))
             parts.append(Line(f"{figure}: mean {mean}, standard deviation {spread}{lost}", Tone.HEADING))
             own = self.table.loc[[figure]].droplevel(0).sort_values("total", ascending=False)
-            parts.append(Table(columns, tuple(_row(str(axis), row) for axis, row in own.iterrows())))
+            rows = []
+            for axis, row in own.iterrows():
+                cells = [str(axis)]
+                for name in ("total", "first"):
+                    low, high = row[f"{name}_low"], row[f"{name}_high"]
+                    cells += [f"{row[name]:.2f}", f"{low:.2f} to {high:.2f}"] if np.isfinite(low) else ["-", "-"]
+                rows.append(tuple(cells))
+            parts.append(Table(columns, tuple(rows)))
         return Report(tuple(parts))
 
 
@@ -214,14 +221,6 @@ def _estimate(blocks: Array) -> Array:
     given: Any = {"f_A": blocks[:1], "f_B": blocks[1:2], "f_AB": blocks[2:, None]}
     found = sobol_indices(func=given, n=blocks.shape[1])
     return np.vstack([found.first_order, found.total_order])
-
-
-def _row(axis: str, row: "pd.Series[Any]") -> tuple[str, ...]:
-    cells = [axis]
-    for name in ("total", "first"):
-        low, high = row[f"{name}_low"], row[f"{name}_high"]
-        cells += [f"{row[name]:.2f}", f"{low:.2f} to {high:.2f}"] if np.isfinite(low) else ["-", "-"]
-    return tuple(cells)
 
 
 LOCAL_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError")

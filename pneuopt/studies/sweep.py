@@ -156,21 +156,18 @@ def _read_column(column: "pd.Series[Any]", written: str, unit: str, where: str) 
 
 def check_case(parameters: ParameterSet, case: CaseValues, name: str) -> None:
     """Raise `InputError`, which names the case, if it has an unknown parameter, or a value out of bounds."""
-    if isinstance(case, ParameterSet) or all(_is_inside(parameters, n, v) for n, v in case.items()):
+    if isinstance(case, ParameterSet):
         return
+    known = {n: parameters[n] for n in case if n in parameters}
+    if len(known) == len(case) and all(
+        p.lower <= case[n] <= p.upper and (not p.log or case[n] > 0) for n, p in known.items()
+    ):
+        return  # certainly good; below, the words where it is not
     check_names("parameter", case, parameters, name)
     try:
         parameters.with_values(case)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-
-
-def _is_inside(parameters: ParameterSet, name: str, value: float) -> bool:
-    """Whether a value is certainly good; `ParameterSet.with_values` finds the words where it is not."""
-    if name not in parameters:
-        return False
-    p = parameters[name]
-    return p.lower <= value <= p.upper and (not p.log or value > 0)
 
 
 def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:

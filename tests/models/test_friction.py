@@ -21,7 +21,6 @@ from pneuopt.models.friction import (
     stribeck_curve,
 )
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ModelError
 
 STATIC: dict[str, FrictionModel] = {"viscous": Viscous(), "coulomb": Coulomb(), "stribeck": Stribeck()}
 MODELS: dict[str, FrictionModel] = {
@@ -188,11 +187,6 @@ def test_pressure_and_direction_multiply() -> None:
     values = {"coulomb": 4.0, "viscous": 0.0, "coulomb_pressure_a": 2e-5, "coulomb_asymmetry": 0.5}
     model = PressureDependent(Asymmetric(Coulomb()))
     assert force(model, 0.5, values, {"pressure_a": 3e5}) == pytest.approx((4 + 6) * 1.5)
-
-
-def test_pressure_needs_a_coulomb_level() -> None:
-    with pytest.raises(ModelError, match=r"Viscous.* has no Coulomb level .*; take Coulomb\(\), Stribeck\(\) or LuGre"):
-        PressureDependent(Viscous())
 
 
 @pytest.mark.parametrize("name", MODELS)

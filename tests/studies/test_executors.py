@@ -104,17 +104,6 @@ def test_a_certified_loop_is_the_same_on_a_cluster(dask: Executor) -> None:
     assert_identical(sweep(certify, given, cases, executor=dask), serial)
 
 
-@pytest.mark.parametrize("word", ["", "-1", "two", "dsk", "http://host:8786"])
-def test_a_word_that_names_no_executor_is_refused(word: str) -> None:
-    with pytest.raises(InputError, match="give a number of processes, dask, or a scheduler"), open_executor(word):
-        pass
-
-
-def test_no_processes_are_refused() -> None:
-    with pytest.raises(InputError, match="a process at least, got 0"), open_executor("0"):
-        pass
-
-
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (

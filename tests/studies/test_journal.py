@@ -76,7 +76,7 @@ def test_a_study_that_is_done_leaves_no_journal(tmp_path: Path) -> None:
     journal.add("a", "0", Outcome({"x": 1.0}, 0.1))
     journal.close(finished=True)
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError):
         Journal(tmp_path / "none" / "journal", "study")
 
 
@@ -116,7 +116,7 @@ def test_a_case_of_the_same_name_with_other_values_is_computed_again(tmp_path: P
 
 def test_a_study_is_resumed_only_if_nothing_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, inputs = tmp_path / "journal", {"drive.toml": "1", "tuning.toml": "2"}
-    with pytest.raises(InputError, match="there is nothing to resume; leave out --resume"):
+    with pytest.raises(InputError):
         Journal(path, inputs, resume=True)
     journal = Journal(path, inputs)
     journal.add("a", "mark", Outcome({"x": 1 / 3}, 0.1))
@@ -124,8 +124,7 @@ def test_a_study_is_resumed_only_if_nothing_has_changed(tmp_path: Path, monkeypa
     again = Journal(path, inputs, resume=True)
     again.close(finished=False)
     assert again.find("a", "mark") == Outcome({"x": 1 / 3}, 0.1)
-    said = r"is of another study, tuning\.toml changed since; put that back, or begin anew"
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=r"tuning\.toml"):
         Journal(path, {**inputs, "tuning.toml": "3"}, resume=True)
     monkeypatch.setattr("pneuopt.studies.journal.provenance", lambda: {"casadi": "9.9", "options": ""})
     with pytest.raises(InputError, match="version of casadi"):
@@ -252,7 +251,7 @@ def test_a_column_of_numbers_and_texts_is_one_of_texts() -> None:
 
 def test_parquet_without_pyarrow_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"Parquet needs pyarrow; run: pip install 'pneuopt\[parquet\]'"):
+    with pytest.raises(InputError, match="pyarrow"):
         RowFile(tmp_path / "rows.parquet")
 
 

@@ -95,20 +95,6 @@ def test_nan_is_a_reason_where_no_number_came_out() -> None:
     assert outcome({"word": "none"}) == ""
 
 
-@pytest.mark.parametrize(
-    ("seconds", "megabytes", "said"),
-    [(0.0, 1.0, "time limit of a case must be positive"), (math.nan, 1.0, "time"), (1.0, -1.0, "memory limit")],
-)
-def test_limits_that_cannot_be_are_refused(seconds: float, megabytes: float, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        Processes(None, seconds, megabytes)
-
-
-def test_no_process_at_all_is_refused() -> None:
-    with pytest.raises(InputError, match="a process at least, got 0"):
-        Processes(0)
-
-
 def test_memory_is_limited_on_linux_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "win32")
     with pytest.raises(InputError, match="needs Linux; leave it out"):

@@ -527,7 +527,18 @@ def solve_steady_motion(glide: MotionBalance, p: ParameterSet, pressure_b: float
     if pressure_b is None:
         spool, a, b = _solve_balance(glide, p)
     else:
-        spool, a, b = 0.0, _balance_pressure_a(glide, p, pressure_b), pressure_b
+        spool, b = 0.0, pressure_b
+        require(
+            b > MIN_CHAMBER_PRESSURE,
+            f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {MIN_CHAMBER_PRESSURE:g} Pa",
+        )
+        low, high = p.value("ambient.pressure"), p.value("supply.pressure")
+        at_low, at_high = (glide.rates(spool, a, b)[2] for a in (low, high))
+        a = low - at_low * (high - low) / (at_high - at_low)  # the force is linear in the pressure
+        require(
+            a > MIN_CHAMBER_PRESSURE,
+            f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more",
+        )
     return glide.states(spool, a, b), p.value("valve.centre") + spool * p.value("valve.span")
 
 
@@ -569,22 +580,6 @@ def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float,
         f"{what}: a chamber would need {a if low < pressure_b_at < high else pressure_b_at:g} Pa(a); lower the speed",
     )
     return spool, a, pressure_b_at
-
-
-def _balance_pressure_a(glide: MotionBalance, p: ParameterSet, b: float) -> float:
-    """Pressure in chamber a that balances pressure b; the force is linear in it."""
-    require(
-        b > MIN_CHAMBER_PRESSURE,
-        f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {MIN_CHAMBER_PRESSURE:g} Pa",
-    )
-    low, high = p.value("ambient.pressure"), p.value("supply.pressure")
-    at_low, at_high = (glide.rates(0.0, a, b)[2] for a in (low, high))
-    a = low - at_low * (high - low) / (at_high - at_low)
-    require(
-        a > MIN_CHAMBER_PRESSURE,
-        f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more",
-    )
-    return a
 
 
 def _zero_crossing_or_end(rate: Callable[[float], float], low: float, high: float) -> float:

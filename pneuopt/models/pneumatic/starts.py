@@ -79,7 +79,13 @@ class AirSimulator:
         u[:-1, inner] = (u[:-1, inner] + u[1:, inner]) / 2
         h = np.append(np.diff(given.t), 0.0)
         h = np.minimum(h, MAX_USUAL_STEPS * np.median(h))  # behind a hole of the log the air soon forgets its start
-        x0 = np.array([[self._initial_value(q.name, p) for q in self.states] for p in sets]).reshape(len(sets), -1)
+        x0 = np.zeros((len(sets), len(self.states)))
+        for row, p in zip(x0, sets, strict=True):
+            for k, name in enumerate(names(self.states)):
+                if name in PRESSURE_NAMES:
+                    row[k] = (p.value("supply.pressure") + p.value("ambient.pressure")) / 2
+                elif name.startswith("temperature"):
+                    row[k] = p.value("ambient.temperature")
         substeps = max(1, math.ceil(float(h.max()) / MAX_INTEGRATION_STEP))
         x = self._roll_out(x0, u, sets, (given.t, h), substeps, states=True)
         return [dict(zip(names(self.states), columns.T, strict=True)) for columns in x]
@@ -105,11 +111,6 @@ class AirSimulator:
         with np.errstate(all="ignore"):  # absurd parameters may overflow; the caller then gets no finite number
             run = self._rollout.run(x0, inputs, p, t, h, substeps=substeps, states=states)
         return run.y if run.x is None else run.x
-
-    def _initial_value(self, name: str, p: ParameterSet) -> float:
-        if name in PRESSURE_NAMES:
-            return (p.value("supply.pressure") + p.value("ambient.pressure")) / 2
-        return p.value("ambient.temperature") if name.startswith("temperature") else 0.0
 
 
 ValveValues = Mapping[str, float]
