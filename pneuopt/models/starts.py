@@ -43,7 +43,7 @@ def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[S
     """Starts of a `ForceDrive`: states from the filtered logs, parameters from M a + F_f(v) + F_L = F."""
 
     @functools.cache
-    def filtered(window: float) -> dict[str, RegressionRows]:
+    def balances(window: float) -> dict[str, RegressionRows]:
         rows = {}
         for name, (measured, parameters, _) in logs.items():
             position, speed, acceleration = filter_motion(measured, window)
@@ -51,7 +51,7 @@ def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[S
             rows[name] = RegressionRows(measured, parameters, speed, measured["force"], columns, states)
         return rows
 
-    return friction_candidates(friction, filtered(choose_filter_time(friction, filtered)))
+    return friction_candidates(friction, balances(choose_filter_time(friction, balances)))
 
 
 def motion_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:

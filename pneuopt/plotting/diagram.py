@@ -164,6 +164,18 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
     sheet.draw_arrow("reference", loop.feedback.unit, least=1.2 if loop.feedforward else 0.9)
     begin, error = sheet.x, sheet.draw_sum("−")
     sheet.draw_arrow("error", loop.feedback.unit)
+    _draw_controller(sheet, loop)
+    _draw_sampling(sheet, loop, begin)
+    sheet.draw_arrow("control", loop.command.unit, least=sheet.above + 0.15 - sheet.x)
+    outlet = _draw_plant(sheet, loop)
+    _draw_feedback(sheet, loop, outlet, error)
+    _list_states(sheet, loop)
+    sheet.fit(figure)
+    return figure
+
+
+def _draw_controller(sheet: Sheet, loop: ClosedLoop) -> None:
+    """Position loop, PID, and what is added to its command, in the order in which the controller computes them."""
     if loop.outer is not None:  # of a cascade; what the PID is fed back itself is said in words
         sheet.write_below(sheet.draw_block("$K_p$", STYLE.small_width), "position\nloop")
         sheet.draw_arrow(f"{loop.pid_signal.name} wanted", loop.pid_signal.unit)
@@ -196,13 +208,6 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
     elif loop.dither:
         sheet.draw_source("dither: offset", STYLE.source_width, STYLE.source_height)
     _draw_limits(sheet, loop)
-    _draw_sampling(sheet, loop, begin)
-    sheet.draw_arrow("control", loop.command.unit, least=sheet.above + 0.15 - sheet.x)
-    outlet = _draw_plant(sheet, loop)
-    _draw_feedback(sheet, loop, outlet, error)
-    _list_states(sheet, loop)
-    sheet.fit(figure)
-    return figure
 
 
 def _draw_sampling(sheet: Sheet, loop: ClosedLoop, begin: float) -> None:

@@ -17,7 +17,6 @@ import pytest
 
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies import journal as row_file
 from pneuopt.studies.journal import Journal, RowFile, parquet_bytes
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
@@ -193,8 +192,8 @@ def test_a_study_that_is_killed_loses_no_row_and_ends_in_the_same_table(tmp_path
     assert run() == (0, ["0", resumed])
 
 
-RIG_ROW_FILE = ParameterSet({"mass": Parameter(1.0, "kg")})
-CASES_ROW_FILE = {f"case {k}": {"mass": 1.0 + k} for k in range(5)}
+MASS = ParameterSet({"mass": Parameter(1.0, "kg")})
+MASSES = {f"case {k}": {"mass": 1.0 + k} for k in range(5)}
 
 
 def read(path: Path) -> pd.DataFrame:
@@ -211,14 +210,14 @@ def third(p: ParameterSet) -> dict[str, float]:
 def test_the_file_holds_each_row_as_soon_as_its_case_is_done(
     tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(row_file, "_REWRITE_SECONDS", 0.0)
-    monkeypatch.setattr(row_file, "_REWRITE_SHARE", inf)
+    monkeypatch.setattr("pneuopt.studies.journal.REWRITE_SECONDS", 0.0)
+    monkeypatch.setattr("pneuopt.studies.journal.REWRITE_SHARE", inf)
     path, seen = tmp_path / f"rows.{suffix}", list[pd.DataFrame]()
     journal = Journal(tmp_path / "journal", "study", rows=RowFile(path, lambda n: f"{n} [kg]" if n == "mass" else n))
     table = sweep(
         third,
-        RIG_ROW_FILE,
-        CASES_ROW_FILE,
+        MASS,
+        MASSES,
         executor=ThreadPoolExecutor(1),
         journal=journal,
         progress=lambda _: seen.append(read(path)),

@@ -1,4 +1,4 @@
-""""""
+"""Studies: named cases, their table, and what becomes of them when something fails or is interrupted."""
 
 import importlib
 import os
@@ -338,25 +338,17 @@ sweep.sweep(str, ParameterSet({"mass": Parameter(5.0, "kg")}), {"one": {}})
     assert done.stdout == "True\n"
 
 
-RIG_CASES = ParameterSet(
-    {
-        "load.mass": Parameter(5.0, "kg", 0.1, 100.0),
-        "supply.pressure": Parameter(7e5, "Pa(a)"),
-    }
-)
-
-
 def test_rows_of_a_file_become_cases_in_si(tmp_path: Path) -> None:
     path = tmp_path / "plants.csv"
     path.write_text("load.mass [g],case,supply.pressure [bar(a)]\n4000,left,5\n6500,right,7\n", encoding="utf-8")
-    assert read_cases(RIG_CASES, path) == {
+    assert read_cases(RIG, path) == {
         "left": {"load.mass": 4.0, "supply.pressure": 5e5},
         "right": {"load.mass": 6.5, "supply.pressure": 7e5},
     }
 
 
 def test_rows_without_a_name_are_counted_and_plain_columns_are_si() -> None:
-    assert read_cases(RIG_CASES, pd.DataFrame({"load.mass": [4, 5]})) == {
+    assert read_cases(RIG, pd.DataFrame({"load.mass": [4, 5]})) == {
         "row 1": {"load.mass": 4.0},
         "row 2": {"load.mass": 5.0},
     }
