@@ -75,6 +75,7 @@ def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
     Parameters
     ----------
     figure : Figure
+        Its texts are mended where no file can hold them.
     path : str or Path
         Ends in .png, .pdf or .svg.
     dpi : int

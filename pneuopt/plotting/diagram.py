@@ -142,10 +142,6 @@ LAWS = {
 def plot_loop(loop: ClosedLoop) -> "Figure":
     """Draw the block diagram of a loop: its parts, and its signals with their units; only what the loop has.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-
     Returns
     -------
     Figure

@@ -50,8 +50,8 @@ def plot_fit(result: IdentificationResult, experiments: Sequence[Experiment]) ->
 
     Parameters
     ----------
-    result : Fitted
-        An `IdentificationResult`, say.
+    result : IdentificationResult
+        Its trajectories are drawn.
     experiments : sequence of Experiment
         Those that it was made from, in the same order. Windows of one log (`split`) share a column.
 
@@ -70,6 +70,7 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
     runs : sequence of Trajectory
         One an experiment.
     experiments : sequence of Experiment
+        In the same order; windows of one log (`split`) share a column.
     label : str
         What the runs are: "fitted", "predicted".
 
@@ -151,14 +152,6 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
 
 def plot_correlation(result: IdentificationResult) -> "Figure":
     """The correlation of the estimates: a cell a pair, 1 or -1 where only a combination of both is identifiable.
-
-    Parameters
-    ----------
-    result : IdentificationResult
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------
@@ -292,7 +285,9 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
     Parameters
     ----------
     system : System
-    result : Fitted
+        A drive's with a mass, or a rig's.
+    result : IdentificationResult
+        Its fit.
     experiments : sequence of Experiment
         Those that it was made from, in the same order.
 
@@ -348,6 +343,7 @@ def friction_force(system: System, run: Trajectory, parameters: ParameterSet) ->
     run : Trajectory
         Its states and inputs.
     parameters : ParameterSet
+        Those of the run.
     """
     seen, axis = {n: run[n] for n in names(system.states)}, _moving_axis(system)
     idle = {n: np.zeros(len(run)) for n in seen if n == axis.speed or n.startswith("friction.")}

@@ -33,10 +33,6 @@ if TYPE_CHECKING:
 def plot_logs(experiments: Sequence[Experiment]) -> "Figure":
     """The channels of logs, a row a channel, a column a log.
 
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-
     Returns
     -------
     Figure

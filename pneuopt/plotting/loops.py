@@ -35,6 +35,7 @@ class Response:
     run : Trajectory
         With the measured signal and "control"; "valve.spool" [1] and "friction.force" are drawn where it has them.
     reference : Reference
+        Drawn with its settling band.
     measured : str
         Column of the signal that follows the reference.
     units : tuple of str
@@ -62,6 +63,7 @@ def plot_steps(responses: Sequence[Response], *, band: Band = 0.02) -> "Figure":
     Parameters
     ----------
     responses : sequence of Response
+        Beside each other; the first three are drawn.
     band : float
         Half width of the settling band, a fraction of the step.
 

@@ -30,10 +30,6 @@ if TYPE_CHECKING:
 def plot_experiment(design: ExperimentDesign) -> "Figure":
     """The excitation, the signals with limits as the estimates predict them, and the intervals before and after.
 
-    Parameters
-    ----------
-    design : ExperimentDesign
-
     Returns
     -------
     Figure
@@ -109,10 +105,6 @@ def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
 
 def plot_tracking(found: Tracking) -> "Figure":
     """Estimates with their intervals over dates, their line with its band, and where a drift was first seen.
-
-    Parameters
-    ----------
-    found : Tracking
 
     Returns
     -------

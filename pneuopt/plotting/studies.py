@@ -203,6 +203,7 @@ def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) 
     Parameters
     ----------
     found : Sensitivity
+        Of the figures to draw, a panel each.
     local : LocalSensitivity, optional
         Of a design on the same axes: its shares are a third bar, which agrees with an axis' share by itself where the
         figure is linear over the whole box.

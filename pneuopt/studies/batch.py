@@ -122,7 +122,9 @@ def evaluate_batch(
     Parameters
     ----------
     loop : ClosedLoop
+        With a plant without Karnopp's friction.
     references : Reference or sequence of Reference
+        A column of each metric for each.
     parameters : ParameterSet
         The nominal plant and the gains.
     cases : mapping of str to mapping of str to float

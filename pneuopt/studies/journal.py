@@ -43,7 +43,6 @@ class RowFile:
 
     Attributes
     ----------
-    path : Path
     problem : str
         Why rows are missing, a full disk; empty where none are.
 
@@ -222,7 +221,6 @@ class Journal:
         What an earlier run of the same study computed, by case.
     problem : str
         Why cases could not be kept, a full disk; empty where all are.
-    rows : RowFile or None
 
     Raises
     ------

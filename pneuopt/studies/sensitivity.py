@@ -105,6 +105,7 @@ def sensitivity(
     fn : callable
         As for `sweep`; it is called ``count * (axes + 2)`` times.
     parameters : ParameterSet
+        The nominal values, about which the axes vary.
     spreads : mapping
         As for `samples`: the axes vary independently of each other.
     figures : sequence of str, optional
@@ -276,7 +277,9 @@ def local_sensitivity(
     Parameters
     ----------
     loop : ClosedLoop
+        With a plant without Karnopp's friction.
     references : Reference or sequence of Reference
+        A figure of each metric for each.
     parameters : ParameterSet
         The design, at which the derivatives are taken.
     spreads : mapping

@@ -141,6 +141,7 @@ class PneumaticDrive:
         parameters : ParameterSet
             Missing parameters have their defaults.
         start : mapping of state to value, optional
+            State from which a run begins, if its position is to be checked too.
 
         Raises
         ------
