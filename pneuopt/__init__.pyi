@@ -140,23 +140,13 @@ from .models.pneumatic.drive import PneumaticDrive
 from .models.pneumatic.gas import IsentropicNozzle, Iso6358
 from .models.pneumatic.valve import ProportionalValve, Spool
 from .models.sensing import coarse_delay, with_sensors
-from .plotting import (
-    plot_bode,
-    plot_correlation,
-    plot_distribution,
-    plot_fit,
-    plot_friction,
-    plot_front,
-    plot_logs,
-    plot_loop,
-    plot_map,
-    plot_prediction,
-    plot_residuals,
-    plot_sensitivity,
-    plot_steps,
-    plot_tracking,
-    save_figure,
-)
+from .plotting.canvas import save_figure
+from .plotting.diagram import plot_loop
+from .plotting.fits import plot_correlation, plot_fit, plot_friction, plot_prediction, plot_residuals
+from .plotting.logs import plot_logs
+from .plotting.loops import plot_bode, plot_steps
+from .plotting.plans import plot_tracking
+from .plotting.studies import plot_distribution, plot_front, plot_map, plot_sensitivity
 from .quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from .quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
 from .quantities.report import Report

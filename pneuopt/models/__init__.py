@@ -2,7 +2,8 @@
 
 Friction laws, loads, drives, transfer functions, sensors, cited numbers, and how each plant starts from a log. `files`,
 `plotting`, `studies` and `cli` may import it; identification, tuning, shooting, evaluation and dynamics never do: they
-read what a plant declares. A newcomer adds a friction law, with its row in `friction_laws`, or a plant (`drive_kinds`).
+read what a plant declares. A newcomer adds a friction law, with its row in `friction_laws`, or a plant (`drive_kinds`);
+`drives` is the file to begin with.
 """
 
 import lazy_loader

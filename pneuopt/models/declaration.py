@@ -28,28 +28,15 @@ class Drive(Protocol):
 
 @dataclass(frozen=True)
 class Alias:
-    """A key that gives a parameter in another form, such as a catalogue's nominal flow for a conductance.
-
-    Parameters
-    ----------
-    parameter : str
-        The parameter that it gives; a file has either this parameter or the alias.
-    uses : tuple of str
-        Parameters whose values the conversion needs; those that the drive lacks are left out.
-    convert : callable
-        ``convert(entry, values, where)`` returns the parameter's value [SI] from the written entry, the values [SI] of
-        `uses`, and the place with which the message of an error begins.
-    meaning, unit, example : str
-        What it is, the unit in which a file writes it, and how a file may write it.
-    """
+    """A key that gives a parameter in another form, such as a catalogue's nominal flow for a conductance."""
 
     section: str
     key: str
-    parameter: str
-    uses: tuple[str, ...]
-    convert: Callable[[Any, Mapping[str, float], str], float]
+    parameter: str  # that it gives; a file has either this parameter or the alias
+    uses: tuple[str, ...]  # parameters whose values the conversion needs, where the drive has them
+    convert: Callable[[Any, Mapping[str, float], str], float]  # (entry, values of `uses` [SI], place) -> value [SI]
     meaning: str
-    unit: str
+    unit: str  # in which a file writes it
     example: str
 
     def as_key(self) -> Key:
@@ -60,21 +47,11 @@ class Alias:
 
 @dataclass(frozen=True)
 class DriveSections:
-    """Sections of a drive's file, read key by key against their declaration.
-
-    Parameters
-    ----------
-    written : mapping
-        Sections of the file.
-    declared : mapping
-        Declared sections of the drive's kind.
-    location : callable
-        ``location(section, key)`` returns file and line for messages.
-    """
+    """Sections of a drive's file, read key by key against their declaration."""
 
     written: Sections
-    declared: Mapping[str, Mapping[str, Key]]
-    location: Callable[[str, str], str]
+    declared: Mapping[str, Mapping[str, Key]]  # of the drive's kind, by section and key
+    location: Callable[[str, str], str]  # (section, key) -> file and line for messages
 
     def has(self, section: str, key: str = "") -> bool:
         """Whether the file has the section, or the key in it."""
@@ -95,65 +72,26 @@ class DriveSections:
 
 @dataclass(frozen=True)
 class FirstFiles:
-    """What a new user's files begin with: a drive of that kind, and a loop that controls its usual values.
+    """What a new user's files begin with: a drive of that kind, and a loop that controls its usual values."""
 
-    Parameters
-    ----------
-    options : mapping
-        Sections of the drive's file with the keys that choose how it is built.
-    unknowns : tuple of str
-        Parameters that logs usually give.
-    gains : mapping of str to (float, float, float)
-        Of a parallel PID: value, lower and upper bound [SI].
-    limit : float
-        Largest command [its unit].
-    dither : (float, float), optional
-        Frequency [Hz] and largest amplitude [the command's unit].
-    steps : tuple of float
-        Heights of the references [unit of the measured signal].
-    horizon : float
-        Of each step [s].
-    swept : str
-        Parameter over which a study goes.
-    values : mapping of str to float
-        Parameters that are not as the model has them [SI].
-    """
-
-    options: Sections
-    unknowns: tuple[str, ...]
-    gains: Mapping[str, tuple[float, float, float]]
-    limit: float
-    dither: tuple[float, float] | None
-    steps: tuple[float, ...]
-    horizon: float
-    swept: str
-    values: Mapping[str, float] = field(default_factory=dict)
+    options: Sections  # of the drive's file, with the keys that choose how it is built
+    unknowns: tuple[str, ...]  # parameters that logs usually give
+    gains: Mapping[str, tuple[float, float, float]]  # of a parallel PID: value, lower and upper bound [SI]
+    limit: float  # largest command [its unit]
+    dither: tuple[float, float] | None  # frequency [Hz] and largest amplitude [the command's unit]
+    steps: tuple[float, ...]  # heights of the references [unit of the measured signal]
+    horizon: float  # of each step [s]
+    swept: str  # parameter over which a study goes
+    values: Mapping[str, float] = field(default_factory=dict)  # parameters that are not as the model has them [SI]
 
 
 @dataclass(frozen=True)
 class DriveKind:
-    """A row of the registry of drives: how a file describes such a drive.
+    """A row of the registry of drives: how a file describes such a drive; log channels are those of its `System`."""
 
-    Its log channels are the inputs and outputs of its `System`, by name and unit. The `System` also declares whether
-    the drive has an axis, and so a friction map, and a meter (`axis`, `meter`).
-
-    Parameters
-    ----------
-    name : str
-        Value of kind in [drive].
-    sections : mapping
-        Sections that such a file may have, with their keys; a section of parameters alone has no keys.
-    build : callable
-        Builds the drive from a `DriveSections`.
-    any_friction : bool
-        Whether ``replace(drive, friction=...)`` works with every friction law.
-    first : FirstFiles, optional
-        What `pneuopt init` writes for it; None: it writes nothing.
-    """
-
-    name: str
-    sections: Mapping[str, Mapping[str, Key]]
+    name: str  # value of kind in [drive]
+    sections: Mapping[str, Mapping[str, Key]]  # that such a file may have; one of parameters alone has no keys
     build: Callable[[DriveSections], Drive]
     aliases: tuple[Alias, ...] = ()
-    any_friction: bool = True
-    first: FirstFiles | None = None
+    any_friction: bool = True  # whether ``replace(drive, friction=...)`` works with every friction law
+    first: FirstFiles | None = None  # what `pneuopt init` writes; None: nothing

@@ -1,7 +1,4 @@
-"""The registry of drives, a row for each kind: files and the command line read drives through it.
-
-`stick_slip_drive` makes of a smooth drive one that truly sticks.
-"""
+"""The registry of drives, a row for each kind, and `stick_slip_drive`, which makes a smooth drive truly stick."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,14 +12,7 @@ from pneuopt.models.pneumatic.drive import PNEUMATIC_KIND
 from pneuopt.quantities.errors import ModelError
 
 DRIVE_KINDS: Mapping[str, DriveKind] = {
-    kind.name: kind
-    for kind in (
-        PNEUMATIC_KIND,
-        FORCE_KIND,
-        MOTION_KIND,
-        LINEAR_KIND,
-        ROTARY_KIND,
-    )
+    kind.name: kind for kind in (PNEUMATIC_KIND, FORCE_KIND, MOTION_KIND, LINEAR_KIND, ROTARY_KIND)
 }
 
 

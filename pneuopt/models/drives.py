@@ -1,8 +1,7 @@
-"""Drives wired from parts: `ForceDrive`, pushed by a known force, and `MotionDrive`, a rig that measures friction.
+"""Drives wired from parts, each pushed or moved by one known signal, with the sections of their files.
 
-`RotaryDrive`: a shaft with inertia and friction, turned by a known torque, as a servo with an encoder logs it.
-
-Rest or steady motion of a body that a known force or torque pushes against friction.
+`ForceDrive`: a load that a known force pushes; `MotionDrive`: a rig that measures friction; `RotaryDrive`: a shaft that
+a known torque turns. Below them, how a body that a known push drives rests or moves steadily (`with_rest`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ from pneuopt.models.declaration import DriveKind, FirstFiles
 from pneuopt.models.friction import LOAD_HINTS, RIG_HINTS, Coulomb, FrictionModel, law_inputs, load_hints
 from pneuopt.models.friction_laws import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
-from pneuopt.models.starts.friction import force_starts, motion_starts
+from pneuopt.models.starts import force_starts, motion_starts
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
 from pneuopt.quantities.keys import flag
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
@@ -177,10 +176,7 @@ _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
 
 
 def _power_meter(system: System) -> ca.Function:
-    """Function ``(t, x, u, p)`` for the power that the motor draws [W]: that of the force where it drives, else zero.
-
-    A servo drive that cannot feed back turns braking power into heat in its brake resistor.
-    """
+    """Function ``(t, x, u, p)`` for the power that the motor draws [W], zero where it brakes: it cannot feed back."""
     t, x, u, p = (ca.SX.sym(n, system.ode.size1_in(i)) for i, n in enumerate("txup"))
     force, speed = (u[names(system.inputs).index("force")], x[names(system.states).index("speed")])
     return ca.Function("meter", [t, x, u, p], [ca.fmax(force * speed, 0)], ["t", "x", "u", "p"], ["power"])
@@ -257,7 +253,12 @@ class RotaryDrive:
 
     def system(self) -> System:
         """Build the equations; states and outputs as in the class."""
-        states = (ANGLE, ANGULAR_SPEED, *(_turning_state(q) for q in self.friction.states))
+        units = [_turning_unit(q.unit) for q in self.friction.states]
+        inner_states = [
+            Quantity(f"friction.{q.name}", unit, *(factor * size for size in (q.nominal, q.lower, q.upper)))
+            for q, (unit, factor) in zip(self.friction.states, units, strict=True)
+        ]
+        states = (ANGLE, ANGULAR_SPEED, *inner_states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             inner, own, load = without_prefix(x, "friction"), without_prefix(p, "friction"), {"force": u["torque"]}
@@ -280,28 +281,30 @@ class _RotaryStarts:
     friction: FrictionModel
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
-        sliding = {name: Log(_sliding_log(log.measured), self._sliding_parameters(log)) for name, log in logs.items()}
-        return [self._turning_start(start) for start in force_starts(self.friction, sliding)]
+        # name and unit of each parameter for sliding, and the factor that turns its value into that of the shaft
+        factors = {"load.inertia": ("load.mass", "kg", RADIUS**2), "load.torque": ("load.force", "N", RADIUS)}
+        for n, p in self.friction.parameters.items():
+            factors[f"friction.{n}"] = (f"friction.{n}", p.unit, _turning_unit(p.unit)[1])
+        signals = {"torque": ("force", 1 / RADIUS), "angle": ("position", RADIUS), "speed": ("speed", RADIUS)}
+        sliding = {}
+        for name, (measured, known, *_) in logs.items():
+            columns = {signals[n][0]: signals[n][1] * measured[n] for n in measured if n in signals}
+            parameters = ParameterSet({n: _scale(known[own], unit, 1 / f) for own, (n, unit, f) in factors.items()})
+            sliding[name] = Log(Trajectory(measured.t, columns), parameters)
+        turning = {n: (own, f) for own, (n, _, f) in factors.items()}
+        return [self._turning_start(start, turning) for start in force_starts(self.friction, sliding)]
 
-    def _factors(self) -> dict[str, tuple[str, str, float]]:
-        """Name and unit of each parameter for sliding, and the factor that turns its value into that of the shaft."""
-        load = {"load.inertia": ("load.mass", "kg", RADIUS**2), "load.torque": ("load.force", "N", RADIUS)}
-        friction = self.friction.parameters.items()
-        return load | {f"friction.{n}": (f"friction.{n}", p.unit, _turning_unit(p.unit)[1]) for n, p in friction}
-
-    def _sliding_parameters(self, log: Log) -> ParameterSet:
-        return ParameterSet(
-            {name: _scale(log.parameters[n], unit, 1 / f) for n, (name, unit, f) in self._factors().items()}
-        )
-
-    def _turning_start(self, start: Start) -> Start:
-        known = {name: (n, f) for n, (name, _, f) in self._factors().items()}
+    def _turning_start(self, start: Start, turning: Mapping[str, tuple[str, float]]) -> Start:
+        """The start of the shaft, from that of the sliding mass; `turning` gives name and factor by the mass's name."""
         values = {}
         for whole, value in start.parameters.items():
             base, bracket, log = whole.partition("[")
-            name, factor = known[base]
+            name, factor = turning[base]
             values[name + bracket + log] = factor * value
-        states = {log: _turning_run(run) for log, run in start.states.items()}
+        states = {
+            log: Trajectory(run.t, {"angle" if n == "position" else n: run[n] / RADIUS for n in run})
+            for log, run in start.states.items()
+        }
         return replace(start, states=states, parameters=values)
 
 
@@ -320,26 +323,9 @@ def _turning_unit(unit: str) -> tuple[str, float]:
     return "".join(turned), RADIUS ** (forces - lengths)
 
 
-def _turning_state(state: Quantity) -> Quantity:
-    unit, factor = _turning_unit(state.unit)
-    return Quantity(f"friction.{state.name}", unit, factor * state.nominal, factor * state.lower, factor * state.upper)
-
-
 def _scale(parameter: Parameter, unit: str, factor: float) -> Parameter:
     value, lower, upper = (factor * number for number in (parameter.value, parameter.lower, parameter.upper))
     return replace(parameter, value=value, lower=lower, upper=upper, unit=unit)
-
-
-def _sliding_log(measured: Trajectory) -> Trajectory:
-    """Log of a shaft as that of the sliding mass."""
-    factors = {"torque": ("force", 1 / RADIUS), "angle": ("position", RADIUS), "speed": ("speed", RADIUS)}
-    return Trajectory(measured.t, {factors[n][0]: factors[n][1] * measured[n] for n in measured if n in factors})
-
-
-def _turning_run(run: Trajectory) -> Trajectory:
-    """States of the shaft along a log, from those of the sliding mass."""
-    names = {"position": "angle"}
-    return Trajectory(run.t, {names.get(n, n): run[n] / RADIUS for n in run})
 
 
 ROTARY_KIND = DriveKind(
@@ -360,16 +346,7 @@ ROTARY_KIND = DriveKind(
 
 
 def with_rest(system: System, push: Quantity, axis: Axis) -> System:
-    """The system with its axis and a `rest_hook`: the push that balances friction and load at a position and a speed.
-
-    Friction states are steady at that speed; the system's other inputs are zero.
-
-    Parameters
-    ----------
-    system : System
-        Its states: position, speed and those of friction ("friction.*").
-    push : Quantity
-        The input that drives the body.
+    """The system with its axis and a `rest_hook`: the push (an input) that balances friction and load, at a speed too.
 
     Examples
     --------

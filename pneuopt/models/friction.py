@@ -1,15 +1,10 @@
-"""Friction of seals, guides and bearings, from viscous to LuGre; wrappers add asymmetry and pressure dependence.
+"""Friction of seals, guides, bearings and gears, from viscous to LuGre; wrappers add asymmetry, pressure and load.
 
 Signs: the force opposes positive speed when positive. Every map is smooth; `smoothing` is the speed over which the
 Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre holds it.
 
-Presliding friction as a map of the speed: friction that yields a little before it slides.
-
-Friction that grows with the force that a gear or a guide transmits.
-
-Declarations of a friction law from which an identification starts without a guess (see `models.starts.friction`).
-
-Motion that a log must show for the parameters of drives and friction laws, and runs that separate them.
+First stand the declarations that a law makes (`FrictionStart`: its start from logs, see `starts`) and what a log must
+show for its parameters; then `FrictionModel`, the laws, the wrappers, and the formulas that they share.
 """
 
 import math
@@ -23,6 +18,22 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import DEFAULT_WIDTH, IdentificationHints, Lack, LoggedMotion, Need, SeparatingRun, Width
 from pneuopt.dynamics.system import Symbols
+from pneuopt.models.tolerances import (
+    BRISTLE_STIFFNESS_RANGE,
+    MIN_COULOMB_SHARE,
+    MIN_DIRECTION_SHARE,
+    MIN_INERTIA_SHARE,
+    MIN_PRESLIDING_SPEED,
+    MIN_REVERSALS,
+    MIN_SLOW_SAMPLES,
+    MIN_SPEED_RATIO,
+    SMOOTHING_FACTOR,
+    STICKING_SPEED,
+    STRIBECK_VELOCITIES,
+    USUAL_SMOOTHING,
+    USUAL_STRIBECK_VELOCITY,
+    VISCOUS_SPEED_RATIO,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -30,90 +41,43 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 @dataclass(frozen=True, eq=False)
 class FrictionSamples:
-    """Samples of a log for a friction law; arrays of shape (n,), parameters and inputs by the law's names.
+    """Samples of a log for a friction law; arrays of shape (n,), parameters and inputs by the law's names."""
 
-    Attributes
-    ----------
-    speed : ndarray
-        Filtered speed [m/s].
-    side : ndarray
-        The sign of the speed, smooth over the law's `smoothing`; just before break-away, the sign of the force that
-        pulls.
-    level_speed : ndarray
-        The speed at which the friction level applies [m/s]: zero just before break-away.
-    values : mapping of str to float
-        The law's parameters as given; for a scanned one, the value that is tried.
-    """
-
-    speed: Array
-    side: Array
-    level_speed: Array
+    speed: Array  # filtered [m/s]
+    side: Array  # sign of the speed, smooth over `smoothing`; just before break-away, that of the force that pulls
+    level_speed: Array  # at which the friction level applies [m/s]: zero just before break-away
     inputs: Mapping[str, Array]
-    values: Mapping[str, float]
+    values: Mapping[str, float]  # the law's parameters as given; of a scanned one, the value that is tried
 
 
 @dataclass(frozen=True)
 class Bristles:
-    """Start of bristle deflections: their stiffness is the slope of the force over travel in presliding.
+    """Start of bristle deflections: their stiffness is the slope of the force over travel in presliding."""
 
-    Parameters
-    ----------
-    stiffness, level : str
-        Names of the parameters for that slope [N/m] and for the sliding force [N], well below which bristles only bend.
-    range : tuple of float
-        Least and greatest stiffness of a start [N/m]: softer bristles bend for millimetres, stiffer ones need
-        integration steps below 1 us.
-    deflections : callable
-        ``(force, speed, values)`` returns the law's states from the friction force [N], the speed [m/s] and the
-        law's parameters.
-    """
-
-    stiffness: str
-    level: str
-    range: tuple[float, float]
+    stiffness: str  # parameter for that slope [N/m]
+    level: str  # parameter for the sliding force [N], well below which bristles only bend
+    range: tuple[float, float]  # least and greatest stiffness of a start [N/m]
+    # (friction force [N], speed [m/s], the law's parameters) -> the law's states
     deflections: Callable[[Array, Array, Mapping[str, float]], dict[str, Array]]
 
 
 @dataclass(frozen=True)
 class FrictionStart:
-    """A friction law as a linear regression: ``force = sum(column * parameter)`` at given scanned parameters.
+    """A friction law as a linear regression: ``force = sum(column * parameter)`` at given scanned parameters."""
 
-    Parameters
-    ----------
-    columns : callable
-        Maps `FrictionSamples` to the regression column of each parameter, by name.
-    unknowns : tuple of str
-        Parameters that are estimated unless the user frees others.
-    floors : mapping of str to float
-        Least value in the regression as a share of the median force [1], which keeps friction from driving the load.
-    above : mapping of str to str
-        Parameters whose column multiplies their excess over another parameter: static friction over Coulomb friction.
-    scanned : mapping of str to tuple of float
-        Parameters on which the force does not depend linearly, with the values to try, the most promising first.
-    bristles : Bristles, optional
-        For a law with internal states.
-    """
-
-    columns: Callable[[FrictionSamples], dict[str, Array]]
-    unknowns: tuple[str, ...]
+    columns: Callable[[FrictionSamples], dict[str, Array]]  # the regression column of each parameter, by name
+    unknowns: tuple[str, ...]  # parameters that are estimated unless the user frees others
+    # least value as a share of the median force [1], which keeps friction from driving the load
     floors: Mapping[str, float] = field(default_factory=dict)
+    # parameters whose column multiplies their excess over another one: static friction over Coulomb friction
     above: Mapping[str, str] = field(default_factory=dict)
+    # parameters on which the force does not depend linearly: the values to try, the most promising first
     scanned: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    bristles: Bristles | None = None
+    bristles: Bristles | None = None  # of a law with internal states
 
 
-MIN_SPEED_RATIO = 3.0  # fast over slow speed [1]: less shows one point of the curve, a larger bound refuses good logs
-VISCOUS_SPEED_RATIO = 5.0  # speed over the Stribeck velocity [1] beyond which the static peak hides no viscous friction
-MIN_SLOW_SAMPLES = 20  # samples below the Stribeck velocity: fewer are noise, a larger bound refuses good logs
-MIN_DIRECTION_SHARE = 0.05  # share of the moving samples in the rarer direction [1]: fewer are accidental
-MIN_REVERSALS = 2  # reversals of the motion: one alone does not show that presliding repeats
-MIN_INERTIA_SHARE = 0.02  # inertia force over the friction level [1]: less is lost in the model's error
-DEFAULT_STRIBECK_VELOCITY = 0.02  # for laws without a Stribeck velocity [m/s]
 FRICTION_LEVELS = frozenset({"coulomb", "static"})
 STRIBECK_CURVE = FRICTION_LEVELS | {"stribeck_velocity"}
-# factor of a search over the width of dry friction's sign [1]: a smaller one takes more trials, a larger one leaves out
-# widths at which a log that slides is followed best
-SMOOTHING_FACTOR = 10.0
 BRISTLES = frozenset({"bristle_stiffness", "bristle_damping", "damping_velocity"})
 CONSTANT_FORCES = frozenset({"load.force", "rig.force_offset"})
 """Parameters of drives for a force that is constant, whatever the speed."""
@@ -124,7 +88,7 @@ ALIKE_AT_EVERY_SPEED = (
 
 def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
     """Lack of the slow and fast speeds that a Stribeck curve needs, if any."""
-    stribeck = _largest_known("friction.stribeck_velocity", DEFAULT_STRIBECK_VELOCITY, seen.values)
+    stribeck = _largest_known("friction.stribeck_velocity", USUAL_STRIBECK_VELOCITY, seen.values)
     speed = np.abs(seen.speed)
     below = int(np.count_nonzero((speed > 0.1 * stribeck) & (speed < stribeck)))
     slowest, fastest = 0.1 * stribeck, VISCOUS_SPEED_RATIO * stribeck
@@ -237,17 +201,7 @@ _LEVELS = frozenset(f"friction.{n}" for n in FRICTION_LEVELS)
 
 
 def load_hints(inertia: str, force: str, push: str, remedy: str) -> IdentificationHints:
-    """Identification hints of a drive's load.
-
-    Parameters
-    ----------
-    inertia, force : str
-        Names of the load's parameters: its inertia, and its constant force.
-    push : str
-        The drive's input in words: "force", "torque".
-    remedy : str
-        How the inertia is found without a log, in words.
-    """
+    """What a log must show for a load's inertia and constant force; `push` and `remedy` are words of the advice."""
     lacks = partial(lacks_acceleration, inertia, f"{remedy}, or log steps of {push}")
     asymmetry, slope = (
         frozenset({"friction.coulomb_asymmetry"}),
@@ -278,25 +232,11 @@ def _known_unit(seen: LoggedMotion, *names: str) -> str:
     return next((known[n].unit for n in names for known in (seen.given, seen.values) if n in known), "")
 
 
-STICKING_SPEED = 1e-6  # rounding of |v| in LuGre [m/s]: a larger one creeps visibly, a smaller one needs finer steps
-STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # values that a start tries [m/s], most successful first
-MIN_COULOMB_SHARE = 0.05  # least Coulomb level of a start as a share of the median force [1]; a search sticks at zero
-# Least and greatest bristle stiffness of a start [N/m]: softer bristles bend for millimetres, stiffer ones need steps
-# below 1 us.
-BRISTLE_STIFFNESS_RANGE = (1e4, 1e6)
 CHAMBER_PRESSURES = ("pressure_a", "pressure_b")
 
 
 class Force(NamedTuple):
-    """A friction force and the rates of its internal states.
-
-    Attributes
-    ----------
-    value : SX
-        [N]
-    rates : mapping of str to SX
-        Rate of each internal state, by name.
-    """
+    """A friction force [N] and the rate of each internal state, by name."""
 
     value: ca.SX
     rates: Symbols
@@ -586,24 +526,8 @@ def smooth_sign(v: ca.SX, p: Symbols, width: str = "smoothing") -> ca.SX:
 
 
 def stribeck_curve(v: ca.SX, coulomb: ca.SX, static: ca.SX, stribeck_velocity: ca.SX) -> ca.SX:
-    """Sliding friction level g(v) = F_c + (F_s - F_c) exp(-(v/v_s)^2).
+    """Sliding friction level g(v) = F_c + (F_s - F_c) exp(-(v/v_s)^2) [N] at speed v [m/s].
 
-    Parameters
-    ----------
-    v : SX or float
-        Speed [m/s].
-    coulomb, static : SX or float
-        F_c and F_s [N].
-    stribeck_velocity : SX or float
-        v_s [m/s], positive.
-
-    Returns
-    -------
-    SX or float
-        [N], between F_c and F_s.
-
-    Notes
-    -----
     Source: Armstrong-Helouvry et al., Automatica 30(7), 1994, with the Gaussian exponent 2.
 
     Examples
@@ -631,7 +555,7 @@ _STRIBECK_SCAN = {"stribeck_velocity": STRIBECK_VELOCITIES}
 _VISCOUS_PARAMETER = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5, meaning="friction per speed")
 _COULOMB_PARAMETER = Parameter(30.0, "N", lower=0.0, upper=1e5, meaning="Coulomb friction: the level while sliding")
 _SMOOTHING_PARAMETER = Parameter(
-    1e-3,
+    USUAL_SMOOTHING,
     "m/s",
     lower=1e-6,
     upper=1.0,
@@ -643,14 +567,16 @@ _STRIBECK_PARAMETERS = {
     "coulomb": _COULOMB_PARAMETER,
     "static": Parameter(45.0, "N", lower=0.0, upper=1e5, meaning="static friction: the level at break-away"),
     "stribeck_velocity": Parameter(
-        0.02, "m/s", lower=1e-4, upper=1.0, log=True, meaning="speed over which friction falls from static to Coulomb"
+        USUAL_STRIBECK_VELOCITY,
+        "m/s",
+        lower=1e-4,
+        upper=1.0,
+        log=True,
+        meaning="speed over which friction falls from static to Coulomb",
     ),
 }
 
 
-# least presliding speed [m/s]: below it friction is as sharp as that of `Coulomb`, and takes many integration steps;
-# above it the yielding of stiff drives is missed
-MIN_PRESLIDING_SPEED = 3e-4
 SLOW_REVERSALS = SeparatingRun(
     frozenset({"presliding_speed"}),
     frozenset({"static", "stribeck_velocity", "bristle_stiffness", "bristle_damping", "coulomb", "viscous"}),

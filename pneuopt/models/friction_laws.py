@@ -1,8 +1,7 @@
 """The registry of friction laws, a row each, for files, model selection (`friction_ladder`) and the table test.
 
-A row is a law's name in files and its class, which declares everything else (see `FrictionModel`).
-
-Section [friction] of a drive's file: the law and its wrappers.
+A row is a law's name in files and its class, which declares everything else (see `FrictionModel`). Below the rows stand
+the keys of section [friction] of a drive's file.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,22 +26,12 @@ from pneuopt.quantities.keys import Key, Takes, choice, flag
 
 @dataclass(frozen=True)
 class Wrapper:
-    """A law that wraps another law.
+    """A law that wraps another law."""
 
-    Parameters
-    ----------
-    wrap : callable
-        Builds the law from the inner law and, where there are options, a tuple of them.
-    option : str
-        Name of an option in messages, "chamber"; empty without options.
-    options : tuple of str
-        The options that it takes; all of them where none is given.
-    """
-
-    wrap: Callable[..., FrictionModel]
+    wrap: Callable[..., FrictionModel]  # (inner law) or, with options, (inner law, tuple of options) -> law
     meaning: str
-    option: str = ""
-    options: tuple[str, ...] = ()
+    option: str = ""  # an option's name in messages, "chamber"
+    options: tuple[str, ...] = ()  # those it takes; all of them where none is given
 
 
 FRICTION_LAWS: Mapping[str, Callable[[], FrictionModel]] = {
@@ -91,8 +80,6 @@ FRICTION_KEYS: Mapping[str, Key] = {
         for name, wrapper in FRICTION_WRAPPERS.items()
     },
 }
-
-
 STRIBECK_UNKNOWNS = tuple(f"friction.{n}" for n in Stribeck().start.unknowns)
 """Parameters of the usual law that logs give, as a drive names them."""
 

@@ -14,8 +14,6 @@ from pneuopt.models.friction import Force, FrictionModel, FrictionStart
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-SMOOTHING_WIDTHS = ("smoothing", "asymmetry_width")
-
 
 @dataclass(frozen=True)
 class Karnopp:
@@ -57,7 +55,7 @@ class Karnopp:
     @property
     def parameters(self) -> ParameterSet:
         """Parameters of the base without smoothing widths, and direction [1], which only a simulation sets."""
-        kept = {n: p for n, p in self.base.parameters.items() if n not in SMOOTHING_WIDTHS}
+        kept = {n: p for n, p in self.base.parameters.items() if n not in ("smoothing", "asymmetry_width")}
         return ParameterSet({**kept, "direction": Parameter(0.0, "1", -1.0, 1.0, source="switched by simulate")})
 
     @property

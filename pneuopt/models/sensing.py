@@ -1,4 +1,4 @@
-"""`with_sensors`: a plant whose measured outputs have delays, lags or offsets, each a parameter of its own.
+"""Plants whose measured outputs have delays, lags or offsets (`with_sensors`), each a parameter of its own.
 
 The outputs keep their names, so logs, loops and tables read them as before. Free parameters "sensor.*" are estimated
 with the others and have intervals: a zero point of each log (`per_log`) for example, or the skew between two channels.
@@ -16,15 +16,13 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Log, Rest, RestHook, Start
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack
+from pneuopt.models.tolerances import DEFAULT_SENSOR_DELAY, MAX_SENSOR_DELAY, MIN_SENSOR_DELAY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 Channels = tuple[str, ...]
-MIN_SENSOR_DELAY = 2e-4  # least delay or lag [s]: shorter ones make the ODE stiff and do not show in logs at 1 kHz
-MAX_SENSOR_DELAY = 0.05  # greatest delay or lag [s]: longer delays are not followed by a Padé form of second order
-DEFAULT_SENSOR_DELAY = 1e-3  # delay or lag before an identification [s]
 
 
 def with_sensors(
@@ -106,7 +104,14 @@ def coarse_delay(log: Trajectory, late: str, other: str, longest: float = MAX_SE
     """
     step = float(np.median(np.diff(log.t)))
     grid = np.arange(log.t[0], log.t[-1], step)
-    a, b = (_resample_channel(log, n, grid, wanted) for n, wanted in ((late, other), (other, late)))
+    curves = []
+    for name in (late, other):
+        known = np.isfinite(log[name])
+        require(bool(known.any()), f"channel {name!r} holds no sample")
+        column = np.interp(grid, log.t[known], log[name][known])
+        to_speed = name == "position" and (late, other) != ("position", "position")
+        curves.append(np.gradient(column, grid) if to_speed else column)
+    a, b = curves
     most = min(round(longest / step), len(grid) // 4)
     inner = slice(most, len(grid) - most)
     shifts = np.arange(-most, most + 1)
@@ -180,12 +185,17 @@ class _Sensors:
         """Candidates of the plant, from logs corrected for delays and offsets, with settled sensors."""
         guessed = {name: self._guess_delays(log) for name, log in logs.items()}
         plant = {name: self._correct_log(log, guessed[name]) for name, log in logs.items()}
+        delays: dict[str, float] = {}
+        for name in dict.fromkeys(n for found in guessed.values() for n in found):
+            by_log = {log: found[name] for log, found in guessed.items() if name in found}
+            if any(logs[log].parameters[name].per_log for log in by_log):
+                delays |= {f"{name}[{log}]": delay for log, delay in by_log.items()}
+            else:
+                delays[name] = float(np.median([*by_log.values()]))
         out = []
         for start in self.plant.starts(plant):
             states = {name: self._complete_states(start, name, log, guessed[name]) for name, log in logs.items()}
-            out.append(
-                replace(start, states=states, parameters={**start.parameters, **self._start_parameters(logs, guessed)})
-            )
+            out.append(replace(start, states=states, parameters={**start.parameters, **delays}))
         return out
 
     def _guess_delays(self, log: Log) -> dict[str, float]:
@@ -198,21 +208,6 @@ class _Sensors:
                 p = log.parameters[name]
                 found[name] = float(np.clip(coarse_delay(log.measured, late, other), p.lower, p.upper))
         return found
-
-    def _start_parameters(
-        self, logs: Mapping[str, Log], guessed: Mapping[str, Mapping[str, float]]
-    ) -> dict[str, float]:
-        """Parameters of a start from the guessed delays; a shared delay is the median over the logs."""
-        out: dict[str, float] = {}
-        for name in dict.fromkeys(n for delays in guessed.values() for n in delays):
-            by_log = {log: values[name] for log, values in guessed.items() if name in values}
-            per_log = any(logs[log].parameters[name].per_log for log in by_log)
-            out |= (
-                {f"{name}[{log}]": v for log, v in by_log.items()}
-                if per_log
-                else {name: float(np.median([*by_log.values()]))}
-            )
-        return out
 
     def _correct_log(self, log: Log, guessed: Mapping[str, float]) -> Log:
         """Log without the sensors' delays, lags and offsets, for the plant's starts."""
@@ -259,18 +254,4 @@ class _Sensors:
 
     def _parameter_value(self, parameters: ParameterSet, channel: str, kind: str) -> float:
         name = f"sensor.{channel}.{kind}"
-        return (
-            parameters.value(name)
-            if name in parameters
-            else self.parameters.value(name)
-            if name in self.parameters
-            else 0.0
-        )
-
-
-def _resample_channel(log: Trajectory, name: str, grid: Array, other: str) -> Array:
-    """Channel on an even grid; a position is differentiated unless the other channel is one too."""
-    known = np.isfinite(log[name])
-    require(bool(known.any()), f"channel {name!r} holds no sample")
-    column = np.interp(grid, log.t[known], log[name][known])
-    return np.asarray(np.gradient(column, grid)) if name == "position" and other != "position" else column
+        return next((known.value(name) for known in (parameters, self.parameters) if name in known), 0.0)

@@ -1,14 +1,14 @@
-"""What every figure shares: axes, colours, a legend outside, and the way to a file.
+"""What every figure shares: colours, sizes (`STYLE`), axes, a legend outside, and the way to a file or a page.
 
-`mend_texts`: names from files and logs in figures, drawn as they are, whatever their letters mean to matplotlib.
-
-`to_svg`: a figure as an SVG element that stands within a page of HTML, the same letters for the same figure.
+Names from files and logs are drawn as they are, whatever their letters mean to matplotlib (`mend_texts`). `to_svg`
+gives an SVG element that stands within a page of HTML, the same letters for the same figure.
 """
 
 import io
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,10 +16,7 @@ import numpy as np
 
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiment import Experiment
-from pneuopt.plotting.tolerances import (
-    MAX_VECTOR_MARKERS,
-    RASTER_DPI,
-)
+from pneuopt.plotting.tolerances import MAX_VECTOR_MARKERS
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.output import write_bytes
 from pneuopt.quantities.trajectories import Trajectory
@@ -28,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Figure  # noqa: PLC0414 - cli and report name it from here
-    from matplotlib.text import Text
 
 
 FIGURE_SUFFIXES = ("png", "pdf", "svg")
@@ -37,12 +33,49 @@ PLOT_UNITS = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}
 """SI units that would give an axis many zeros, with the factor and the unit that are drawn in their place."""
 
 
+@dataclass(frozen=True)
+class Style:
+    """Sizes in figures: lengths in inches on paper, texts in points."""
+
+    raster_dpi: int = 200  # of clouds that become an image [1/inch]: lower blurs in print, higher makes the page large
+    title_letters: int = 118  # a line of a title at 10 inches
+    label_letters: int = 24  # a line of a label beside an axis
+    labels_of_long_axis: int = 6  # where cells are too many to have a label each
+    parameter_height: float = 0.24  # of a parameter's line: less and their names touch
+    bars_height: float = 0.42  # of an axis' two bars
+    decade_ticks: tuple[float, ...] = (1.0, 2.0, 5.0)  # numbers of each decade on a logarithmic axis
+    # of the block diagram
+    block_height: float = 0.62
+    circle_radius: float = 0.12
+    arrow_length: float = 0.3  # without a label
+    block_text: float = 9.0
+    small_text: float = 8.0  # beside an arrow or below a block
+    letter_width: float = 0.064  # beside an arrow: with less, labels overlap; with more, arrows are long
+    legend_letter_width: float = 0.055  # in running text: with less, lines run off the figure
+    margin: float = 0.15
+    source_height: float = 1.2  # of what is added, above the forward path
+    sensor_height: float = -1.45
+    wire_height: float = -1.15  # of the feedback without a sensor
+    pid_width: float = 2.1
+    source_width: float = 1.5
+    small_width: float = 0.8
+    plant_width: float = 1.7
+    compensator_width: float = 1.15
+    output_spacing: float = 0.32  # between the outputs of a plant: closer, their labels overlap
+    frame: float = 0.12  # between the controller and the frame around it
+    branch: float = 0.15  # from an arrow's begin to where it divides
+
+
+STYLE = Style()
+
+
 def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
     """Write a figure whole or not at all, in the format of the file's suffix.
 
     Parameters
     ----------
     figure : Figure
+        Its texts are mended where no file can hold them.
     path : str or Path
         Ends in .png, .pdf or .svg.
     dpi : int
@@ -135,30 +168,24 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\uff
 
 def mend_texts(figure: "Figure") -> None:
     """Replace letters that no file of a figure can hold, and read no formula in what is none."""
+    from matplotlib.mathtext import MathTextParser
     from matplotlib.text import Text
 
     for artist in figure.findobj(Text):
-        if isinstance(artist, Text):
-            _mend_text(artist)
+        assert isinstance(artist, Text)
+        words = replace_unprintable(artist.get_text())
+        artist.set_text(words)
+        if words.count("$") > 1 and artist.get_parse_math():
+            try:
+                for line in words.split("\n"):
+                    MathTextParser("path").parse(line)
+            except ValueError:
+                artist.set_parse_math(False)
 
 
 def replace_unprintable(text: str) -> str:
     """A text with a replacement character for each letter that neither XML nor UTF-8 can hold."""
     return _UNPRINTABLE.sub("\ufffd", text)
-
-
-def _mend_text(text: "Text") -> None:
-    """Take names from files as they are: replace what XML cannot hold, and read no formula in what is none."""
-    from matplotlib.mathtext import MathTextParser
-
-    words = replace_unprintable(text.get_text())
-    text.set_text(words)
-    if words.count("$") > 1 and text.get_parse_math():
-        try:
-            for line in words.split("\n"):
-                MathTextParser("path").parse(line)
-        except ValueError:
-            text.set_parse_math(False)
 
 
 HASH_SALT = "pneuopt"
@@ -196,7 +223,7 @@ def to_svg(figure: "Figure", name: str, alt: str) -> str:
     content = io.BytesIO()
     with rc_context({"svg.hashsalt": HASH_SALT, "svg.fonttype": "path" if formulas else "none"}):
         figure.savefig(
-            content, format="svg", transparent=True, dpi=RASTER_DPI, metadata={"Date": None, "Creator": None}
+            content, format="svg", transparent=True, dpi=STYLE.raster_dpi, metadata={"Date": None, "Creator": None}
         )
     return _as_element(content.getvalue(), name, alt)
 
@@ -206,10 +233,8 @@ def _is_large_cloud(artist: "Artist") -> bool:
     from matplotlib.lines import Line2D
 
     if isinstance(artist, Line2D):
-        return (
-            artist.get_marker() not in ("", " ", "None", "none", None)
-            and np.size(artist.get_xdata()) > MAX_VECTOR_MARKERS
-        )
+        has_markers = artist.get_marker() not in ("", " ", "None", "none", None)
+        return has_markers and np.size(artist.get_xdata()) > MAX_VECTOR_MARKERS
     return isinstance(artist, PathCollection) and len(np.asarray(artist.get_offsets())) > MAX_VECTOR_MARKERS
 
 

@@ -1,7 +1,4 @@
-"""`Sheet`: boxes, sums, arrows and labels of a block diagram, along a forward path.
-
-`plot_loop`: the block diagram of a closed loop, drawn from its parts.
-"""
+"""`plot_loop`: the block diagram of a closed loop, drawn from its parts on a `Sheet`, a pen on the forward path."""
 
 from collections.abc import Sequence
 from textwrap import fill
@@ -13,28 +10,7 @@ from pneuopt.control.dither import Waveform
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.pid import AntiWindup, Form
 from pneuopt.control.sensor import Encoder
-from pneuopt.plotting.canvas import BLUE, GREY
-from pneuopt.plotting.tolerances import (
-    ARROW_LENGTH,
-    BLOCK_HEIGHT,
-    BLOCK_TEXT,
-    BRANCH,
-    CIRCLE_RADIUS,
-    COMPENSATOR_WIDTH,
-    FRAME,
-    LEGEND_LETTER_WIDTH,
-    LETTER_WIDTH,
-    MARGIN,
-    OUTPUT_SPACING,
-    PID_WIDTH,
-    PLANT_WIDTH,
-    SENSOR_HEIGHT,
-    SMALL_TEXT,
-    SMALL_WIDTH,
-    SOURCE_HEIGHT,
-    SOURCE_WIDTH,
-    WIRE_HEIGHT,
-)
+from pneuopt.plotting.canvas import BLUE, GREY, STYLE
 from pneuopt.quantities.parameters import Quantity
 
 if TYPE_CHECKING:
@@ -46,31 +22,22 @@ BLOCK_COLOUR = "#eef4fa"
 
 
 class Sheet:
-    """The paper, in inches, and a pen on the forward path, which lies at height 0.
-
-    Attributes
-    ----------
-    x : float
-        Where the next part of the forward path begins.
-    above : float
-        Where the last block above the forward path ends.
-    right, low, high : float
-        The edges of what is drawn so far; the left one is 0.
-    """
+    """The paper, in inches, and a pen on the forward path, which lies at height 0."""
 
     def __init__(self, axes: "Axes") -> None:
         self.axes = axes
-        self.x = self.above = self.right = self.low = self.high = 0.0
+        self.x = self.above = 0.0  # where the next part of the forward path begins, and the last block above it ends
+        self.right = self.low = self.high = 0.0  # the edges of what is drawn so far; the left one is 0
 
-    def draw_arrow(self, name: str = "", unit: str = "", *, least: float = ARROW_LENGTH) -> None:
+    def draw_arrow(self, name: str = "", unit: str = "", *, least: float = STYLE.arrow_length) -> None:
         """Go on along the forward path, as far as the label needs, which stands above the arrow."""
         lines = [line for line in (name, f"[{unit}]" if unit else "") if line]
-        length = max(least, LETTER_WIDTH * max(map(len, lines), default=0) + 0.16)
+        length = max(least, STYLE.letter_width * max(map(len, lines), default=0) + 0.16)
         self.draw_line([(self.x, 0.0), (self.x + length, 0.0)])
         self.write(self.x + length / 2 - 0.03, 0.05, "\n".join(lines), va="bottom")
         self.x += length
 
-    def draw_block(self, text: str, width: float, *, low: float = -BLOCK_HEIGHT / 2, high: float = 0.0) -> float:
+    def draw_block(self, text: str, width: float, *, low: float = -STYLE.block_height / 2, high: float = 0.0) -> float:
         """Draw a block on the forward path, by default one as high as the others; returns its centre."""
         centre, high = self.x + width / 2, high or -low
         self.draw_box(centre, (low + high) / 2, width, text, height=high - low)
@@ -81,23 +48,23 @@ class Sheet:
         """Draw a sum on the forward path, with the sign of what comes from below; returns its centre."""
         from matplotlib.patches import Circle
 
-        centre = self.x + CIRCLE_RADIUS
-        self.axes.add_patch(Circle((centre, 0.0), CIRCLE_RADIUS, fc="white", ec="black", lw=1.0, zorder=3))
-        self.axes.text(centre, -0.005, "+", ha="center", va="center_baseline", fontsize=BLOCK_TEXT, zorder=4)
-        self.write(centre + 0.12, -CIRCLE_RADIUS - 0.1, sign_below)
-        self.x += 2 * CIRCLE_RADIUS
+        centre = self.x + STYLE.circle_radius
+        self.axes.add_patch(Circle((centre, 0.0), STYLE.circle_radius, fc="white", ec="black", lw=1.0, zorder=3))
+        self.axes.text(centre, -0.005, "+", ha="center", va="center_baseline", fontsize=STYLE.block_text, zorder=4)
+        self.write(centre + 0.12, -STYLE.circle_radius - 0.1, sign_below)
+        self.x += 2 * STYLE.circle_radius
         return centre
 
     def draw_source(self, text: str, width: float, height: float) -> float:
         """Draw a sum on the forward path and a block that feeds it, at a height above; returns the centre of both."""
-        self.draw_arrow(least=max(ARROW_LENGTH, self.above + 0.15 + width / 2 - self.x - CIRCLE_RADIUS))
+        self.draw_arrow(least=max(STYLE.arrow_length, self.above + 0.15 + width / 2 - self.x - STYLE.circle_radius))
         centre = self.draw_sum()
         self.draw_box(centre, height, width, text)
-        self.draw_line([(centre, height - BLOCK_HEIGHT / 2), (centre, CIRCLE_RADIUS)])
+        self.draw_line([(centre, height - STYLE.block_height / 2), (centre, STYLE.circle_radius)])
         self.above = centre + width / 2
         return centre
 
-    def draw_box(self, x: float, y: float, width: float, text: str, *, height: float = BLOCK_HEIGHT) -> None:
+    def draw_box(self, x: float, y: float, width: float, text: str, *, height: float = STYLE.block_height) -> None:
         """Draw a block about a point."""
         from matplotlib.patches import FancyBboxPatch
 
@@ -106,7 +73,7 @@ class Sheet:
         self.axes.add_patch(
             FancyBboxPatch((left, bottom), width, height, boxstyle=style, fc=BLOCK_COLOUR, ec=BLUE, lw=1.2, zorder=2)
         )
-        self.axes.text(x, y, text, ha="center", va="center", fontsize=BLOCK_TEXT, linespacing=1.4, zorder=4)
+        self.axes.text(x, y, text, ha="center", va="center", fontsize=STYLE.block_text, linespacing=1.4, zorder=4)
         self._include(left + width, bottom, bottom + height)
 
     def draw_curve(self, x: float, y: float, points: Sequence[tuple[float, float]]) -> None:
@@ -141,17 +108,17 @@ class Sheet:
         self, x: float, y: float, text: str, *, ha: str = "center", va: str = "center", color: str = "black"
     ) -> None:
         """Write beside what is drawn."""
-        self.axes.text(x, y, text, ha=ha, va=va, fontsize=SMALL_TEXT, color=color, linespacing=1.2)
+        self.axes.text(x, y, text, ha=ha, va=va, fontsize=STYLE.small_text, color=color, linespacing=1.2)
         lines, up = text.count("\n") + 1, 0.0 if va == "top" else 0.15
         self._include(self.right, y - 0.15 * lines * (va == "top"), y + up * lines)
 
     def write_below(self, centre: float, text: str) -> None:
         """Write below a block on the forward path."""
-        self.write(centre, -BLOCK_HEIGHT / 2 - 0.06, text, va="top", color="0.35")
+        self.write(centre, -STYLE.block_height / 2 - 0.06, text, va="top", color="0.35")
 
     def fit(self, figure: "Figure") -> None:
         """Make the figure as large as what is on it."""
-        ends = (-MARGIN, self.right + MARGIN, self.low - MARGIN, self.high + MARGIN)
+        ends = (-STYLE.margin, self.right + STYLE.margin, self.low - STYLE.margin, self.high + STYLE.margin)
         figure.set_size_inches(ends[1] - ends[0], ends[3] - ends[2])
         self.axes.set(xlim=ends[:2], ylim=ends[2:])
         self.axes.axis("off")
@@ -175,10 +142,6 @@ LAWS = {
 def plot_loop(loop: ClosedLoop) -> "Figure":
     """Draw the block diagram of a loop: its parts, and its signals with their units; only what the loop has.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-
     Returns
     -------
     Figure
@@ -197,11 +160,7 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
     sheet.draw_arrow("reference", loop.feedback.unit, least=1.2 if loop.feedforward else 0.9)
     begin, error = sheet.x, sheet.draw_sum("−")
     sheet.draw_arrow("error", loop.feedback.unit)
-    _draw_position_loop(sheet, loop)
-    _draw_pid(sheet, loop)
-    _draw_feedforward(sheet, loop)
-    _draw_compensators(sheet, loop)
-    _draw_command(sheet, loop)
+    _draw_controller(sheet, loop)
     _draw_sampling(sheet, loop, begin)
     sheet.draw_arrow("control", loop.command.unit, least=sheet.above + 0.15 - sheet.x)
     outlet = _draw_plant(sheet, loop)
@@ -211,45 +170,39 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
     return figure
 
 
-def _draw_position_loop(sheet: Sheet, loop: ClosedLoop) -> None:
-    """The outer loop of a cascade; what the PID is fed back itself is said in words."""
-    if loop.outer is not None:
-        sheet.write_below(sheet.draw_block("$K_p$", SMALL_WIDTH), "position\nloop")
+def _draw_controller(sheet: Sheet, loop: ClosedLoop) -> None:
+    """Position loop, PID, and what is added to its command, in the order in which the controller computes them."""
+    if loop.outer is not None:  # of a cascade; what the PID is fed back itself is said in words
+        sheet.write_below(sheet.draw_block("$K_p$", STYLE.small_width), "position\nloop")
         sheet.draw_arrow(f"{loop.pid_signal.name} wanted", loop.pid_signal.unit)
         sheet.draw_sum(f"− {loop.pid_signal.name}")
         sheet.draw_arrow()
-
-
-def _draw_pid(sheet: Sheet, loop: ClosedLoop) -> None:
     notes = [f"PID, {loop.pid.form.value} form;", "P sees b r − y, D sees c r − y"]
     notes += ["gains follow position and load"] if loop.schedule else []
     notes += ["the integral has a dead band"] if loop.pid.dead_band else []
     notes += ["the error's change of sign resets it"] if loop.pid.reset else []
     notes += ["it is clamped at a limit"] if loop.pid.limits and loop.pid.anti_windup is AntiWindup.CLAMPING else []
-    sheet.write_below(sheet.draw_block(LAWS[loop.pid.form], PID_WIDTH), "\n".join(notes))
-
-
-def _draw_feedforward(sheet: Sheet, loop: ClosedLoop) -> None:
+    sheet.write_below(sheet.draw_block(LAWS[loop.pid.form], STYLE.pid_width), "\n".join(notes))
     if loop.feedforward:
-        centre = sheet.draw_source("feedforward\n" + r"gain $\frac{time\;s}{time\;s + 1}$", SOURCE_WIDTH, SOURCE_HEIGHT)
-        sheet.draw_branch(BRANCH, 0.0)
-        sheet.draw_line([(BRANCH, 0.0), (BRANCH, SOURCE_HEIGHT), (centre - SOURCE_WIDTH / 2, SOURCE_HEIGHT)])
-
-
-def _draw_compensators(sheet: Sheet, loop: ClosedLoop) -> None:
-    """Each adds to the command that it gets."""
-    for part in loop.compensators:
+        centre = sheet.draw_source(
+            "feedforward\n" + r"gain $\frac{time\;s}{time\;s + 1}$", STYLE.source_width, STYLE.source_height
+        )
+        sheet.draw_branch(STYLE.branch, 0.0)
+        sheet.draw_line(
+            [
+                (STYLE.branch, 0.0),
+                (STYLE.branch, STYLE.source_height),
+                (centre - STYLE.source_width / 2, STYLE.source_height),
+            ]
+        )
+    for part in loop.compensators:  # each adds to the command that it gets
         sheet.draw_arrow()
-        centre = sheet.draw_block(fill(part.section.replace("_", " "), 14), COMPENSATOR_WIDTH)
+        centre = sheet.draw_block(fill(part.section.replace("_", " "), 14), STYLE.compensator_width)
         sheet.write_below(centre, "adds to the\ncommand")
-
-
-def _draw_command(sheet: Sheet, loop: ClosedLoop) -> None:
-    """Dither and limits, as the controller adds and clips."""
     if loop.dither and not _has_generator(loop):
         _draw_dither(sheet, loop.dither.waveform, "dither: offset +")
     elif loop.dither:
-        sheet.draw_source("dither: offset", SOURCE_WIDTH, SOURCE_HEIGHT)
+        sheet.draw_source("dither: offset", STYLE.source_width, STYLE.source_height)
     _draw_limits(sheet, loop)
 
 
@@ -267,9 +220,9 @@ def _draw_sampling(sheet: Sheet, loop: ClosedLoop, begin: float) -> None:
     sheet.draw_curve(centre, 0.0, steps)
     sheet.write_below(centre, "hold")
     top = sheet.high + 0.3
-    sheet.draw_frame(begin - FRAME, sheet.x + FRAME, -0.98, top, f"controller, every {1e3 * h:g} ms")
-    sheet.draw_line([(sheet.x, 0.0), (sheet.x + FRAME, 0.0)], head=False)
-    sheet.x += FRAME
+    sheet.draw_frame(begin - STYLE.frame, sheet.x + STYLE.frame, -0.98, top, f"controller, every {1e3 * h:g} ms")
+    sheet.draw_line([(sheet.x, 0.0), (sheet.x + STYLE.frame, 0.0)], head=False)
+    sheet.x += STYLE.frame
     sheet.above = sheet.x
     if loop.dither and _has_generator(loop):
         _draw_dither(sheet, loop.dither.waveform, "dither generator:")
@@ -277,17 +230,17 @@ def _draw_sampling(sheet: Sheet, loop: ClosedLoop, begin: float) -> None:
 
 
 def _draw_dither(sheet: Sheet, waveform: Waveform, title: str) -> None:
-    centre = sheet.draw_source(f"{title}\namplitude ·" + 9 * " ", SOURCE_WIDTH, SOURCE_HEIGHT)
+    centre = sheet.draw_source(f"{title}\namplitude ·" + 9 * " ", STYLE.source_width, STYLE.source_height)
     phases = np.linspace(0, 3 * np.pi, 61)
     sheet.draw_curve(
-        centre + 0.28, SOURCE_HEIGHT - 0.1, list(zip(0.035 * phases, 0.09 * waveform.at(phases), strict=True))
+        centre + 0.28, STYLE.source_height - 0.1, list(zip(0.035 * phases, 0.09 * waveform.at(phases), strict=True))
     )
 
 
 def _draw_limits(sheet: Sheet, loop: ClosedLoop) -> None:
     if loop.pid.limits:
         sheet.draw_arrow(least=0.45)
-        centre = sheet.draw_block("", SMALL_WIDTH)
+        centre = sheet.draw_block("", STYLE.small_width)
         sheet.draw_curve(centre, 0.0, [(-0.28, -0.18), (-0.12, -0.18), (0.12, 0.18), (0.28, 0.18)])
         sheet.write_below(centre, "limits lower,\nupper")
 
@@ -295,24 +248,21 @@ def _draw_limits(sheet: Sheet, loop: ClosedLoop) -> None:
 def _draw_plant(sheet: Sheet, loop: ClosedLoop) -> float:
     """The plant, its parts, its other inputs from above, its outputs to the right; returns where feedback branches."""
     parts = dict.fromkeys(n.removeprefix("plant.").partition(".")[0] for n in loop.plant.parameters)
-    outputs = sorted(loop.plant.outputs, key=lambda q: q.name != _sensed_name(loop))
-    high = max(BLOCK_HEIGHT / 2, OUTPUT_SPACING * (len(outputs) - 1) + 0.2)
+    fed_back = loop.sensor.position if isinstance(loop.sensor, Encoder) else loop.feedback.name
+    outputs = sorted(loop.plant.outputs, key=lambda q: q.name != fed_back)
+    high = max(STYLE.block_height / 2, STYLE.output_spacing * (len(outputs) - 1) + 0.2)
     text = fill(f"plant: {', '.join(parts)}", 23, break_long_words=False)
-    centre = sheet.draw_block(text, PLANT_WIDTH, low=-BLOCK_HEIGHT / 2, high=high)
+    centre = sheet.draw_block(text, STYLE.plant_width, low=-STYLE.block_height / 2, high=high)
     driven = loop.inputs[1 + len(loop.motion_inputs) :]
     for k, signal in enumerate(driven):
         x = centre + 0.7 * (k - (len(driven) - 1) / 2)
         sheet.draw_line([(x, high + 0.45), (x, high)])
         sheet.write(x, high + 0.48, "\n".join(signal_lines(signal)), va="bottom")
-    return _draw_outputs(sheet, outputs)
-
-
-def _draw_outputs(sheet: Sheet, outputs: list[Quantity]) -> float:
-    """Arrows out of the plant: the one that is fed back on the forward path, the others above it."""
+    # the output that is fed back lies on the forward path, the others above it
     labels = [" ".join(signal_lines(q)) for q in outputs]
-    length = LETTER_WIDTH * max(map(len, labels)) + 0.3
+    length = STYLE.letter_width * max(map(len, labels)) + 0.3
     for k, label in enumerate(labels):
-        y = OUTPUT_SPACING * k
+        y = STYLE.output_spacing * k
         sheet.draw_line([(sheet.x, y), (sheet.x + length + 0.3 * (k == 0), y)])
         sheet.write(sheet.x + 0.08, y + 0.03, label, ha="left", va="bottom")
     return sheet.x + length
@@ -321,8 +271,8 @@ def _draw_outputs(sheet: Sheet, outputs: list[Quantity]) -> float:
 def _draw_feedback(sheet: Sheet, loop: ClosedLoop, outlet: float, error: float) -> None:
     """From the plant's output, through the sensor where there is one, to the sum."""
     sheet.draw_branch(outlet, 0.0)
-    height = WIRE_HEIGHT if loop.sensor is None else SENSOR_HEIGHT
-    path = [(outlet, 0.0), (outlet, height), (error, height), (error, -CIRCLE_RADIUS)]
+    height = STYLE.wire_height if loop.sensor is None else STYLE.sensor_height
+    path = [(outlet, 0.0), (outlet, height), (error, height), (error, -STYLE.circle_radius)]
     if loop.sensor is None:
         sheet.draw_line(path)
         return
@@ -330,12 +280,14 @@ def _draw_feedback(sheet: Sheet, loop: ClosedLoop, outlet: float, error: float) 
     text = r"sensor: $\dfrac{1}{lag\;s + 1}$"
     if isinstance(loop.sensor, Encoder):
         text = "encoder: counts" + ("" if loop.sensor.position == loop.feedback.name else ", difference, filter")
-    sheet.draw_line([*path[:2], (place + width / 2, SENSOR_HEIGHT)])
-    sheet.draw_box(place, SENSOR_HEIGHT, width, text)
-    sheet.draw_line([(place - width / 2, SENSOR_HEIGHT), *path[2:]])
+    sheet.draw_line([*path[:2], (place + width / 2, STYLE.sensor_height)])
+    sheet.draw_box(place, STYLE.sensor_height, width, text)
+    sheet.draw_line([(place - width / 2, STYLE.sensor_height), *path[2:]])
     shown = "sensor.count" if loop.outer and isinstance(loop.sensor, Encoder) else "sensor.reading"
     for q in (q for q in loop.states if q.name == shown):
-        sheet.write(place - width / 2 - 0.1, SENSOR_HEIGHT + 0.04, " ".join(signal_lines(q)), ha="right", va="bottom")
+        sheet.write(
+            place - width / 2 - 0.1, STYLE.sensor_height + 0.04, " ".join(signal_lines(q)), ha="right", va="bottom"
+        )
 
 
 def _list_states(sheet: Sheet, loop: ClosedLoop) -> None:
@@ -343,7 +295,7 @@ def _list_states(sheet: Sheet, loop: ClosedLoop) -> None:
     outputs = {q.name: q for q in loop.plant.outputs}
     seen = [*loop.motion_inputs, *(outputs[n] for n in loop.readings)]
     listed = {"States": loop.states, "The controller also gets": seen}
-    letters = max(40, int(sheet.right / LEGEND_LETTER_WIDTH))
+    letters = max(40, int(sheet.right / STYLE.legend_letter_width))
     lines = []
     for title, own in ((title, own) for title, own in listed.items() if own):
         signals = ", ".join(" ".join(signal_lines(q)).replace(" [", "\u00a0[") for q in own)
@@ -354,8 +306,3 @@ def _list_states(sheet: Sheet, loop: ClosedLoop) -> None:
 def _has_generator(loop: ClosedLoop) -> bool:
     """Whether the dither is added behind a sampled controller."""
     return loop.dither is not None and loop.dither.analogue and loop.pid.sample_time is not None
-
-
-def _sensed_name(loop: ClosedLoop) -> str:
-    """The output that the feedback begins at."""
-    return loop.sensor.position if isinstance(loop.sensor, Encoder) else loop.feedback.name

@@ -1,9 +1,4 @@
-"""Fits and predictions beside their logs.
-
-Diagnosis of a fit: its residuals, their correlations and distribution; the correlation of its estimates.
-
-The friction that the logs imply over speed, with the fitted curve and its band.
-"""
+"""Fits beside their logs: prediction, residuals and their correlations, correlation of the estimates, friction map."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -33,7 +28,7 @@ from pneuopt.plotting.canvas import (
 )
 from pneuopt.plotting.tolerances import (
     MAX_CORRELATION_LAG,
-    MAX_NUMBERED_PARAMETERS,
+    MAX_NUMBERED_CELLS,
     MAX_PLOT_CHANNELS,
     MAX_PLOT_COLUMNS,
     MAX_PLOT_POINTS,
@@ -50,16 +45,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-Pairs = Sequence[tuple[Trajectory, Trajectory]]
-
-
 def plot_fit(result: IdentificationResult, experiments: Sequence[Experiment]) -> "Figure":
     """Measured beside fitted, and the residuals, a column a log.
 
     Parameters
     ----------
-    result : Fitted
-        An `IdentificationResult`, say.
+    result : IdentificationResult
+        Its trajectories are drawn.
     experiments : sequence of Experiment
         Those that it was made from, in the same order. Windows of one log (`split`) share a column.
 
@@ -78,6 +70,7 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
     runs : sequence of Trajectory
         One an experiment.
     experiments : sequence of Experiment
+        In the same order; windows of one log (`split`) share a column.
     label : str
         What the runs are: "fitted", "predicted".
 
@@ -86,45 +79,33 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
     Figure
     """
     require(len(runs) == len(experiments) > 0, f"{len(runs)} runs do not match {len(experiments)} experiments")
-    logs = _group_by_log(runs, experiments)
+    logs: dict[str, list[tuple[Trajectory, Trajectory]]] = {}  # windows "name@0", "name@1" belong to "name"
+    for number, (run, experiment) in enumerate(zip(runs, experiments, strict=True), 1):
+        log = experiment.name.partition("@")[0] or f"log {number}"
+        logs.setdefault(log, []).append((experiment.trajectory, run))
     shown = [list(logs)[k] for k in sorted({round(k) for k in np.linspace(0, len(logs) - 1, MAX_PLOT_COLUMNS)})]
     channels = common_channels(runs, experiments)
     require(bool(channels), "the runs and the logs have no channel in common")
     figure, grid = axes_grid(2 * len(channels), len(shown), [2.2, 1.0] * len(channels), sharex="col")
     for column, name in enumerate(shown):
         for row, channel in enumerate(channels):
-            pair, shown_in = (grid[2 * row][column], grid[2 * row + 1][column]), plot_unit(experiments, channel)
-            _draw_comparison(pair, logs[name], channel, label, shown_in)
+            top, bottom, pairs = grid[2 * row][column], grid[2 * row + 1][column], logs[name]
+            factor, unit = plot_unit(experiments, channel)
+            for number, (measured, run) in enumerate(pairs):
+                if channel not in measured or channel not in run:
+                    continue
+                first = number == 0
+                every = max(1, len(measured) * len(pairs) // MAX_PLOT_POINTS)
+                t, y = measured.t[::every], factor * measured[channel][::every]
+                top.plot(t, y, ".", color=GREY, ms=3, label="measured" if first else None)
+                top.plot(run.t, factor * run[channel], color=BLUE, lw=1.2, label=label if first else None)
+                bottom.plot(t, y - factor * run[channel][::every], ".", color=ORANGE, ms=1.5)
+            top.set_ylabel(f"{channel} [{unit}]")
+            bottom.set_ylabel(f"measured\n- {label} [{unit}]", fontsize=8)
+            bottom.axhline(0, color=GREY, lw=0.8)
         grid[0][column].set_title(name, fontsize=9)
         grid[-1][column].set_xlabel("time [s]")
     return finish_columns(figure, grid, len(logs), "logs")
-
-
-def _group_by_log(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Mapping[str, Pairs]:
-    """Pairs of measured and computed, by log; windows "name@0", "name@1" belong to "name"."""
-    logs: dict[str, list[tuple[Trajectory, Trajectory]]] = {}
-    for number, (run, experiment) in enumerate(zip(runs, experiments, strict=True), 1):
-        name = experiment.name.partition("@")[0] or f"log {number}"
-        logs.setdefault(name, []).append((experiment.trajectory, run))
-    return logs
-
-
-def _draw_comparison(
-    axes: tuple["Axes", "Axes"], pairs: Pairs, channel: str, label: str, shown_in: tuple[float, str]
-) -> None:
-    (top, bottom), (factor, unit) = axes, shown_in
-    for number, (measured, run) in enumerate(pairs):
-        if channel not in measured or channel not in run:
-            continue
-        first = number == 0
-        every = max(1, len(measured) * len(pairs) // MAX_PLOT_POINTS)
-        t, y = measured.t[::every], factor * measured[channel][::every]
-        top.plot(t, y, ".", color=GREY, ms=3, label="measured" if first else None)
-        top.plot(run.t, factor * run[channel], color=BLUE, lw=1.2, label=label if first else None)
-        bottom.plot(t, y - factor * run[channel][::every], ".", color=ORANGE, ms=1.5)
-    top.set_ylabel(f"{channel} [{unit}]")
-    bottom.set_ylabel(f"measured\n- {label} [{unit}]", fontsize=8)
-    bottom.axhline(0, color=GREY, lw=0.8)
 
 
 def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> "Figure":
@@ -148,7 +129,14 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
     shown = channels[:MAX_PLOT_CHANNELS]
     figure, grid = axes_grid(len(shown), 4, [2.4] * len(shown), width=13.0)
     for (over_time, own, crossed, spread), channel in zip(grid, shown, strict=True):
-        _draw_over_time(over_time, pairs, channel)
+        factor, unit = plot_unit([e for _, e in pairs], channel)
+        found = _channel_residuals(pairs, channel)
+        every = max(1, sum(len(log) for log, _ in found) // MAX_PLOT_POINTS)
+        for number, (log, e) in enumerate(found):
+            colour = (BLUE, ORANGE)[number % 2] if len(found) <= 4 else BLUE
+            over_time.plot(log.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
+        over_time.axhline(0, color=GREY, lw=0.8)
+        over_time.set_ylabel(f"{channel} [{unit}]")
         _draw_autocorrelation(own, pairs, channel)
         _draw_crosscorrelation(crossed, pairs, channel)
         _draw_distribution(spread, pairs, channel)
@@ -164,14 +152,6 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
 
 def plot_correlation(result: IdentificationResult) -> "Figure":
     """The correlation of the estimates: a cell a pair, 1 or -1 where only a combination of both is identifiable.
-
-    Parameters
-    ----------
-    result : IdentificationResult
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------
@@ -190,18 +170,19 @@ def plot_correlation(result: IdentificationResult) -> "Figure":
     axes.grid(False)
     axes.set_xticks(range(count), names, rotation=40, ha="right", fontsize=8)
     axes.set_yticks(range(count), names, fontsize=8)
-    if count <= MAX_NUMBERED_PARAMETERS:
+    if count <= MAX_NUMBERED_CELLS:
         for (row, column), value in np.ndenumerate(values):
             colour = "white" if abs(value) > 0.6 else "black"
-            axes.text(column, row, _format_correlation(value), ha="center", va="center", fontsize=8, color=colour)
+            # two digits, but never a 1.00 that is none
+            text = (
+                f"{value:.2f}"
+                if abs(value) < 0.995 or abs(value) > 1 - 1e-9
+                else f"{math.trunc(1e4 * value) / 1e4:.4f}"
+            )
+            axes.text(column, row, text, ha="center", va="center", fontsize=8, color=colour)
     axes.set_title("correlation of the estimates", fontsize=10)
     note_omissions(figure, count, len(covariance), "estimates have a standard deviation")
     return figure
-
-
-def _format_correlation(value: float) -> str:
-    """Two digits, but never a 1.00 that is none."""
-    return f"{value:.2f}" if abs(value) < 0.995 or abs(value) > 1 - 1e-9 else f"{math.trunc(1e4 * value) / 1e4:.4f}"
 
 
 def _channel_residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> list[tuple[Trajectory, Array]]:
@@ -212,17 +193,6 @@ def _channel_residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: 
     ]
 
 
-def _draw_over_time(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
-    factor, unit = plot_unit([e for _, e in pairs], channel)
-    found = _channel_residuals(pairs, channel)
-    every = max(1, sum(len(log) for log, _ in found) // MAX_PLOT_POINTS)
-    for number, (log, e) in enumerate(found):
-        colour = (BLUE, ORANGE)[number % 2] if len(found) <= 4 else BLUE
-        axes.plot(log.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
-    axes.axhline(0, color=GREY, lw=0.8)
-    axes.set_ylabel(f"{channel} [{unit}]")
-
-
 def _draw_autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
     found = [e for _, e in _channel_residuals(pairs, channel)]
     rho = _mean_correlogram([_correlogram(e, e) for e in found])
@@ -230,11 +200,10 @@ def _draw_autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experi
     _draw_band(axes, found)
     p = [ljung_box(e)[1] for e in found]
     known = [q for q in p if math.isfinite(q)]
-    message = (
-        f"Ljung-Box p {_format_probability(min(known))}" + (f" (least of {len(known)})" if len(known) > 1 else "")
-        if known
-        else ""
-    )
+    message = ""
+    if known:
+        least = f"{min(known):.2g}" if min(known) >= 1e-4 else "< 1e-4"
+        message = f"Ljung-Box p {least}" + (f" (least of {len(known)})" if len(known) > 1 else "")
     axes.text(0.98, 0.03, message, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
     _set_symmetric_limits(axes, rho[1:])
 
@@ -303,10 +272,6 @@ def _set_symmetric_limits(axes: "Axes", rho: Array) -> None:
     axes.set_ylim(-edge, edge)
 
 
-def _format_probability(p: float) -> str:
-    return f"{p:.2g}" if p >= 1e-4 else "< 1e-4"
-
-
 def plot_friction(system: System, result: IdentificationResult, experiments: Sequence[Experiment]) -> "Figure":
     """The friction force that the logs imply against speed, with the fitted curve and its 95 % band on top.
 
@@ -320,7 +285,9 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
     Parameters
     ----------
     system : System
-    result : Fitted
+        A drive's with a mass, or a rig's.
+    result : IdentificationResult
+        Its fit.
     experiments : sequence of Experiment
         Those that it was made from, in the same order.
 
@@ -337,7 +304,7 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
     imposed, axis = not system.states, system.axis or Axis()
     figure, ((axes,),) = axes_grid(1, 1, [4.2], width=7.0)
     clouds = [
-        _rig_points(e) if imposed else _drive_points(system, result, e, name)
+        (e.trajectory["speed"], e.trajectory["force"]) if imposed else _drive_points(system, result, e, name)
         for name, e in zip(result.trajectories, experiments, strict=True)
     ]
     speed, force = (np.concatenate(part) for part in zip(*clouds, strict=True))
@@ -347,7 +314,7 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
         fitted = np.concatenate([run["force"] for run in result.trajectories.values()])
         axes.plot(speed[::every], fitted[::every], ".", color=BLUE, ms=2.5, label="fitted")
     else:
-        _draw_curve(axes, system, result, experiments, _speed_grid(speed))
+        _draw_curve(axes, system, result, experiments, speed)
     low, high = np.nanpercentile(force, [0.5, 99.5])
     axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
     speed_unit = next(q.unit for q in (*system.states, *system.inputs) if q.name == axis.speed)
@@ -376,6 +343,7 @@ def friction_force(system: System, run: Trajectory, parameters: ParameterSet) ->
     run : Trajectory
         Its states and inputs.
     parameters : ParameterSet
+        Those of the run.
     """
     seen, axis = {n: run[n] for n in names(system.states)}, _moving_axis(system)
     idle = {n: np.zeros(len(run)) for n in seen if n == axis.speed or n.startswith("friction.")}
@@ -387,10 +355,6 @@ def friction_force(system: System, run: Trajectory, parameters: ParameterSet) ->
 def _moving_axis(system: System) -> Axis:
     assert system.axis is not None, "has_friction_map comes first"
     return system.axis
-
-
-def _rig_points(experiment: Experiment) -> tuple[Array, Array]:
-    return experiment.trajectory["speed"], experiment.trajectory["force"]
 
 
 def _drive_points(
@@ -418,9 +382,13 @@ def _drive_points(
 
 
 def _draw_curve(
-    axes: "Axes", system: System, result: IdentificationResult, experiments: Sequence[Experiment], grid: Array
+    axes: "Axes", system: System, result: IdentificationResult, experiments: Sequence[Experiment], speed: Array
 ) -> None:
-    """The fitted curve, and how far the estimates' covariance lets it move; no band where it does not say."""
+    """The fitted curve over the range of speeds, and how far the estimates' covariance lets it move, if it says so."""
+    low, high = float(np.nanmin(speed)), float(np.nanmax(speed))
+    near = np.geomspace(1e-4, 1.0, 120) * max(-low, high)  # dense around zero
+    grid = np.unique(np.concatenate([np.linspace(low, high, 200), near, -near]))
+    grid = grid[(grid >= low) & (grid <= high) & (grid != 0)]
     shared = [n for n in result.covariance.index if n in result.parameters]
     usual = {
         n: float(np.median(np.concatenate([run[n] for run in result.trajectories.values()])))
@@ -440,10 +408,7 @@ def _draw_curve(
 
 
 def _steady_friction(system: System, parameters: ParameterSet, usual: Mapping[str, float], speeds: Array) -> Array:
-    """The friction force at a steady speed, with the bristles at their deflection for that speed.
-
-    A bristle's rate is linear in its deflection: two points tell where it is zero.
-    """
+    """Friction force at steady speeds; bristles have the deflection at which their rate, linear in it, is zero."""
     axis, usual_columns = _moving_axis(system), {n: np.full(len(speeds), value) for n, value in usual.items()}
     inputs = {n: usual_columns[n] for n in names(system.inputs)}
     still = {n: usual_columns[n] for n in names(system.states)} | {axis.speed: np.zeros(len(speeds))}
@@ -471,11 +436,3 @@ def _state_rates(
 def _smooth_derivative(t: Array, y: Array) -> Array:
     window = SLOPE_SAMPLES * float(np.median(np.diff(t)))
     return differentiate(Experiment(Trajectory(t, {"position": y})), window=window).trajectory["speed"]
-
-
-def _speed_grid(speed: Array) -> Array:
-    """A grid over the range, dense around zero."""
-    low, high = float(np.nanmin(speed)), float(np.nanmax(speed))
-    near = np.geomspace(1e-4, 1.0, 120) * max(-low, high)
-    grid = np.unique(np.concatenate([np.linspace(low, high, 200), near, -near]))
-    return np.asarray(grid[(grid >= low) & (grid <= high) & (grid != 0)])

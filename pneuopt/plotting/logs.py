@@ -1,7 +1,4 @@
-"""Logs as they were read: each channel over time.
-
-A finding of the log doctor: the signals that contradict each other.
-"""
+"""Logs as they were read, each channel over time, and the signals that contradict each other in a doctor's finding."""
 
 import textwrap
 from collections.abc import Sequence
@@ -10,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.logs.columns import CHANNELS
-from pneuopt.logs.doctor import Evidence, LogFinding, Panel
+from pneuopt.logs.doctor import LogFinding
 from pneuopt.logs.experiment import Experiment
 from pneuopt.plotting.canvas import (
     BLUE,
@@ -18,27 +15,23 @@ from pneuopt.plotting.canvas import (
     ORANGE,
     PLOT_UNITS,
     RED,
+    STYLE,
     axes_grid,
     axis_label,
     note_omissions,
     plot_unit,
 )
-from pneuopt.plotting.tolerances import LABEL_WIDTH, MAX_PLOT_COLUMNS, MAX_PLOT_POINTS, MAX_ZOOM_SHARE, TITLE_WIDTH
+from pneuopt.plotting.tolerances import MAX_PLOT_COLUMNS, MAX_PLOT_POINTS, MAX_ZOOM_SHARE
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 def plot_logs(experiments: Sequence[Experiment]) -> "Figure":
     """The channels of logs, a row a channel, a column a log.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
 
     Returns
     -------
@@ -52,23 +45,18 @@ def plot_logs(experiments: Sequence[Experiment]) -> "Figure":
     for column, experiment in enumerate(shown):
         for row, channel in enumerate(channels):
             axes = grid[row][column]
-            _draw(axes, experiment, channel)
+            log = experiment.trajectory
+            if channel in log:
+                t, y = _envelope(log.t, plot_unit([experiment], channel)[0] * log[channel])
+                axes.plot(t, y, color=BLUE, lw=0.9)
+            else:
+                axes.text(0.5, 0.5, "not logged", transform=axes.transAxes, ha="center", va="center", color=GREY)
             if column == 0:
                 axes.set_ylabel(axis_label(channel.replace("_", "\n", 1), plot_unit(shown, channel)[1]), fontsize=9)
         grid[0][column].set_title(experiment.name, fontsize=9)
         grid[-1][column].set_xlabel("time [s]")
     note_omissions(figure, len(shown), len(experiments), "logs")
     return figure
-
-
-def _draw(axes: "Axes", experiment: Experiment, channel: str) -> None:
-    """A channel over time; of more points than can be seen, the least and the largest of each stretch."""
-    log = experiment.trajectory
-    if channel not in log:
-        axes.text(0.5, 0.5, "not logged", transform=axes.transAxes, ha="center", va="center", color=GREY)
-        return
-    t, y = _envelope(log.t, plot_unit([experiment], channel)[0] * log[channel])
-    axes.plot(t, y, color=BLUE, lw=0.9)
 
 
 def _envelope(t: Array, y: Array) -> tuple[Array, Array]:
@@ -104,6 +92,8 @@ def plot_finding(finding: LogFinding) -> "Figure":
     InputError
         If the finding has no evidence.
     """
+    from matplotlib.patches import Patch
+
     shown = finding.evidence
     if shown is None:
         raise InputError(f"the finding {finding.check!r} has no signals to be drawn")
@@ -115,44 +105,31 @@ def plot_finding(finding: LogFinding) -> "Figure":
     for column, (label, view) in enumerate(views.items()):
         for number, panel in enumerate(shown.panels):
             axes = grid[number][column]
-            _draw_panel(axes, shown, panel, view, COLOURS[number:])
+            factor, _ = PLOT_UNITS.get(panel.unit, (1.0, ""))
+            inside = np.flatnonzero((shown.t >= view[0]) & (shown.t <= view[1]))
+            part = inside[:: max(1, inside.size // MAX_PLOT_POINTS)]
+            for colour, (name, curve) in zip(COLOURS[number:], panel.curves.items(), strict=False):
+                axes.plot(shown.t[part], factor * curve[part], color=colour, lw=1.1, label=name)
+            axes.set_xlim(*view)
+            if not shown.contradiction.all():
+                between = axes.get_xaxis_transform()
+                axes.fill_between(
+                    shown.t, 0, 1, where=shown.contradiction, transform=between, color=RED, alpha=0.15, lw=0
+                )
             if column == 0:
-                axes.set_ylabel(_panel_label(panel), fontsize=9)
+                unit = PLOT_UNITS.get(panel.unit, (1.0, panel.unit))[1]
+                name = next(iter(panel.curves)) if len(panel.curves) == 1 else ""
+                text = axis_label("\n".join(textwrap.wrap(name, STYLE.label_letters)), unit)
+                axes.set_ylabel(text.strip(), fontsize=9)
         grid[0][column].set_title(label, fontsize=9, color=GREY)
         grid[-1][column].set_xlabel("time [s]")
     title = f"{finding.log}: {finding.message}" if finding.log else finding.message
-    figure.suptitle("\n".join(textwrap.wrap(title, TITLE_WIDTH)), fontsize=9, ha="left", x=0.01)
-    _add_legend(figure, [row[0] for row in grid], shown)
-    return figure
-
-
-def _draw_panel(axes: "Axes", shown: Evidence, panel: Panel, view: tuple[float, float], colours: Sequence[str]) -> None:
-    """The curves of a panel within a view, and where they contradict others."""
-    factor, _ = PLOT_UNITS.get(panel.unit, (1.0, ""))
-    inside = np.flatnonzero((shown.t >= view[0]) & (shown.t <= view[1]))
-    part = inside[:: max(1, inside.size // MAX_PLOT_POINTS)]
-    for colour, (name, curve) in zip(colours, panel.curves.items(), strict=False):
-        axes.plot(shown.t[part], factor * curve[part], color=colour, lw=1.1, label=name)
-    axes.set_xlim(*view)
-    if not shown.contradiction.all():
-        between = axes.get_xaxis_transform()
-        axes.fill_between(shown.t, 0, 1, where=shown.contradiction, transform=between, color=RED, alpha=0.15, lw=0)
-
-
-def _panel_label(panel: Panel) -> str:
-    """The name of a panel's only curve, or nothing, and the unit that is drawn."""
-    unit = PLOT_UNITS.get(panel.unit, (1.0, panel.unit))[1]
-    name = next(iter(panel.curves)) if len(panel.curves) == 1 else ""
-    return axis_label("\n".join(textwrap.wrap(name, LABEL_WIDTH)), unit).strip()
-
-
-def _add_legend(figure: "Figure", panels: Sequence["Axes"], shown: Evidence) -> None:
-    """Names of the curves of panels that have several, and what is shaded, below all axes."""
-    from matplotlib.patches import Patch
-
-    several = [axes for axes, panel in zip(panels, shown.panels, strict=True) if len(panel.curves) > 1]
+    figure.suptitle("\n".join(textwrap.wrap(title, STYLE.title_letters)), fontsize=9, ha="left", x=0.01)
+    # below all axes, the names of the curves of panels that have several, and what is shaded
+    several = [row[0] for row, panel in zip(grid, shown.panels, strict=True) if len(panel.curves) > 1]
     handles: list[Artist] = [line for axes in several for line in axes.get_legend_handles_labels()[0]]
     if not shown.contradiction.all():
         handles.append(Patch(color=RED, alpha=0.15, label=shown.label))
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure

@@ -1,7 +1,4 @@
-"""Step responses of closed loops, with reference, band and command, and what goes on inside the drive.
-
-The Bode plot of an open loop with its margins, and the sensitivities that they come from.
-"""
+"""Step responses of closed loops, with what goes on inside the drive, and the Bode plot of an open loop."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +13,7 @@ from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.margins import Margins, frequency_grid, frequency_response, margins
 from pneuopt.evaluation.metric import Band, band_share, describe_band
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, finish_columns, legend_above
-from pneuopt.plotting.tolerances import CURVE_POINTS, MAX_PLOT_COLUMNS, MIN_PLOTTED_SENSITIVITY
+from pneuopt.plotting.tolerances import MAX_PLOT_COLUMNS, MIN_PLOTTED_SENSITIVITY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -38,6 +35,7 @@ class Response:
     run : Trajectory
         With the measured signal and "control"; "valve.spool" [1] and "friction.force" are drawn where it has them.
     reference : Reference
+        Drawn with its settling band.
     measured : str
         Column of the signal that follows the reference.
     units : tuple of str
@@ -65,6 +63,7 @@ def plot_steps(responses: Sequence[Response], *, band: Band = 0.02) -> "Figure":
     Parameters
     ----------
     responses : sequence of Response
+        Beside each other; the first three are drawn.
     band : float
         Half width of the settling band, a fraction of the step.
 
@@ -113,12 +112,12 @@ def _draw_tracking(axes: "Axes", response: Response, band: Band) -> None:
     _set_view_limits(axes, signal, ends, ends if before is None else before[response.measured])
 
 
-def _reference_curve(reference: Reference, end: float) -> tuple[Array, Array]:
+def _reference_curve(reference: Reference, end: float, points: int = 500) -> tuple[Array, Array]:
     """Points of a reference up to the end of its record; a step stands upright."""
     if isinstance(reference, Step):
         values = [reference.initial, reference.initial, reference.final, reference.final]
         return np.array([0, reference.at, reference.at, end]), np.array(values)
-    t = np.linspace(0, end, CURVE_POINTS)
+    t = np.linspace(0, end, points)
     return t, reference.values(t)
 
 
@@ -170,13 +169,18 @@ def plot_bode(open_loop: Linearisation, before: Linearisation | None = None) -> 
     Figure
     """
     m = margins(open_loop)
-    omega = _plot_frequencies(open_loop, [m.gain_crossover, m.phase_crossover, m.max_sensitivity_frequency])
+    omega, marks = frequency_grid(open_loop), (m.gain_crossover, m.phase_crossover, m.max_sensitivity_frequency)
+    finite = [w for w in marks if math.isfinite(w) and w > 0]
+    if finite:  # the grid of all features is cut to one and a half decades around the crossovers
+        omega = omega[(omega >= min(finite) / 30) & (omega <= max(finite) * 30)]
     figure, ((top,), (middle,), (bottom,)) = axes_grid(3, 1, [2.0, 2.0, 1.8], sharex="col", width=7.0)
     if before is not None:
         _draw_curves((top, middle, bottom), before, omega, GREY, "before")
     phase = _draw_curves((top, middle, bottom), open_loop, omega, BLUE, "" if before is None else "tuned")
     _mark_margins(top, middle, m, omega, phase)
-    _mark_peak(bottom, m)
+    bottom.axhline(1, color=GREY, lw=0.8)
+    if math.isfinite(m.max_sensitivity_frequency) and math.isfinite(m.max_sensitivity):
+        bottom.plot([m.max_sensitivity_frequency], [m.max_sensitivity], "o", color=BLUE, ms=4)
     for axes, name in ((top, "gain [dB]"), (middle, "phase [deg]"), (bottom, "|S|, dashed |T|")):
         axes.set_ylabel(name)
     bottom.set_xlabel("frequency [rad/s]")
@@ -221,22 +225,6 @@ def _mark_margins(top: "Axes", middle: "Axes", m: Margins, omega: Array, phase: 
     for level in (-180 + 360 * k for k in (-2, -1, 0, 1) if np.min(phase) - 45 < -180 + 360 * k < np.max(phase) + 45):
         middle.axhline(level, color=GREY, lw=0.8)
     middle.yaxis.set_major_locator(MultipleLocator(90))
-
-
-def _mark_peak(axes: "Axes", m: Margins) -> None:
-    """Where feedback makes things worse the most."""
-    axes.axhline(1, color=GREY, lw=0.8)
-    if math.isfinite(m.max_sensitivity_frequency) and math.isfinite(m.max_sensitivity):
-        axes.plot([m.max_sensitivity_frequency], [m.max_sensitivity], "o", color=BLUE, ms=4)
-
-
-def _plot_frequencies(open_loop: Linearisation, marks: Sequence[float]) -> Array:
-    """The grid of all features, cut to one and a half decades around the crossovers."""
-    omega = frequency_grid(open_loop)
-    finite = [w for w in marks if math.isfinite(w) and w > 0]
-    if not finite:
-        return omega
-    return omega[(omega >= min(finite) / 30) & (omega <= max(finite) * 30)]
 
 
 def _mark_frequency(rows: tuple["Axes", "Axes"], omega: float, color: str) -> None:

@@ -1,7 +1,4 @@
-"""A planned experiment: what is played and how the drive answers, within its limits, and what its log will tell.
-
-Condition tracking: each log's estimates over their dates, the line through them, and the alarm.
-"""
+"""Experiments over time: a planned one, within its limits, and estimates tracked over the dates of their logs."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -16,19 +13,13 @@ from pneuopt.plotting.canvas import (
     ORANGE,
     PLOT_UNITS,
     RED,
+    STYLE,
     axes_grid,
     axis_label,
     legend_above,
     note_omissions,
 )
-from pneuopt.plotting.tolerances import (
-    INCHES_A_PARAMETER,
-    MAX_PANELS,
-    MAX_SIGNALS,
-    NORMAL_QUANTILE_95,
-    SHOWN_LIMIT_SHARE,
-    TICKS,
-)
+from pneuopt.plotting.tolerances import MAX_PANELS, MAX_PLOT_CHANNELS, NORMAL_QUANTILE_95, SHOWN_LIMIT_SHARE
 from pneuopt.quantities.arrays import Array
 
 if TYPE_CHECKING:
@@ -39,18 +30,14 @@ if TYPE_CHECKING:
 def plot_experiment(design: ExperimentDesign) -> "Figure":
     """The excitation, the signals with limits as the estimates predict them, and the intervals before and after.
 
-    Parameters
-    ----------
-    design : ExperimentDesign
-
     Returns
     -------
     Figure
         A panel the excitation, and one each signal that has a limit; several runs follow one another. Then half the
         95 % interval of each free parameter, over its value: before, where logs are in hand, and after.
     """
-    signals = [n for n in dict.fromkeys((design.channel, *design.limits)) if n in design.runs[0]][:MAX_SIGNALS]
-    heights = [1.3] * len(signals) + [0.6 + INCHES_A_PARAMETER * len(design.table)]
+    signals = [n for n in dict.fromkeys((design.channel, *design.limits)) if n in design.runs[0]][:MAX_PLOT_CHANNELS]
+    heights = [1.3] * len(signals) + [0.6 + STYLE.parameter_height * len(design.table)]
     figure, grid = axes_grid(len(heights), 1, heights, width=8.0)
     *panels, last = (row[0] for row in grid)
     for panel, name in zip(panels, signals, strict=True):
@@ -104,7 +91,7 @@ def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
         panel.plot(before, places, "o", color=GREY, ms=5, label="95 % now")
     panel.plot(after, places, "o", color=BLUE, ms=5, label="95 % with the planned log")
     panel.set_xscale("log")
-    panel.xaxis.set_major_locator(ticks.LogLocator(subs=TICKS, numticks=8))
+    panel.xaxis.set_major_locator(ticks.LogLocator(subs=STYLE.decade_ticks, numticks=8))
     panel.xaxis.set_minor_locator(ticks.NullLocator())
     panel.xaxis.set_major_formatter(ticks.FuncFormatter(lambda value, _: f"{value:g}"))
     for place in places[size == 0]:
@@ -118,10 +105,6 @@ def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
 
 def plot_tracking(found: Tracking) -> "Figure":
     """Estimates with their intervals over dates, their line with its band, and where a drift was first seen.
-
-    Parameters
-    ----------
-    found : Tracking
 
     Returns
     -------

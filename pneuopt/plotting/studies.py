@@ -1,28 +1,16 @@
-"""Studies: metrics over one axis as lines, over two as maps of equal cells.
+"""Studies: metrics over one axis as lines, over two as maps; Pareto fronts; distributions over cases without axes.
 
-Pareto fronts: one requirement over another, a point a certified design.
-
-How the metrics of a study are distributed over its cases: of samples, corners or a table, which have no map.
-
-Which tolerances matter: Sobol's indices, and a design's derivatives beside them, as bars, a panel a figure.
+Which tolerances matter is drawn as bars: Sobol's indices, and a design's derivatives beside them.
 """
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.evaluation.requirements import METRICS, larger_is_better
-from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, axis_label, legend_above, note_omissions
-from pneuopt.plotting.tolerances import (
-    INCHES_AN_AXIS,
-    LABELS_PER_LONG_AXIS,
-    MARKED_SHARE,
-    MAX_NUMBERED_CELLS,
-    MAX_PLOT_COLUMNS,
-)
-from pneuopt.quantities.arrays import Array
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, STYLE, axes_grid, axis_label, legend_above, note_omissions
+from pneuopt.plotting.tolerances import MARKED_SHARE, MAX_NUMBERED_CELLS, MAX_PLOT_COLUMNS
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.studies.sensitivity import LocalSensitivity, Sensitivity
@@ -30,7 +18,6 @@ from pneuopt.studies.sensitivity import LocalSensitivity, Sensitivity
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
-    from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
 
@@ -107,21 +94,16 @@ def _draw_map(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], met
     panel.figure.colorbar(mesh, ax=panel, pad=0.02)
     panel.grid(False)
     for ticks, at in ((panel.set_xticks, x), (panel.set_yticks, y)):
-        every = 1 if len(at) <= MAX_NUMBERED_CELLS else -(-len(at) // LABELS_PER_LONG_AXIS)
+        every = 1 if len(at) <= MAX_NUMBERED_CELLS else -(-len(at) // STYLE.labels_of_long_axis)
         ticks(np.arange(0, len(at), every) + 0.5, [f"{v:.3g}" for v in at[::every]])
     if max(len(x), len(y)) <= MAX_NUMBERED_CELLS:
-        _number_cells(panel, mesh, values, errors, metric)
-
-
-def _number_cells(panel: "Axes", mesh: "QuadMesh", values: Array, errors: NDArray[np.object_], metric: str) -> None:
-    """Each cell's figure, or what became of it, in black or white as the cell is light or dark."""
-    for (j, i), value in np.ndenumerate(values):
-        known = bool(np.isfinite(value))
-        text = f"{value:.3g}" if known else _failure_word(metric, str(errors[j, i]))
-        red, green, blue, _ = mesh.to_rgba(np.array([value]))[0]
-        light = 0.3 * red + 0.59 * green + 0.11 * blue > 0.5
-        colour = RED if not known else "black" if light else "white"
-        panel.text(i + 0.5, j + 0.5, text, ha="center", va="center", fontsize=8, color=colour)
+        for (j, i), value in np.ndenumerate(values):
+            known = bool(np.isfinite(value))
+            text = f"{value:.3g}" if known else _failure_word(metric, str(errors[j, i]))
+            red, green, blue, _ = mesh.to_rgba(np.array([value]))[0]
+            light = 0.3 * red + 0.59 * green + 0.11 * blue > 0.5  # then black letters can be read, else white ones
+            colour = RED if not known else "black" if light else "white"
+            panel.text(i + 0.5, j + 0.5, text, ha="center", va="center", fontsize=8, color=colour)
 
 
 def _failure_word(metric: str, error: str) -> str:
@@ -221,6 +203,7 @@ def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) 
     Parameters
     ----------
     found : Sensitivity
+        Of the figures to draw, a panel each.
     local : LocalSensitivity, optional
         Of a design on the same axes: its shares are a third bar, which agrees with an axis' share by itself where the
         figure is linear over the whole box.
@@ -236,7 +219,7 @@ def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) 
     order = table["total"].groupby(level="axis").max().sort_values(ascending=False).index.tolist()
     width = 2.2 + 2.6 * len(shown)
     bars = 2 if local is None else 3
-    height, thick = INCHES_AN_AXIS * bars / 2, 0.74 / bars
+    height, thick = STYLE.bars_height * bars / 2, 0.74 / bars
     picture, (row,) = axes_grid(1, len(shown), [0.8 + height * len(order)], width=width)
     places = np.arange(len(order)) - thick * (bars - 1) / 2
     for panel, figure in zip(row, shown, strict=True):
@@ -251,7 +234,9 @@ def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) 
                 places + k * thick, value, 0.95 * thick, xerr=spread, color=colour, label=label, ecolor="k", capsize=2
             )
         if local is not None:
-            shares = _local_shares(local, str(figure), order)
+            # none where the design has no such figure, or no such axis
+            rows = [local.table["share"].get((str(figure), axis), np.nan) for axis in order]
+            shares = np.nan_to_num(np.array(rows, dtype=float))
             panel.barh(places + 2 * thick, shares, 0.95 * thick, color=ORANGE, label="by its slope at the design")
         panel.set_yticks(np.arange(len(order)), order if panel is row[0] else [""] * len(order))
         panel.set_xlim(0.0, max(1.0, panel.get_xlim()[1]))  # one scale, so that panels compare, and a constant's is 0
@@ -261,9 +246,3 @@ def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) 
     legend_above(picture, row[0])
     note_omissions(picture, len(shown), len(figures), "figures")
     return picture
-
-
-def _local_shares(local: LocalSensitivity, figure: str, axes: list[str]) -> Array:
-    """Shares of a figure by axis; none where the design has no such figure, or no such axis."""
-    rows = [local.table["share"].get((figure, axis), np.nan) for axis in axes]
-    return np.asarray(np.nan_to_num(np.array(rows, dtype=float)))

@@ -1,11 +1,9 @@
 """`evaluate_batch`: one design on thousands of plants, many at once in SIMD lanes; the worst and some others certified.
 
-The lanes integrate by RK4 on one grid of samples, as a search does, and the metrics are read off them by the records
-that the certificate reads by. They have no events of stick-slip, no margins and no continuation beyond the horizon:
-those are left to the certificate. What the lanes say is held to `evaluate`, the independent simulation, on the plants
-on which a metric is worst, and on a share of all that is drawn at random.
-
-`PlantBatch`: the plants of a batch as rows of numbers, run in SIMD lanes, and their metrics.
+The lanes (`PlantBatch`) integrate by RK4 on one grid of samples, as a search does, and the metrics are read off them by
+the records that the certificate reads by. They have no events of stick-slip, no margins and no continuation beyond the
+horizon: those are left to the certificate. What the lanes say is held to `evaluate`, the independent simulation, on the
+plants on which a metric is worst, and on a share of all that is drawn at random.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -124,7 +122,9 @@ def evaluate_batch(
     Parameters
     ----------
     loop : ClosedLoop
+        With a plant without Karnopp's friction.
     references : Reference or sequence of Reference
+        A column of each metric for each.
     parameters : ParameterSet
         The nominal plant and the gains.
     cases : mapping of str to mapping of str to float
@@ -179,7 +179,11 @@ def evaluate_batch(
     check_parameters(parameters)
     check_closed_loop(loop)
     chunk = CHUNK_A_CORE * processor_count() if chunk is None else chunk
-    _check_batch(loop, chosen, cases, recertify, chunk)
+    check_smooth(loop.plant)
+    require(len(cases) > 0, "a batch needs a case")
+    require(0 <= recertify <= 1, f"recertify is a share of the plants between 0 and 1, got {recertify:g}; 0.01 is 1 %")
+    require(chunk >= 1, f"chunk must be at least 1, got {chunk}")
+    check_lanes(loop, chosen)
     cases = {str(name): values for name, values in cases.items()}
     batch = PlantBatch(add_disturbances(loop, steps), steps, parameters, cases, chosen, band)
     columns, report = batch.empty_columns(), ProgressReporter(progress, "batch")
@@ -215,7 +219,7 @@ class _Memory:
         self.missing = np.array([k for k in range(len(cases)) if not self._recall(k)], dtype=np.intp)
         if journal is not None:
             known = np.setdiff1d(np.arange(len(cases)), self.missing)
-            journal.show(self._row(k, "") for k in known.tolist())
+            journal.append_rows(self._row(k, "") for k in known.tolist())
 
     @property
     def done(self) -> int:
@@ -231,7 +235,7 @@ class _Memory:
             assert self._journal is not None
             self._journal.add(name, self._marks.of(values), Outcome(results, error=errors[k]))
         if self._journal is not None:
-            self._journal.show(self._row(k, errors[k]) for k in rows.tolist())
+            self._journal.append_rows(self._row(k, errors[k]) for k in rows.tolist())
 
     def _row(self, k: int, error: str) -> dict[str, Any]:
         """A plant's row for those who watch."""
@@ -247,17 +251,6 @@ class _Memory:
         for n, column in self._columns.items():
             column[k] = found.results[n]
         return True
-
-
-def _check_batch(
-    loop: ClosedLoop, metrics: Sequence[str], cases: Mapping[str, Mapping[str, float]], recertify: float, chunk: int
-) -> None:
-    """Refuse what lanes cannot do; the message names the remedy."""
-    check_smooth(loop.plant)
-    require(len(cases) > 0, "a batch needs a case")
-    require(0 <= recertify <= 1, f"recertify is a share of the plants between 0 and 1, got {recertify:g}; 0.01 is 1 %")
-    require(chunk >= 1, f"chunk must be at least 1, got {chunk}")
-    check_lanes(loop, metrics)
 
 
 def check_lanes(loop: ClosedLoop, metrics: Sequence[str]) -> None:
@@ -337,16 +330,24 @@ class PlantBatch:
         self._values = np.array(
             [[v.get(n, self._full.value(n)) for n in self.varied] for v in self._cases], dtype=float
         )
-        self._check_values()
+        for k, n in enumerate(self.varied):
+            known, column = self._full[n], self._values[:, k]
+            bad = ~((column >= known.lower) & (column <= known.upper) & np.isfinite(column))
+            for row in np.flatnonzero(bad).tolist():
+                reason = f"{n} is {column[row]:g} {known.unit}, outside [{known.lower:g}, {known.upper:g}]"
+                self.errors[row] = self.errors[row] or reason
         self.lanes = LoopLanes(loop, metrics, _make_rollout)
-        fastest = {"dither.frequency": self._most("dither.frequency")} if "dither.frequency" in self.varied else {}
+        fastest, frequency = {}, "dither.frequency"
+        if frequency in self.varied:
+            values = self._values[:, self.varied.index(frequency)]
+            fastest[frequency] = float(np.max(values, where=np.isfinite(values), initial=self._full.value(frequency)))
         self.grids = reference_grids(loop, steps, self._full.with_values(fastest))
         self._starts = [self._shared_start(grid.reference) for grid in self.grids]
         rate = max(RATE_MARGIN * self._fastest_mode(), dither_resolution_rate(loop, self._full))
         self.substeps = [rk4_substeps(rate, grid.spacing) for grid in self.grids]
 
     def nominal_value(self, name: str) -> float:
-        """Of a parameter."""
+        """Value of a parameter of the nominal plant."""
         return float(self._full.value(name))
 
     def column(self, metric: str, grid: ReferenceGrid) -> str:
@@ -399,11 +400,8 @@ class PlantBatch:
         return TuningCase(step, "", values).initial(self.loop, self._full)
 
     def _shared_start(self, step: Reference) -> Array | None:
-        """The state before the step, if it is the same on every plant, as far as probes tell; None: each has its own.
-
-        It takes a millisecond, which is longer than a plant's response in the lanes. The probes are the plants with the
-        least and the greatest value of each parameter, and the first.
-        """
+        """The state before the step, if it is the same on the probed plants (`_extremes`); None: each has its own."""
+        # a state takes a millisecond, which is longer than a plant's response in the lanes
         try:
             states = [self.start(self._cases[k], step) for k in self._extremes()]
         except PneuoptError:
@@ -430,25 +428,11 @@ class PlantBatch:
         along = [self.lanes.states_along(g, x, self.nominal, few) for g, x in zip(self.grids, starts, strict=True)]
         return float(fastest_eigenvalue(self.loop, p, [x for rows in along for x in rows]).max())
 
-    def _check_values(self) -> None:
-        """Give each plant with a value that is no number, or out of bounds, its reason."""
-        for k, n in enumerate(self.varied):
-            p, column = self._full[n], self._values[:, k]
-            bad = ~((column >= p.lower) & (column <= p.upper) & np.isfinite(column))
-            for row in np.flatnonzero(bad).tolist():
-                said = f"{n} is {column[row]:g} {p.unit}, outside [{p.lower:g}, {p.upper:g}]"
-                self.errors[row] = self.errors[row] or said
-
-    def _most(self, name: str) -> float:
-        values = self._values[:, self.varied.index(name)]
-        return float(np.max(values, where=np.isfinite(values), initial=self._full.value(name)))
-
 
 def _make_rollout(pieces: Pieces) -> Rollout:
-    """A rollout with twice the usual lanes, where there are lanes.
+    """A rollout with twice the usual lanes, where there are lanes: two chains of operations run at a time.
 
-    Two vectors' chains of operations run at a time where one waits for its results: four fifths of the time for many
-    plants. A search has too few for it.
+    It takes four fifths of the time for many plants; a search has too few for it.
     """
     usual = Rollout(pieces)
     twice = Rollout(pieces, lanes=2 * usual.lanes) if usual.lanes > 1 else usual

@@ -2,7 +2,7 @@
 
 A simulated log has the inputs of the logged one, its noise, its resolution and its missing samples. It begins in the
 fitted state, and again wherever the simulation has left the fitted motion (`MAX_WANDER`), as an axis without its loop
-does: the excitation is that of the log. What the fits of simulated logs make of estimates that are known then shows
+does: the motion is that of the log. What the fits of simulated logs make of estimates that are known then shows
 what the one fit of the real logs has made of the truth. Source: Efron, Tibshirani, An Introduction to the Bootstrap,
 1993, chapters 6 (the parametric bootstrap) and 10 (the value less its bias).
 """
@@ -10,7 +10,7 @@ what the one fit of the real logs has made of the truth. Source: Efron, Tibshira
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -183,29 +183,15 @@ def _reason_for_doubt(row: "pd.Series[Any]") -> str:
 
 def _rig_of(rig: HasSystem | Rig | Runnable, log: Experiment, fit: IdentificationResult, outputs: Sequence[str]) -> Rig:
     """The rig with the log's own sensors where it has none."""
-    own = {n: _sensor_of(log, n, float(fit.fit["noise"][log.name, n])) for n in outputs}
+    own = {}
+    for n in outputs:  # the noise that the fit counts, and the resolution that the log shows
+        resolution = estimate_noise(log.trajectory[n], log.trajectory.t).resolution
+        noise = math.sqrt(max(float(fit.fit["noise"][log.name, n]) ** 2 - resolution**2 / 12, 0.0))
+        own[n] = Sensor(noise=noise, resolution=resolution)
     if isinstance(rig, Rig):
         return replace(rig, sensors=own | {n: s for n, s in rig.sensors.items() if n in own})
     plant = as_runnable(rig, "rig").plant
     return Rig(plant, own, actuated=names(plant.inputs)[0])
-
-
-def _sensor_of(log: Experiment, channel: str, level: float) -> Sensor:
-    """A sensor with the noise that the fit counts, and the resolution that the log shows."""
-    resolution = estimate_noise(log.trajectory[channel], log.trajectory.t).resolution
-    return Sensor(noise=math.sqrt(max(level**2 - resolution**2 / 12, 0.0)), resolution=resolution)
-
-
-def _parameters_of(log: Experiment, fit: IdentificationResult) -> ParameterSet:
-    """The estimates as they hold in a log."""
-    own = {
-        n: float(fit.estimates["value"][f"{n}[{log.name}]"]) for n in fit.parameters.free_names if _is_own(n, log, fit)
-    }
-    return fit.parameters.with_values({**own, **log.conditions})
-
-
-def _is_own(name: str, log: Experiment, fit: IdentificationResult) -> bool:
-    return f"{name}[{log.name}]" in fit.estimates.index
 
 
 def _find_runs(rig: Rig, log: Experiment, fit: IdentificationResult) -> list[tuple[int, int]]:
@@ -229,7 +215,10 @@ def _simulate(
     rig: Rig, log: Experiment, fit: IdentificationResult, begin: int, end: int, *, seed: int
 ) -> Mapping[str, Array]:
     """Readings of the rig over rows of a log, from the fitted state at the first one."""
-    plant, fitted, parameters = rig.plant, fit.trajectories[log.name], _parameters_of(log, fit)
+    plant, fitted, estimates = rig.plant, fit.trajectories[log.name], fit.estimates["value"]
+    per_log = {n: f"{n}[{log.name}]" for n in fit.parameters.free_names}
+    values = {n: float(estimates[row]) for n, row in per_log.items() if row in estimates.index}
+    parameters = fit.parameters.with_values({**values, **log.conditions})
     initial = {n: float(fitted[n][begin]) for n in names(plant.states) if n in fitted}
     rows = log.trajectory.rows(begin, end)
     inputs = Trajectory(rows.t, {n: rows[n] for n in names(plant.inputs)})
@@ -290,13 +279,10 @@ def _refit(
         )
     if not again.status.converged:
         raise ConvergenceError(again.status.verdict, again)
-    return {"verdict": again.status.verdict} | dict(_flat(again))
-
-
-def _flat(fit: IdentificationResult) -> Iterator[tuple[str, float]]:
-    for name, row in fit.estimates.iterrows():
-        for part in ("value", "ci_low", "ci_high"):
-            yield f"{name}.{part}", float(row[part])
+    found: dict[str, float | str] = {"verdict": again.status.verdict}
+    for name, row in again.estimates.iterrows():
+        found |= {f"{name}.{part}": float(row[part]) for part in ("value", "ci_low", "ci_high")}
+    return found
 
 
 def _tabulate(fit: IdentificationResult, draws: "pd.DataFrame") -> "pd.DataFrame":

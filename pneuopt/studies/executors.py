@@ -1,13 +1,11 @@
-"""Somebody else's threads, processes or machines: anything with the interface of `concurrent.futures`.
+"""Where a study computes its cases: processes of this machine (`Processes`), a cluster, or any executor.
 
-Processes of this machine, in which a study computes its cases by default.
-
-They are loky's executors of one process each: if a process dies, its executor breaks, and that names the cases that it
-had. They are spawned, not forked, on every system, and have one thread each for linear algebra.
-
-`CaseQueue`: which cases are computed next, how many in one go, and which of them again.
-
-`open_executor`: the executor of a study by a word, as the command line has it; a cluster's is dask's.
+`open_executor` opens one by a word, as the command line has it. `CaseQueue` decides which cases are computed next, how
+many in one go, and which of them again. A case that crashes, or takes too long or too much memory, costs no other: the
+processes (`run_in_processes`) are loky's executors of one process each, so that one that dies names the cases that it
+had; they are tried again one by one, and one that dies twice has its reason in the table. Processes are spawned, not
+forked, on every system, and have one thread each for linear algebra. With an executor of the interface of
+`concurrent.futures` (`run_in_executor`) the same queue decides; whether a dead worker harms others is up to it.
 """
 
 import functools
@@ -25,7 +23,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for_connections
@@ -47,90 +45,6 @@ from pneuopt.studies.tolerances import (
 
 if TYPE_CHECKING:
     import loky
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Cases that one process computes in one go, by name; and how often they were tried before."""
-
-    cases: Mapping[str, CaseValues]
-    tries: int = 0
-
-
-class CaseQueue:
-    """Hands cases out in chunks of about half a second.
-
-    Parameters
-    ----------
-    cases : iterable of str and mapping or ParameterSet
-        Read as they are needed.
-    count : int
-        How many there are.
-    workers : int
-        Processes or threads that share them.
-    most_seconds : float
-        That a chunk may take, which a limit of time may lower.
-    """
-
-    def __init__(
-        self, cases: Iterable[tuple[str, CaseValues]], count: int, workers: int, most_seconds: float = math.inf
-    ) -> None:
-        self._fresh, self._again, self._suspect = iter(cases), deque[Chunk](), deque[Chunk]()
-        self._left, self._workers, self._seconds = count, workers, min(CHUNK_SECONDS, most_seconds)
-        self._done, self._spent = 0, 0.0
-
-    def __bool__(self) -> bool:
-        return self._left > 0 or bool(self._again or self._suspect)
-
-    def take(self, *, alone: bool = True) -> Chunk | None:
-        """The next chunk; None where there is none.
-
-        Last come cases whose process has died, but only if nothing else is computed beside: a worker of a cluster takes
-        along what waits for it.
-        """
-        if self._again:
-            return self._again.popleft()
-        cases = dict(next(self._fresh) for _ in range(min(self._size(), self._left)))
-        self._left -= len(cases)
-        if cases:
-            return Chunk(cases)
-        return self._suspect.popleft() if alone and self._suspect else None
-
-    def measure(self, outcomes: Sequence[Outcome]) -> None:
-        """Learn from a chunk how long cases take."""
-        self._done += len(outcomes)
-        self._spent += sum(o.seconds for o in outcomes if o.seconds > 0)
-
-    def give_back(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
-        """Take back a chunk whose process died: its cases are tried one by one; one that dies twice is said."""
-        if len(chunk.cases) > 1:
-            self._again.extend(Chunk({name: values}) for name, values in chunk.cases.items())
-        elif chunk.tries + 1 < TRIES:
-            self._suspect.append(Chunk(chunk.cases, chunk.tries + 1))
-        else:
-            for name in chunk.cases:
-                yield name, Outcome(error=reason)
-
-    def separate(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
-        """Take back a chunk that took too long: a case alone is said, several are tried one by one."""
-        yield from self.give_back(Chunk(chunk.cases, TRIES), reason)
-
-    def _size(self) -> int:
-        if not self._done:
-            return 1
-        by_time = self._seconds * self._done / max(self._spent, 1e-9)
-        return max(1, math.ceil(min(by_time, MAX_CHUNK, self._left / (2 * self._workers))))
-
-
-Outcomes = Generator[tuple[str, Outcome], None, None]
-_THREADS_REMEDY = "in this process, executor=ThreadPoolExecutor()"
-_NO_START = (
-    'the processes of a study cannot start; a script must call the study under `if __name__ == "__main__":`, '
-    f"or compute {_THREADS_REMEDY}"
-)
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_packed = b""  # of a spawned process: its function, as it came
-_task: "tuple[CaseFunction, ParameterSet, Processes] | None" = None  # of a spawned process: what it evaluates
 
 
 @dataclass(frozen=True)
@@ -173,6 +87,156 @@ class Processes:
         return f"needs more memory than the {self.megabytes:g} MB that a case may take"
 
 
+LOCAL_CLUSTER = "dask"
+"""The word for a cluster of dask on this machine, which is there for the study alone."""
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_SCHEMES = ("tcp://", "tls://", "ws://", "wss://", "ucx://")
+
+_OWN_CLUSTER: dict[str, Any] = {
+    "distributed.scheduler.allowed-failures": 0,  # the study itself tries again, case by case
+    "distributed.scheduler.work-stealing-interval": "1s",
+    "distributed.scheduler.active-memory-manager.start": False,
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.admin.system-monitor.gil.enabled": False,
+    "distributed.nanny.pre-spawn-environ": dict.fromkeys(_THREAD_VARIABLES, 1),
+}
+"""What a cluster that is there for one study does not need: its sampling profiler, monitors many times a second, and
+memory that is given back to the system after each array. They took as much CPU time as a sixth of the cases
+(problems/speed/study_executors.py)."""
+
+
+@contextmanager
+def open_executor(where: str) -> Iterator[Executor | Processes]:
+    """Open the executor that a word names, for as long as a study runs.
+
+    Parameters
+    ----------
+    where : str
+        A number of processes of this machine; "dask", a cluster of dask on this machine; or the address of a dask
+        scheduler, "tcp://host:8786", whose workers have this version of pneuopt. A worker should have one thread.
+
+    Yields
+    ------
+    Executor or Processes
+
+    Raises
+    ------
+    InputError
+        If the word is none of these, dask is not installed, or there is no scheduler at the address.
+
+    Examples
+    --------
+    >>> with open_executor("2") as executor:
+    ...     executor
+    Processes(count=2, seconds=inf, megabytes=inf)
+    """
+    if where.isdecimal():
+        yield Processes(int(where))
+        return
+    if where != LOCAL_CLUSTER and not where.startswith(_SCHEMES):
+        raise InputError(f"executor {where!r}: give a number of processes, dask, or a scheduler, tcp://host:8786")
+    try:
+        import distributed
+    except ImportError:
+        message = "dask is not installed; pip install 'pneuopt[cluster]', or give a number of processes"
+        raise InputError(message) from None
+    with _make_client(distributed, where) as client:
+        executor = client.get_executor(pure=False)  # otherwise a chunk that is tried again is given its old error
+        workers = sum(client.nthreads().values())
+        executor._max_workers = workers if where == LOCAL_CLUSTER else max(workers, UNKNOWN_WORKERS)
+        yield executor
+
+
+@contextmanager
+def _make_client(distributed: Any, where: str) -> Iterator[Any]:
+    """A client of the scheduler at an address, or of a cluster of its own, whose workers have one thread each."""
+    import dask
+
+    if where == LOCAL_CLUSTER:
+        with (
+            dask.config.set(_OWN_CLUSTER),
+            distributed.LocalCluster(threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            yield client
+        return
+    try:
+        client = distributed.Client(where, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise InputError(f"executor {where}: there is no dask scheduler ({' '.join(str(error).split())})") from None
+    with client:
+        yield client
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Cases that one process computes in one go, by name; and how often they were tried before."""
+
+    cases: Mapping[str, CaseValues]
+    tries: int = 0
+
+
+class CaseQueue:
+    """Hands cases out in chunks of about half a second, or of `most_seconds` [s] where a limit of time is lower."""
+
+    def __init__(
+        self, cases: Iterable[tuple[str, CaseValues]], count: int, workers: int, most_seconds: float = math.inf
+    ) -> None:
+        self._fresh, self._again, self._suspect = iter(cases), deque[Chunk](), deque[Chunk]()
+        self._left, self._workers, self._seconds = count, workers, min(CHUNK_SECONDS, most_seconds)
+        self._done, self._spent = 0, 0.0
+
+    def __bool__(self) -> bool:
+        return self._left > 0 or bool(self._again or self._suspect)
+
+    def take(self, *, alone: bool = True) -> Chunk | None:
+        """The next chunk, or None; those whose process has died come last, if nothing else runs (`alone`)."""
+        if self._again:
+            return self._again.popleft()
+        size = 1
+        if self._done:
+            by_time = self._seconds * self._done / max(self._spent, 1e-9)
+            size = max(1, math.ceil(min(by_time, MAX_CHUNK, self._left / (2 * self._workers))))
+        cases = dict(next(self._fresh) for _ in range(min(size, self._left)))
+        self._left -= len(cases)
+        if cases:
+            return Chunk(cases)
+        # a worker of a cluster that dies takes along what waits for it
+        return self._suspect.popleft() if alone and self._suspect else None
+
+    def measure(self, outcomes: Sequence[Outcome]) -> None:
+        """Learn from a chunk how long cases take."""
+        self._done += len(outcomes)
+        self._spent += sum(o.seconds for o in outcomes if o.seconds > 0)
+
+    def give_back(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
+        """Take back a chunk whose process died: its cases are tried one by one; one that dies twice is said."""
+        if len(chunk.cases) > 1:
+            self._again.extend(Chunk({name: values}) for name, values in chunk.cases.items())
+        elif chunk.tries + 1 < TRIES:
+            self._suspect.append(Chunk(chunk.cases, chunk.tries + 1))
+        else:
+            for name in chunk.cases:
+                yield name, Outcome(error=reason)
+
+    def separate(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
+        """Take back a chunk that took too long: a case alone is said, several are tried one by one."""
+        yield from self.give_back(Chunk(chunk.cases, TRIES), reason)
+
+
+Outcomes = Generator[tuple[str, Outcome], None, None]
+_THREADS_REMEDY = "in this process, executor=ThreadPoolExecutor()"
+_NO_START = (
+    'the processes of a study cannot start; a script must call the study under `if __name__ == "__main__":`, '
+    f"or compute {_THREADS_REMEDY}"
+)
+_packed = b""  # of a spawned process: its function, as it came
+_task: "tuple[CaseFunction, ParameterSet, Processes] | None" = None  # of a spawned process: what it evaluates
+
+
 def run_in_processes(
     chosen: Processes,
     fn: CaseFunction,
@@ -180,28 +244,7 @@ def run_in_processes(
     cases: Iterable[tuple[str, CaseValues]],
     count: int,
 ) -> Outcomes:
-    """Evaluate cases in spawned processes and yield each outcome as it comes.
-
-    Parameters
-    ----------
-    chosen : Processes
-    fn : callable
-        It travels by pickle, once to each process.
-    parameters : ParameterSet
-        What the cases have in common.
-    cases : iterable of str and mapping or ParameterSet
-    count : int
-        How many there are.
-
-    Yields
-    ------
-    tuple of str and Outcome
-
-    Raises
-    ------
-    InputError
-        If the function cannot travel, or no process can start.
-    """
+    """Evaluate cases in spawned processes and yield each outcome as it comes; the function travels by pickle."""
     wanted = min(count, chosen.count or os.cpu_count() or 1, MAX_PROCESSES)
     queue = CaseQueue(cases, count, wanted, LIMIT_SHARE * chosen.seconds)
     crew = _Crew(pickle_function(fn, parameters, chosen), chosen)
@@ -213,7 +256,11 @@ def run_in_processes(
             while crew.busy:
                 for run, future in crew.wait():
                     yield from _receive(crew, queue, run, future)
-                yield from _stop_late(crew, queue)
+                for late in crew.stop_late():
+                    if late.chunk is not None:
+                        yield from queue.separate(late.chunk, chosen.time_reason)
+                    if queue:
+                        crew.start()
             while chunk := queue.take():
                 yield from ((name, Outcome(error="no process could be started for it")) for name in chunk.cases)
         finally:
@@ -238,8 +285,11 @@ class _Crew:
         self.busy: dict[Future[list[Outcome]], _Run] = {}
 
     def start(self) -> None:
-        """Start a process."""
-        process = _spawn_process(self._packed)
+        """Start a process, which follows this one; loky puts another in its place where its memory grows."""
+        import loky
+
+        given = (self._packed,)
+        process = loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_begin, initargs=given)
         self._processes.append(process)
         with _one_thread_each():
             self.busy[process.submit(_load_task)] = _Run(process, None, inf)
@@ -255,8 +305,8 @@ class _Crew:
         done = wait(self.busy, None if patience == inf else max(patience, 0.0), FIRST_COMPLETED).done
         return [(self.busy.pop(future), future) for future in list(self.busy) if future in done]
 
-    def late(self) -> list[_Run]:
-        """End the processes that had their time; what they computed."""
+    def stop_late(self) -> list[_Run]:
+        """Kill the processes that had their time; returns what they computed."""
         now = time.monotonic()
         late = {future: run for future, run in self.busy.items() if run.deadline <= now and not future.done()}
         for future, run in late.items():
@@ -286,7 +336,9 @@ def _receive(
         require(crew.began, _NO_START)
         crew.remove(run.process)
         if run.chunk is not None:
-            yield from queue.give_back(run.chunk, _describe_death(error))
+            code = re.search(r"\((-?\w+)\)", str(error))  # loky gives it in words only, and not on Windows
+            reason = "its process died twice" + (f" (exit code {code[1]})" if code else "")
+            yield from queue.give_back(run.chunk, reason)
         if queue and run.chunk is not None:
             crew.start()
         return
@@ -297,30 +349,6 @@ def _receive(
         crew.give(run.process, chunk)
     if run.chunk is not None:
         yield from zip(run.chunk.cases, outcomes, strict=False)  # fewer outcomes where the last is an interruption
-
-
-def _stop_late(crew: _Crew, queue: CaseQueue) -> Iterator[tuple[str, Outcome]]:
-    """Kill what takes too long, and let other processes go on."""
-    for run in crew.late():
-        if run.chunk is not None:
-            yield from queue.separate(run.chunk, crew.limits.time_reason)
-        if queue:
-            crew.start()
-
-
-def _describe_death(error: BrokenProcessPool) -> str:
-    code = re.search(r"\((-?\w+)\)", str(error))  # loky gives it in words only, and not on Windows
-    return "its process died twice" + (f" (exit code {code[1]})" if code else "")
-
-
-def _spawn_process(packed: bytes) -> "loky.ProcessPoolExecutor":
-    """An executor of one process, which follows this one, and has one thread for linear algebra: it shares the CPUs.
-
-    Loky puts another process in its place where its memory grows.
-    """
-    import loky
-
-    return loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_begin, initargs=(packed,))
 
 
 @contextmanager
@@ -375,12 +403,10 @@ def _evaluate_chunk(cases: list[CaseValues]) -> list[Outcome]:
     assert _task is not None
     fn, parameters, limits = _task
     outcomes = evaluate_cases(fn, parameters, cases)
-    return [Outcome(seconds=o.seconds, error=limits.memory_reason) if _lacks_memory(o, limits) else o for o in outcomes]
-
-
-def _lacks_memory(outcome: Outcome, limits: Processes) -> bool:
-    """Whether an allocation has failed, in Python or in C++."""
-    return limits.megabytes < inf and bool(re.search("MemoryError|bad_alloc", outcome.error))
+    if limits.megabytes == inf:
+        return outcomes
+    lacking = Outcome(error=limits.memory_reason)  # an allocation has failed, in Python or in C++
+    return [replace(lacking, seconds=o.seconds) if re.search("MemoryError|bad_alloc", o.error) else o for o in outcomes]
 
 
 def pickle_function(fn: CaseFunction, *others: object) -> bytes:
@@ -394,9 +420,6 @@ def pickle_function(fn: CaseFunction, *others: object) -> bytes:
         ) from None
 
 
-_ChunkFunction = Callable[[list[CaseValues]], list[Outcome]]
-
-
 def run_in_executor(
     executor: Executor,
     fn: CaseFunction,
@@ -404,14 +427,22 @@ def run_in_executor(
     cases: Iterable[tuple[str, CaseValues]],
     count: int,
 ) -> Outcomes:
-    """Evaluate cases in an executor and yield each outcome as it comes; parameters as of `run_in_processes`."""
+    """Evaluate cases in an executor and yield each outcome as it comes."""
     workers = int(getattr(executor, "_max_workers", None) or UNKNOWN_WORKERS)
-    queue, task = CaseQueue(cases, count, workers), _make_task(executor, fn, parameters)
-    running: dict[Future[list[Outcome]], Chunk] = {}
+    queue, running = CaseQueue(cases, count, workers), dict[Future[list[Outcome]], Chunk]()
+    try:
+        task: Callable[[list[CaseValues]], list[Outcome]] = _Task(pickle_function(fn, parameters))
+    except ValueError:  # what cannot be pickled goes as it is, to threads, or by cloudpickle
+        if isinstance(executor, ProcessPoolExecutor):
+            raise
+        task = functools.partial(evaluate_cases, fn, parameters)
     try:
         while queue or running:
             while len(running) < CHUNKS_A_WORKER * workers and (chunk := queue.take(alone=not running)):
-                yield from _submit(executor, task, chunk, running)
+                try:
+                    running[executor.submit(task, list(chunk.cases.values()))] = chunk
+                except BrokenExecutor as error:  # broken for good, it costs its cases
+                    yield from ((name, Outcome(error=describe_error(error))) for name in chunk.cases)
             done = wait(running, return_when=FIRST_COMPLETED).done
             for future in [future for future in running if future in done]:  # in the order of the cases
                 yield from _receive_chunk(future, running.pop(future), queue)
@@ -437,29 +468,6 @@ def _unpack(packed: bytes) -> tuple[CaseFunction, ParameterSet]:
     return fn, parameters
 
 
-def _make_task(executor: Executor, fn: CaseFunction, parameters: ParameterSet) -> _ChunkFunction:
-    """What the executor is given; a function that cannot be pickled goes as it is, to threads, or by cloudpickle."""
-    try:
-        return _Task(pickle_function(fn, parameters))
-    except ValueError:
-        if isinstance(executor, ProcessPoolExecutor):
-            raise
-        return functools.partial(evaluate_cases, fn, parameters)
-
-
-def _submit(
-    executor: Executor,
-    task: _ChunkFunction,
-    chunk: Chunk,
-    running: dict["Future[list[Outcome]]", Chunk],
-) -> Iterator[tuple[str, Outcome]]:
-    """Submit a chunk; an executor that is broken for good costs its cases."""
-    try:
-        running[executor.submit(task, list(chunk.cases.values()))] = chunk
-    except BrokenExecutor as error:
-        yield from ((name, Outcome(error=describe_error(error))) for name in chunk.cases)
-
-
 def _receive_chunk(future: "Future[list[Outcome]]", chunk: Chunk, queue: CaseQueue) -> Iterator[tuple[str, Outcome]]:
     """What a chunk gave; one whose worker died is tried again."""
     try:
@@ -469,94 +477,3 @@ def _receive_chunk(future: "Future[list[Outcome]]", chunk: Chunk, queue: CaseQue
         return
     queue.measure(outcomes)
     yield from zip(chunk.cases, outcomes, strict=False)  # fewer outcomes where the last is an interruption
-
-
-LOCAL_CLUSTER = "dask"
-"""The word for a cluster of dask on this machine, which is there for the study alone."""
-_SCHEMES = ("tcp://", "tls://", "ws://", "wss://", "ucx://")
-
-_OWN_CLUSTER: dict[str, Any] = {
-    "distributed.scheduler.allowed-failures": 0,  # the study itself tries again, case by case
-    "distributed.scheduler.work-stealing-interval": "1s",
-    "distributed.scheduler.active-memory-manager.start": False,
-    "distributed.worker.profile.enabled": False,
-    "distributed.worker.memory.monitor-interval": "1s",
-    "distributed.admin.tick.interval": "1s",
-    "distributed.admin.system-monitor.interval": "5s",
-    "distributed.admin.system-monitor.gil.enabled": False,
-    "distributed.nanny.pre-spawn-environ": dict.fromkeys(
-        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), 1
-    ),
-}
-"""What a cluster that is there for one study does not need: its sampling profiler, monitors many times a second, and
-memory that is given back to the system after each array. They took as much CPU time as a sixth of the cases
-(problems/speed/study_executors.py)."""
-
-
-@contextmanager
-def open_executor(where: str) -> Iterator[Executor | Processes]:
-    """Open the executor that a word names, for as long as a study runs.
-
-    Parameters
-    ----------
-    where : str
-        A number of processes of this machine; "dask", a cluster of dask on this machine; or the address of a dask
-        scheduler, "tcp://host:8786", whose workers have this version of pneuopt. A worker should have one thread.
-
-    Yields
-    ------
-    Executor or Processes
-
-    Raises
-    ------
-    InputError
-        If the word is none of these, dask is not installed, or there is no scheduler at the address.
-
-    Examples
-    --------
-    >>> with open_executor("2") as executor:
-    ...     executor
-    Processes(count=2, seconds=inf, megabytes=inf)
-    """
-    if where.isdecimal():
-        yield Processes(int(where))
-        return
-    if where != LOCAL_CLUSTER and not where.startswith(_SCHEMES):
-        raise InputError(f"executor {where!r}: give a number of processes, dask, or a scheduler, tcp://host:8786")
-    distributed = _import_distributed()
-    with _make_client(distributed, where) as client:
-        executor = client.get_executor(pure=False)  # otherwise a chunk that is tried again is given its old error
-        workers = sum(client.nthreads().values())
-        executor._max_workers = workers if where == LOCAL_CLUSTER else max(workers, UNKNOWN_WORKERS)
-        yield executor
-
-
-@contextmanager
-def _make_client(distributed: Any, where: str) -> Iterator[Any]:
-    """A client of the scheduler at an address, or of a cluster of its own, whose workers have one thread each."""
-    import dask
-
-    if where == LOCAL_CLUSTER:
-        with (
-            dask.config.set(_OWN_CLUSTER),
-            distributed.LocalCluster(threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as cluster,
-            distributed.Client(cluster) as client,
-        ):
-            yield client
-        return
-    try:
-        client = distributed.Client(where, timeout=CONNECT_SECONDS)
-    except (OSError, ValueError) as error:
-        raise InputError(f"executor {where}: there is no dask scheduler ({' '.join(str(error).split())})") from None
-    with client:
-        yield client
-
-
-def _import_distributed() -> Any:
-    try:
-        import distributed
-    except ImportError:
-        raise InputError(
-            "dask is not installed; pip install 'pneuopt[cluster]', or give a number of processes"
-        ) from None
-    return distributed

@@ -1,10 +1,9 @@
 """`Journal`: the cases of a study on the disk as they come, so that a study that ends early goes on where it was.
 
-`RowFile`: the rows of a study in a CSV or Parquet file while it runs, whole ones at every moment.
-
-A row is appended to a CSV by one write, so a study that is killed leaves whole rows. A Parquet file is valid only with
-the footer at its end, and parts in a folder would be many small files: the whole file is written anew from time to
-time, under another name that replaces the old one. What came since the last time is in the journal alone.
+`RowFile`: the rows of a study in a CSV or Parquet file while it runs, whole ones at every moment. A row is appended to
+a CSV by one write, so a study that is killed leaves whole rows. A Parquet file is valid only with the footer at its
+end, and parts in a folder would be many small files: the whole file is written anew from time to time, under another
+name that replaces the old one. What came since the last time is in the journal alone.
 """
 
 import csv
@@ -44,7 +43,6 @@ class RowFile:
 
     Attributes
     ----------
-    path : Path
     problem : str
         Why rows are missing, a full disk; empty where none are.
 
@@ -113,23 +111,19 @@ class _CsvRows:
         if self._file is None or columns != self._columns:
             self._rewrite(columns)
         else:
-            self._append(self._file, self._format(columns, self._waiting))
+            content = self._format(columns, self._waiting).encode()
+            try:
+                if self._file.write(content) != len(content):
+                    raise OSError(None, "No space left on device")
+            except OSError:  # a row that has no room is cut off again
+                self._file.truncate(self._size)
+                raise
+            self._size += len(content)
         self._waiting = []
 
     def close(self) -> None:
         if self._file is not None:
             self._file.close()
-
-    def _append(self, file: IO[bytes], text: str) -> None:
-        """One write; a row that has no room is cut off again."""
-        content = text.encode()
-        try:
-            if file.write(content) != len(content):
-                raise OSError(None, "No space left on device")
-        except OSError:
-            file.truncate(self._size)
-            raise
-        self._size += len(content)
 
     def _rewrite(self, columns: list[str]) -> None:
         old: Sequence[_Row] = ()
@@ -227,7 +221,6 @@ class Journal:
         What an earlier run of the same study computed, by case.
     problem : str
         Why cases could not be kept, a full disk; empty where all are.
-    rows : RowFile or None
 
     Raises
     ------
@@ -240,16 +233,22 @@ class Journal:
         self, path: str | Path, identity: str | Mapping[str, str], *, resume: bool = False, rows: RowFile | None = None
     ) -> None:
         self.path, self.problem, self.rows = Path(path), "", rows
-        study = {**({"study": identity} if isinstance(identity, str) else identity), **_versions()}
+        study = {"study": identity} if isinstance(identity, str) else dict(identity)
+        study |= {f"version of {name}": version for name, version in provenance().items() if name != "options"}
         try:
             lines = self.path.read_bytes().splitlines() if self.path.exists() else []
             head = _parse(lines[0]) if lines else None
             before = head.get("study") if isinstance(head, dict) else None
             if resume:
                 self._check_study(before, study)
-            entries = _read_entries(lines[1:]) if before == study else {}
-            self._marks = {name: mark for name, (mark, _) in entries.items()}
-            self.known: Mapping[str, Outcome] = {name: outcome for name, (_, outcome) in entries.items()}
+            entries = [entry for entry in map(_parse, lines[1:] if before == study else ()) if isinstance(entry, dict)]
+            whole = [
+                e for e in entries if {"case", "of", "results"} <= e.keys()
+            ]  # of a case there twice, the last counts
+            self._marks = {e["case"]: e["of"] for e in whole}
+            self.known: Mapping[str, Outcome] = {
+                e["case"]: Outcome(e["results"], float(e.get("seconds", 0.0))) for e in whole
+            }
             self._count, self._synced, self._is_cut = len(self.known), 0.0, before == study
             self._file: IO[str] = self.path.open("a" if before == study else "w", encoding="utf-8")
             self._write([] if before == study else [json.dumps({"study": study})])
@@ -271,8 +270,8 @@ class Journal:
         except OSError as error:  # a full disk does not end the study
             self._is_cut, self.problem = True, _describe_failure(self.path, error)
 
-    def show(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Put rows of the study's table into the file that shows them, if there is one."""
+    def append_rows(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Append rows of the study's table to the `RowFile`, if there is one."""
         if self.rows is not None:
             self.rows.extend(rows)
 
@@ -314,13 +313,7 @@ class Journal:
 
 
 class CaseMarks:
-    """Hashes of cases: two have the same mark if all their parameters agree.
-
-    Parameters
-    ----------
-    parameters : ParameterSet
-        What the cases have in common.
-    """
+    """Hashes of cases: two have the same mark if all their parameters, common ones included, agree."""
 
     def __init__(self, parameters: ParameterSet) -> None:
         self._common = hashlib.sha256(repr(dict(parameters)).encode())
@@ -335,19 +328,6 @@ class CaseMarks:
 
 def _describe_failure(path: Path, error: OSError) -> str:
     return f"{path}: cannot be written ({error.strerror}); cases are not kept, make room and run the study again"
-
-
-def _versions() -> dict[str, str]:
-    """What computes, by name and version."""
-    return {f"version of {name}": version for name, version in provenance().items() if name != "options"}
-
-
-def _read_entries(lines: list[bytes]) -> dict[str, tuple[str, Outcome]]:
-    """Marks and outcomes of the lines that are whole, by case; of a case that is there twice, the last."""
-    entries = [entry for entry in map(_parse, lines) if isinstance(entry, dict) and {"case", "of"} <= entry.keys()]
-    return {
-        e["case"]: (e["of"], Outcome(e["results"], float(e.get("seconds", 0.0)))) for e in entries if "results" in e
-    }
 
 
 def _parse(line: bytes) -> object:

@@ -84,7 +84,11 @@ def sweep_from_neighbours(
     cases, table = grid(parameters, axes), pd.DataFrame()
     places = {n: _places(axes[n]) for n in axes}
     for wave in _waves(parameters, cases, axes):
-        chosen = {name: cases[name] | _start_beside(table, cases[name], places, value, starts) for name in wave}
+        chosen = {}
+        for name in wave:  # each starts where its best neighbour ended, if one has ended
+            best = _best_beside(table, cases[name], places, value) if value in table else -1
+            start = {n: float(table[column].iloc[best]) for column, n in starts.items()} if best >= 0 else {}
+            chosen[name] = cases[name] | start
         found = sweep(fn, parameters, chosen, executor=executor, progress=progress, journal=journal)
         found = found.drop(columns=[n for n in starts.values() if n in found])
         found = found.assign(**{n: [cases[name][n] for name in wave] for n in axes})
@@ -199,14 +203,6 @@ def _waves(
         distances = {name: d + abs(places[cases[name][n]] - middle) for name, d in distances.items()}
     waves = [[n for n, d in distances.items() if d == wave] for wave in range(max(distances.values()) + 1)]
     return [wave for wave in waves if wave]
-
-
-def _start_beside(
-    table: "pd.DataFrame", case: Mapping[str, float], places: Places, value: str, starts: Mapping[str, str]
-) -> dict[str, float]:
-    """What the best neighbour of a cell found, by parameter; nothing where none has found anything yet."""
-    best = _best_beside(table, case, places, value) if value in table else -1
-    return {n: float(table[column].iloc[best]) for column, n in starts.items()} if best >= 0 else {}
 
 
 def _places(values: Iterable[float]) -> dict[float, int]:

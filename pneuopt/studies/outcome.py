@@ -1,7 +1,4 @@
-"""`Outcome`: what one case of a study gave, in plain numbers and text, or why it gave nothing.
-
-A limit of memory for a process of a study, so that a case that fills it costs no other.
-"""
+"""`Outcome`: what one case of a study gave, in plain numbers and text, or why not; and a process's limit of memory."""
 
 import math
 import sys
@@ -15,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from pneuopt.quantities.errors import InputError, PneuoptError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.studies.tolerances import MEGABYTE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,20 +25,11 @@ INTERRUPTED_CASE = "interrupted"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one case gave.
+    """What one case gave."""
 
-    Attributes
-    ----------
-    results : mapping of str to bool, int, float or str
-    seconds : float
-        Time in the function [s].
-    error : str
-        Why there are no results, or none that is a number; empty where all is well.
-    """
-
-    results: Mapping[str, Any] = field(default_factory=dict)
-    seconds: float = nan
-    error: str = ""
+    results: Mapping[str, Any] = field(default_factory=dict)  # by name, bool, int, float or str
+    seconds: float = nan  # time in the function [s]
+    error: str = ""  # why there are no results, or none that is a number; empty where all is well
 
 
 def evaluate_cases(fn: CaseFunction, parameters: ParameterSet, cases: Iterable[CaseValues]) -> list[Outcome]:
@@ -63,19 +50,15 @@ def evaluate_case(fn: CaseFunction, parameters: ParameterSet, values: CaseValues
         begun = time.perf_counter()
         result, seconds = fn(given), time.perf_counter() - begun
         results = _plain_results(result)
-        return Outcome(results, seconds, _describe_nan(results))
+        numbers = [v for v in results.values() if isinstance(v, float | int) and not isinstance(v, bool)]
+        error = ""  # a NaN among numbers says something, a metric that a response lacks; NaN alone is no result
+        if numbers and all(math.isnan(v) for v in numbers):
+            error = f"{next(iter(results))} is NaN" if len(results) == 1 else "all its numbers are NaN"
+        return Outcome(results, seconds, error)
     except KeyboardInterrupt:
         return Outcome(error=INTERRUPTED_CASE)
     except (Exception, SystemExit) as error:
         return Outcome(seconds=time.perf_counter() - begun, error=describe_error(error))
-
-
-def _describe_nan(results: Mapping[str, Any]) -> str:
-    """What is wrong where no number came out; a NaN among numbers says something: a metric that a response lacks."""
-    numbers = [v for v in results.values() if isinstance(v, float | int) and not isinstance(v, bool)]
-    if not numbers or not all(v != v for v in numbers):  # noqa: PLR0124 - NaN
-        return ""
-    return f"{next(iter(results))} is NaN" if len(results) == 1 else "all its numbers are NaN"
 
 
 def describe_error(error: BaseException) -> str:
@@ -93,8 +76,13 @@ def _plain_results(result: Any) -> dict[str, Any]:
 
     if isinstance(result, pd.DataFrame):
         return _plain_results(_flatten_frame(result))
-    entries = result if isinstance(result, Mapping | pd.Series) else {"value": result}
-    return {str(name): _check_plain(value, str(name)) for name, value in entries.items()}
+    plain: dict[str, Any] = {}
+    for name, entry in (result if isinstance(result, Mapping | pd.Series) else {"value": result}).items():
+        value = entry.item() if getattr(entry, "shape", None) == () else entry
+        if not isinstance(value, bool | int | float | str):
+            raise InputError(f"{name} is {type(value).__name__}; return numbers or text, by name")
+        plain[str(name)] = value
+    return plain
 
 
 def _flatten_frame(frame: "pd.DataFrame") -> Mapping[str, Any]:
@@ -105,24 +93,15 @@ def _flatten_frame(frame: "pd.DataFrame") -> Mapping[str, Any]:
     return {f"{row}[{column}]": value for column in frame for row, value in frame[column].items()}
 
 
-def _check_plain(value: Any, name: str) -> Any:
-    value = value.item() if getattr(value, "shape", None) == () else value
-    if not isinstance(value, bool | int | float | str):
-        raise InputError(f"{name} is {type(value).__name__}; return numbers or text, by name")
-    return value
-
-
 def limit_memory(megabytes: float) -> None:
-    """Let this process have so much more memory than it has now; beyond it an allocation fails.
-
-    Data alone are limited, not the address space, of which threads reserve gigabytes that they never touch.
-    """
+    """Let this process have so much more memory [MiB] than it has now; beyond it an allocation fails."""
     if sys.platform != "linux" or megabytes == math.inf:
         return
     import resource
 
     with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123 - no file of ours
         pages = int(file.read().split()[5])  # data and stack
-    most = pages * resource.getpagesize() + int(megabytes * MEGABYTE)
+    most = pages * resource.getpagesize() + int(megabytes * 2**20)
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    # data alone are limited, not the address space, of which threads reserve gigabytes that they never touch
     resource.setrlimit(resource.RLIMIT_DATA, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))

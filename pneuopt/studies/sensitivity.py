@@ -3,12 +3,11 @@
 The design is Saltelli's, on a scrambled Sobol sequence, the estimate SciPy's: I. M. Sobol, Mathematics and Computers in
 Simulation 55, 2001; A. Saltelli and others, Computer Physics Communications 181(2), 2010.
 
-`local_sensitivity`: how a figure of a design changes with each tolerance, from derivatives at the design itself.
-
-The response is run once with its sensitivities to the parameters and to the start, by automatic differentiation of
-each integration step. A figure's derivative is that of its reading: the reader takes the response moved along its
-sensitivity, a little to either side. Of a settling time this is the implicit derivative of the instant at which the
-signal enters the band, ``dt = -(dy/dp) / (dy/dt)``; of an overshoot it is the sensitivity at the peak.
+`local_sensitivity` tells the same from derivatives at the design itself. The response is run once with its
+sensitivities to the parameters and to the start, by automatic differentiation of each integration step. A figure's
+derivative is that of its reading: the reader takes the response moved along its sensitivity, a little to either side.
+Of a settling time this is the implicit derivative of the instant at which the signal enters the band,
+``dt = -(dy/dp) / (dy/dt)``; of an overshoot it is the sensitivity at the peak.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +18,6 @@ from math import nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
@@ -77,7 +75,14 @@ class Sensitivity(Shown):
             mean, spread = (format_number(float(about[n]), 4) for n in ("mean", "std"))
             parts.append(Line(f"{figure}: mean {mean}, standard deviation {spread}{lost}", Tone.HEADING))
             own = self.table.loc[[figure]].droplevel(0).sort_values("total", ascending=False)
-            parts.append(Table(columns, tuple(_row(str(axis), row) for axis, row in own.iterrows())))
+            rows = []
+            for axis, row in own.iterrows():
+                cells = [str(axis)]
+                for name in ("total", "first"):
+                    low, high = row[f"{name}_low"], row[f"{name}_high"]
+                    cells += [f"{row[name]:.2f}", f"{low:.2f} to {high:.2f}"] if np.isfinite(low) else ["-", "-"]
+                rows.append(tuple(cells))
+            parts.append(Table(columns, tuple(rows)))
         return Report(tuple(parts))
 
 
@@ -100,6 +105,7 @@ def sensitivity(
     fn : callable
         As for `sweep`; it is called ``count * (axes + 2)`` times.
     parameters : ParameterSet
+        The nominal values, about which the axes vary.
     spreads : mapping
         As for `samples`: the axes vary independently of each other.
     figures : sequence of str, optional
@@ -173,17 +179,14 @@ def _tabulate(cases: "pd.DataFrame", figures: Sequence[str], axes: Sequence[str]
             "lost": 1 - float(whole.mean()),
         }
         enough = about[figure]["lost"] <= MAX_LOST
-        kept = _fill(np.flatnonzero(whole), count) if enough else np.arange(0)
+        kept = np.flatnonzero(whole) if enough else np.arange(0)
+        if kept.size:  # SciPy takes a power of two, so in place of the points that are lost some count twice
+            kept = kept[np.linspace(0, kept.size - 1, count).round().astype(np.intp)]
         for axis, row in zip(axes, _indices(blocks[:, kept], len(axes)), strict=True):
             rows[figure, axis] = row
     index = pd.MultiIndex.from_tuples(rows, names=["figure", "axis"])
     table = WideFrame(list(rows.values()), index=index)
     return Sensitivity(table, WideFrame.from_dict(about, orient="index"), cases)
-
-
-def _fill(points: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """As many points as there were: SciPy takes a power of two, so in place of those that are lost some count twice."""
-    return points[np.linspace(0, points.size - 1, count).round().astype(np.intp)]
 
 
 def _indices(blocks: Array, axes: int) -> Iterator[dict[str, float]]:
@@ -194,8 +197,19 @@ def _indices(blocks: Array, axes: int) -> Iterator[dict[str, float]]:
     if not np.ptp(blocks):  # a constant has no variance to share
         yield from (dict.fromkeys(_COLUMNS, 0.0) for _ in range(axes))
         return
+    from scipy.stats import bootstrap
+
     found = _estimate(blocks)
-    low, high = _interval(blocks)
+    # ends of 95 % intervals, by drawing the points again; the same for the same figures
+    drawn: Any = bootstrap(
+        [np.arange(blocks.shape[1])],
+        lambda points: _estimate(blocks[:, points]),
+        n_resamples=RESAMPLES,
+        vectorized=False,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    )
+    low, high = drawn.confidence_interval.low, drawn.confidence_interval.high
     for k in range(axes):
         ends = zip(found[:, k], low[:, k], high[:, k], strict=True)
         yield dict(zip(_COLUMNS, (float(v) for index in ends for v in index), strict=True))
@@ -208,29 +222,6 @@ def _estimate(blocks: Array) -> Array:
     given: Any = {"f_A": blocks[:1], "f_B": blocks[1:2], "f_AB": blocks[2:, None]}
     found = sobol_indices(func=given, n=blocks.shape[1])
     return np.vstack([found.first_order, found.total_order])
-
-
-def _interval(blocks: Array) -> tuple[Array, Array]:
-    """Ends of 95 % intervals, by drawing the points again; the same for the same figures."""
-    from scipy.stats import bootstrap
-
-    drawn: Any = bootstrap(
-        [np.arange(blocks.shape[1])],
-        lambda points: _estimate(blocks[:, points]),
-        n_resamples=RESAMPLES,
-        vectorized=False,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    )
-    return drawn.confidence_interval.low, drawn.confidence_interval.high
-
-
-def _row(axis: str, row: "pd.Series[Any]") -> tuple[str, ...]:
-    cells = [axis]
-    for name in ("total", "first"):
-        low, high = row[f"{name}_low"], row[f"{name}_high"]
-        cells += [f"{row[name]:.2f}", f"{low:.2f} to {high:.2f}"] if np.isfinite(low) else ["-", "-"]
-    return tuple(cells)
 
 
 LOCAL_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError")
@@ -286,7 +277,9 @@ def local_sensitivity(
     Parameters
     ----------
     loop : ClosedLoop
+        With a plant without Karnopp's friction.
     references : Reference or sequence of Reference
+        A figure of each metric for each.
     parameters : ParameterSet
         The design, at which the derivatives are taken.
     spreads : mapping

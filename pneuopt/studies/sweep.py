@@ -1,18 +1,11 @@
-"""Studies: any function of a `ParameterSet` over named cases, in processes, as one tidy table.
+"""Studies: any function of a `ParameterSet` over named cases, in processes, as one tidy table (`sweep`).
 
 A case that fails is a row with its reason, even where its process dies; Ctrl-C keeps what is done. Processes are
 spawned, not forked, on every system: the function is pickled once for each of them, with all that it refers to (a
-`System`, a `ClosedLoop`); machine code comes from the cache.
-
-Cases of a study: named parameter values, as `sweep` takes them: every combination, or the rows of a table.
-
-Corners and draws are the scenarios of `evaluation`, which are cases as they are.
-
-`CaseRows`: the table of a study while it grows, column by column: a hundred thousand cases take a few megabytes.
-
-The sample time of a loop's controller as an axis of a study: a part of the loop's structure, no parameter of it.
-
-A case that has it among its values is of a loop of its own, with which it is evaluated or tuned.
+`System`, a `ClosedLoop`); machine code comes from the cache. First stand the ways to name cases, every combination of
+values (`grid`) or the rows of a table (`read_cases`); corners and draws, the scenarios of `evaluation`, are cases as
+they are. Last stands the sample time of a loop's controller as an axis of a study: a part of the loop's structure, no
+parameter of it, so that a case that has it is of a loop of its own.
 """
 
 import itertools
@@ -163,21 +156,18 @@ def _read_column(column: "pd.Series[Any]", written: str, unit: str, where: str) 
 
 def check_case(parameters: ParameterSet, case: CaseValues, name: str) -> None:
     """Raise `InputError`, which names the case, if it has an unknown parameter, or a value out of bounds."""
-    if isinstance(case, ParameterSet) or all(_is_inside(parameters, n, v) for n, v in case.items()):
+    if isinstance(case, ParameterSet):
         return
+    known = {n: parameters[n] for n in case if n in parameters}
+    if len(known) == len(case) and all(
+        p.lower <= case[n] <= p.upper and (not p.log or case[n] > 0) for n, p in known.items()
+    ):
+        return  # certainly good; below, the words where it is not
     check_names("parameter", case, parameters, name)
     try:
         parameters.with_values(case)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-
-
-def _is_inside(parameters: ParameterSet, name: str, value: float) -> bool:
-    """Whether a value is certainly good; `ParameterSet.with_values` finds the words where it is not."""
-    if name not in parameters:
-        return False
-    p = parameters[name]
-    return p.lower <= value <= p.upper and (not p.log or value > 0)
 
 
 def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:
@@ -191,37 +181,29 @@ def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> lis
     return [(f"{name} = {label}", value) for label, value in zip(labels, values, strict=True)]
 
 
-_STUDY_COLUMNS = ("case", "seconds", "error")
-
-
 class CaseRows:
-    """A row a case, in their order; one without an outcome counts as interrupted.
-
-    Parameters
-    ----------
-    parameters : ParameterSet
-        What the cases have in common.
-    cases : mapping of str to mapping of str to float, or to ParameterSet
-
-    Attributes
-    ----------
-    count, done, failed : int
-        Cases, those with an outcome, and those of these that have an error.
-    """
+    """The table of a study while it grows, column by column: a row a case; one without an outcome is interrupted."""
 
     def __init__(self, parameters: ParameterSet, cases: Mapping[str, CaseValues]) -> None:
         self._parameters, self._cases = parameters, cases
-        self.count, self.done, self.failed = len(cases), 0, 0
+        self.count, self.done, self.failed = len(cases), 0, 0  # cases, those with an outcome, those with an error
         self._places = {str(name): place for place, name in enumerate(cases)}
-        self._swept = _swept_names(parameters, cases.values())
-        self._taken = {*_STUDY_COLUMNS, *self._swept}
+        nominal, swept = {n: p.value for n, p in parameters.items()}, dict[str, None]()
+        for case in cases.values():
+            values = {n: p.value for n, p in case.items()} if isinstance(case, ParameterSet) else case
+            swept |= dict.fromkeys(n for n, v in values.items() if n not in swept and nominal.get(n) != v)
+        self._swept = list(swept)  # the parameters in which the cases differ from what they have in common
+        self._taken = {"case", "seconds", "error", *self._swept}
         self._results: dict[str, list[Any]] = {}
         self._seconds = array("d", [nan]) * len(cases)
         self._errors = [INTERRUPTED_CASE] * len(cases)
 
     def add(self, name: str, outcome: Outcome) -> None:
         """Put what a case gave into its row."""
-        place, outcome = self._places[name], _check_column_names(outcome, self._taken)
+        place, twice = self._places[name], self._taken.intersection(outcome.results)
+        if twice:
+            message = f"{', '.join(sorted(twice))}: a result has the name of a column of the study; rename it"
+            outcome = Outcome(seconds=outcome.seconds, error=message)
         self._seconds[place], self._errors[place] = outcome.seconds, outcome.error
         for n, value in outcome.results.items():
             if n not in self._results:
@@ -248,28 +230,10 @@ class CaseRows:
         return columns | self._results | {"seconds": list(self._seconds), "error": self._errors}
 
 
-def _swept_names(parameters: ParameterSet, cases: Iterable[CaseValues]) -> list[str]:
-    """The parameters in which the cases differ from what they have in common."""
-    nominal = {n: p.value for n, p in parameters.items()}
-    found: dict[str, None] = {}
-    for case in cases:
-        values = {n: p.value for n, p in case.items()} if isinstance(case, ParameterSet) else case
-        found |= dict.fromkeys(n for n, v in values.items() if n not in found and nominal.get(n) != v)
-    return list(found)
-
-
 def _value_of(name: str, case: CaseValues, parameters: ParameterSet) -> float:
     if isinstance(case, ParameterSet):
         return case.value(name) if name in case else nan
     return float(case[name]) if name in case else parameters.value(name) if name in parameters else nan
-
-
-def _check_column_names(outcome: Outcome, taken: set[str]) -> Outcome:
-    twice = taken.intersection(outcome.results)
-    if not twice:
-        return outcome
-    said = f"{', '.join(sorted(twice))}: a result has the name of a column of the study; rename it"
-    return Outcome(seconds=outcome.seconds, error=said)
 
 
 def sweep(
@@ -337,7 +301,7 @@ def sweep(
         for name, values in cases.items():
             if (outcome := journal.find(name, marks.of(values))) is not None:
                 rows.add(name, outcome)
-        journal.show(rows.row(name) for name in cases if not rows.is_missing(name))
+        journal.append_rows(rows.row(name) for name in cases if not rows.is_missing(name))
     missing = ((name, values) for name, values in cases.items() if rows.is_missing(name))
     given = fn, parameters, missing, len(cases) - rows.done
     if executor is None or isinstance(executor, Processes):
@@ -352,7 +316,7 @@ def sweep(
             rows.add(name, outcome)
             if journal is not None:
                 journal.add(name, marks.of(cases[name]), outcome)
-                journal.show([rows.row(name)])
+                journal.append_rows([rows.row(name)])
             report(meter.text(), rows.done, len(cases))
     return WideFrame(rows.columns())
 
@@ -381,13 +345,7 @@ SAMPLE_TIME_AXIS = "pid.sample_time"
 
 
 def with_sample_time(loop: ClosedLoop, parameters: ParameterSet) -> ParameterSet:
-    """The parameters with the sample time of the loop's controller among them, which cases may change.
-
-    Raises
-    ------
-    InputError
-        If the controller is continuous.
-    """
+    """The parameters with the sample time of the loop's controller, which cases may change; a continuous one fails."""
     step = loop.pid.sample_time
     require(
         step is not None, f"{SAMPLE_TIME_AXIS}: the controller is continuous; give [pid] a sample_time in the tuning"

@@ -1,87 +1,70 @@
 """The numbers that decide in `studies`, each with its unit and what it decides."""
 
-
 # Batch
 
+# plants that a core runs before they are read: fewer fill no lanes; the responses of more leave its cache, for fresh
+# pages, and 16 take two fifths longer
 CHUNK_A_CORE = 8
-"""Plants that a core runs before they are read: fewer fill no lanes; the responses of more leave its cache, for fresh
-pages, and 16 take two fifths longer."""
+# share of a metric, or of its median over the plants, by which lanes and certificate may differ: a search claims no
+# figure that differs by more
 USUAL_TOLERANCE = 0.01
-"""Share of a metric, or of its median over the plants, by which lanes and certificate may differ: a search claims no
-figure that differs by more."""
+# plants, beside those with an extreme value, whose fastest mode is sought: fewer may miss a stiff one, on which RK4 is
+# then unstable; each more costs an eigenvalue problem a plant and state
 MAX_PROBED = 64
-"""Plants, beside those with an extreme value, whose fastest mode is sought: fewer may miss a stiff one, on which RK4
-is then unstable; each more costs an eigenvalue problem a plant and state."""
-RATE_MARGIN = 1.2
-"""Factor on the fastest mode found [1]: the plants that are not probed may be faster by that much."""
-SAME_START = 1e-9
-"""Share of the states' nominal sizes [1] by which starts differ by rounding: at 0 each plant's is computed anew."""
+RATE_MARGIN = 1.2  # factor on the fastest mode found [1]: the plants that are not probed may be faster by that much
+SAME_START = 1e-9  # share of nominal sizes [1] by which starts differ by rounding: at 0 each plant's is computed anew
 
 # Bootstrap
 
+# share of a channel's range [1] by which a simulated log may leave the fitted one: with more its motion is another than
+# the log's, with less the log falls into short parts, each with a start of its own, which tell less
 MAX_WANDER = 0.1
-"""Share of a channel's range [1] by which a simulated log may leave the fitted one: with more the excitation is another
-than the log's, with less the log falls into short parts, each with a start of its own, which tell less."""
-MIN_ROWS = 50
-"""Rows of a part of a log: a shorter one hardly tells more than its own start."""
+MIN_ROWS = 50  # rows of a part of a log: a shorter one hardly tells more than its own start
+# chance [1] of so few intervals that hold the value, if each did so 95 times in 100, below which they are told: with a
+# larger one good intervals are told too often, with a smaller one twenty draws tell nothing
 MIN_CHANCE = 0.01
-"""Chance [1] of so few intervals that hold the value, if each did so 95 times in 100, below which they are told: with
-a larger one good intervals are told too often, with a smaller one twenty draws tell nothing."""
-SIGNIFICANT = 3.0
-"""Deviations [1] of a mean from the value from which it is a bias, and no chance."""
+SIGNIFICANT = 3.0  # deviations [1] of a mean from the value from which it is a bias, and no chance
 
 # Executors
 
-CHUNK_SECONDS = 0.5
-"""Time that a chunk of cases shall take [s]: longer chunks lose more where a process dies, shorter ones cost more to
-send."""
-MAX_CHUNK = 1000
-"""Cases in a chunk [1]: more hold up the table, and fill the memory where each is large."""
+CHUNK_SECONDS = (
+    0.5  # time of a chunk of cases [s]: longer ones lose more with a process, shorter ones cost more to send
+)
+MAX_CHUNK = 1000  # cases in a chunk [1]: more hold up the table, and fill the memory where each is large
 TRIES = 2  # runs of a case whose process dies [1]: a second one tells a case that kills from a machine that went away
-MAX_PROCESSES = 60
-"""Processes at once: Windows cannot wait for more than 63, and each takes memory for CasADi and the model."""
+MAX_PROCESSES = 60  # at once: Windows cannot wait for more than 63, and each takes memory for CasADi and the model
 LIMIT_SHARE = 0.25  # of a case's time limit that a chunk shall take [1]: one that takes all of it is cut up
-CHUNKS_A_WORKER = 3
-"""Chunks that wait for each worker [1]: fewer leave it idle while a result travels, more fill the memory."""
+CHUNKS_A_WORKER = 3  # that wait for each worker [1]: fewer leave it idle while a result travels, more fill the memory
+# workers [1] of an executor that does not say how many it has, or of a cluster that may grow: more make chunks so small
+# that each costs more to send than to compute, fewer leave workers idle
 UNKNOWN_WORKERS = 64
-"""Workers [1] of an executor that does not say how many it has, or of a cluster that may grow: more make chunks so
-small that each costs more to send than to compute, fewer leave workers idle."""
 CONNECT_SECONDS = 10.0  # patience with a scheduler [s]: shorter gives up on a slow net, longer looks like a hang
 
 # Journal
 
 REWRITE_SECONDS = 5.0  # least time between two Parquet files [s]: less writes without end, more is lost with a kill
 REWRITE_SHARE = 0.05  # most of the time that may go into writing them [1]
+# time between two waits for the disk [s]: only what came since is lost where the machine itself loses power; a wait a
+# case slows quick cases down; a process that is killed loses nothing
 SYNC_SECONDS = 1.0
-"""Time between two waits for the disk [s]: only what came since is lost where the machine itself loses power; a wait a
-case slows quick cases down. A process that is killed loses nothing."""
 
 # Neighbours
 
-# Ratio to the best neighbour from which a cell breaks with it. A smaller one computes cells again on a steep slope; a
-# larger one leaves local optima in the table.
+# ratio to the best neighbour from which a cell breaks with it: a smaller one computes cells again on a steep slope, a
+# larger one leaves local optima in the table
 BREAK_RATIO = 3.0
-
-# Outcome
-
-MEGABYTE = 2**20
 
 # Sensitivity
 
-MAX_LOST = 0.1
-"""Share of points [1] without a figure, beyond which its indices are not given: they would tell of other plants."""
-RESAMPLES = 400
-"""Bootstrap samples of an index: fewer make its ends jump, more only take time."""
-SPREAD_POINTS = 64
-"""Quantiles of an axis from which its standard deviation is computed [1]: fewer cut a normal's tails, 2 % here."""
-SIDE = 1e-4
-"""Part of a standard deviation by which a response is moved along its sensitivity [1]: with a larger one a figure that
-bends is off, with a smaller one its digits are lost in the difference."""
-START_SIDE = 1e-3
-"""The same for the state before the step, which is found by iteration, to fewer digits."""
+MAX_LOST = 0.1  # share of points [1] without a figure, beyond which its indices would tell of other plants
+RESAMPLES = 400  # bootstrap samples of an index: fewer make its ends jump, more only take time
+SPREAD_POINTS = 64  # quantiles of an axis that give its standard deviation [1]: fewer cut a normal's tails, 2 % here
+# part of a standard deviation by which a response is moved along its sensitivity [1]: with a larger one a figure that
+# bends is off, with a smaller one its digits are lost in the difference; and the same for the state before the step,
+# which is found by iteration, to fewer digits
+SIDE, START_SIDE = 1e-4, 1e-3
 
 # Sweep
 
-MAX_TABLE_BYTES = 2**28
-"""Size of a table of cases [byte], 256 MiB: more fills the memory; less refuses a million cases of ten parameters."""
+MAX_TABLE_BYTES = 2**28  # of cases, 256 MiB: more fill the memory; less refuses a million cases of ten parameters
 RATE_AFTER = 5.0  # time after the first case until a rate is shown [s]: earlier ones jump

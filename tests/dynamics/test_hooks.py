@@ -17,12 +17,12 @@ from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.identification.identify import identify
 from pneuopt.logs.experiment import Experiment
+from pneuopt.models import starts as friction_starts
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.models.starts import friction as friction_starts
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory

@@ -37,7 +37,7 @@ from pneuopt.models.friction import (
     Viscous,
 )
 from pneuopt.models.load import Load
-from pneuopt.quantities.errors import ConvergenceError, InputError, LogError, ModelError
+from pneuopt.quantities.errors import ConvergenceError, LogError
 from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import tune
@@ -265,11 +265,6 @@ def test_advice_speaks_in_the_axis_units() -> None:
     assert inertia.reason == "inertia takes 5e-07 N*m (rms), nothing beside 0.3 N*m of friction"
 
 
-def test_a_friction_that_needs_pressures_is_refused() -> None:
-    with pytest.raises(ModelError, match="needs pressure_a, pressure_b, which a rotary axis lacks"):
-        RotaryDrive(PressureDependent(Coulomb()))
-
-
 def test_the_torque_is_the_load_of_load_dependent_friction() -> None:
     drive = RotaryDrive(LoadDependent(Coulomb()))
     truth = {**TRUTH, "friction.coulomb_load": 0.1, "friction.load_rounding": 0.02}
@@ -355,15 +350,8 @@ def test_a_spring_holds_still_where_it_is_and_lets_no_motion_be_steady() -> None
     p = system.parameters.with_values({"load.stiffness": 100.0})
     assert system.rest_hook is not None
     assert system.rest_hook(p, {"position": 0.2}).inputs == {"force": pytest.approx(20.0)}
-    with pytest.raises(ConvergenceError, match="changes the force that position needs"):
+    with pytest.raises(ConvergenceError):
         system.rest_hook(p, {"speed": 0.1})
-
-
-def test_it_starts_from_nothing_but_position_and_speed() -> None:
-    system = RotaryDrive().system()
-    assert system.rest_hook is not None
-    with pytest.raises(InputError, match=r"from angle and speed, not from torque; leave torque out"):
-        system.rest_hook(system.parameters, {"torque": 0.1})
 
 
 @pytest.mark.parametrize("drive", [ForceDrive(Stribeck()), RotaryDrive(Stribeck())], ids=["force", "rotary"])

@@ -21,7 +21,6 @@ from pneuopt.models.friction import (
     stribeck_curve,
 )
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ModelError
 
 STATIC: dict[str, FrictionModel] = {"viscous": Viscous(), "coulomb": Coulomb(), "stribeck": Stribeck()}
 MODELS: dict[str, FrictionModel] = {
@@ -190,11 +189,6 @@ def test_pressure_and_direction_multiply() -> None:
     assert force(model, 0.5, values, {"pressure_a": 3e5}) == pytest.approx((4 + 6) * 1.5)
 
 
-def test_pressure_needs_a_coulomb_level() -> None:
-    with pytest.raises(ModelError, match=r"Viscous.* has no Coulomb level .*; take Coulomb\(\), Stribeck\(\) or LuGre"):
-        PressureDependent(Viscous())
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_every_default_has_a_unit_and_lies_in_its_bounds(name: str) -> None:
     for parameter in MODELS[name].parameters.values():
@@ -207,18 +201,18 @@ LAW = LoadDependent(Coulomb())
 VALUES = {"coulomb": 30.0, "viscous": 0.0, "smoothing": 1e-3, "coulomb_load": 0.1, "load_rounding": 1.0}
 
 
-def force_of_load_dependent(load: float) -> float:
+def load_dependent_force(load: float) -> float:
     """The friction force at 1 m/s, where the sign's smoothing has ended."""
     p = {n: ca.SX(v) for n, v in VALUES.items()}
     return float(ca.evalf(LAW.force(ca.SX(1.0), {}, {"force": ca.SX(load)}, p).value))
 
 
 def test_without_load_it_is_the_base_model() -> None:
-    assert force_of_load_dependent(0.0) == pytest.approx(30.0, rel=1e-12)
+    assert load_dependent_force(0.0) == pytest.approx(30.0, rel=1e-12)
 
 
 @given(load=st.floats(-1e4, 1e4))
 def test_the_rise_is_the_coefficient_times_the_load_less_at_most_the_rounding(load: float) -> None:
-    rise = force_of_load_dependent(load) - 30.0
+    rise = load_dependent_force(load) - 30.0
     assert rise <= 0.1 * abs(load) + 1e-9
     assert rise >= 0.1 * (abs(load) - VALUES["load_rounding"]) - 1e-9

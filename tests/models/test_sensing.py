@@ -15,7 +15,6 @@ from pneuopt.models.catalog import b32
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.sensing import coarse_delay, with_sensors
-from pneuopt.quantities.errors import UnknownNameError
 from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -111,8 +110,3 @@ def test_a_drive_behind_its_sensors_still_rests() -> None:
     rate = np.array(system.ode(0, x, u, p)[0])
     nominal = np.array([q.nominal for q in system.states])
     assert np.abs(rate.ravel() / nominal).max() < 1e-3
-
-
-def test_an_unknown_output_is_refused() -> None:
-    with pytest.raises(UnknownNameError, match="with_sensors: delay"):
-        with_sensors(DRIVE, delay=["positon"])

@@ -21,7 +21,6 @@ from pneuopt.models.friction import LuGre
 from pneuopt.models.linear import SecondOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.plotting import plot_loop
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Quantity
 
 SAMPLED = {"limits", "hold", "controller, every"}
@@ -120,8 +119,3 @@ def test_neither_texts_nor_blocks_overlap(name: str) -> None:
         assert not any(one.overlaps(other) for k, one in enumerate(drawn) for other in drawn[:k])
     inside = figure.bbox
     assert all(inside.x0 <= q.x0 and q.x1 <= inside.x1 for q in (t.get_window_extent() for t in axes.texts))
-
-
-def test_what_is_no_loop_is_refused() -> None:
-    with pytest.raises(InputError, match="ClosedLoop"):
-        plot_loop(FORCE)  # type: ignore[arg-type]

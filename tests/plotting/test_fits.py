@@ -1,19 +1,27 @@
-"""The friction map: points that the logs imply, the fitted curve, and its band."""
+"""Fits beside their logs, residuals and correlations; the friction map: points, fitted curve, and its band."""
 
 from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+import pandas as pd
 import pytest
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.logs.experiment import Experiment
+from pneuopt.logs.experiment import Experiment, split
 from pneuopt.models.drives import MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.plotting import friction_force, has_friction_map, plot_friction
-from pneuopt.quantities.errors import InputError
+from pneuopt.plotting import (
+    friction_force,
+    has_friction_map,
+    plot_correlation,
+    plot_fit,
+    plot_friction,
+    plot_prediction,
+    plot_residuals,
+)
 from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 from tests.plotting.fits import DRIVE, TRUTH, fit_of, fitted, line, table, texts
@@ -113,8 +121,6 @@ def test_a_rig_shows_its_measured_force() -> None:
     assert np.array_equal(line(figure.axes[0], "fitted")[1], measured + 1)
     assert figure.axes[0].get_ylabel() == "force [N]"
     assert not has_friction_map(FirstOrder().system())
-    with pytest.raises(InputError, match="a friction map is drawn for"):
-        plot_friction(FirstOrder().system(), fit_of(rig.parameters, {}), [experiment])
 
 
 def test_friction_along_a_run_is_what_the_balance_of_forces_leaves() -> None:
@@ -130,3 +136,57 @@ def test_friction_along_a_run_is_what_the_balance_of_forces_leaves() -> None:
     force = ca.Function("force", [v, *z.values()], [g(v, z, {}, values).value])
     expected = np.array(force(speed, bristle)).ravel()
     assert friction_force(drive.system(), run, p) == pytest.approx(expected, abs=0.02)  # the end stops reach so far
+
+
+def test_a_fit_stands_beside_its_log_with_units() -> None:
+    pairs = [fitted(seed) for seed in range(2)]
+    figure = plot_fit(fit_of(TRUTH, {e.name: run for e, run in pairs}), [e for e, _ in pairs])
+    assert len(figure.axes) == 4
+    assert [texts(a) for a in figure.axes[:2]] == ["|position [mm]|run_0", "||run_1"]
+    assert figure.axes[3].get_xlabel() == "time [s]"
+    y = line(figure.axes[0], "fitted")[1]
+    assert np.allclose(y, 1e3 * pairs[0][1]["position"])
+    residual = np.asarray(figure.axes[2].lines[0].get_ydata(), dtype=float)
+    assert np.abs(residual).max() < 1e-9
+    assert [q.get_text() for q in figure.legends[0].get_texts()] == ["measured", "fitted"]
+    assert all(a.get_legend() is None for a in figure.axes)
+
+
+def test_windows_of_a_log_share_its_axes_and_many_logs_are_spread() -> None:
+    experiment, run = fitted()
+    windows = split(experiment, 0.25)
+    runs = [run.rows(125 * k, 125 * (k + 1)) for k in range(len(windows))]
+    assert len(plot_prediction(runs, windows, label="predicted").axes) == 2
+    several = [Experiment(experiment.trajectory, name=f"log {k}") for k in range(7)]
+    figure = plot_prediction([run] * 7, several, label="predicted")
+    assert [a.get_title() for a in figure.axes[:3]] == ["log 0", "log 3", "log 6"]
+    assert "3 of 7 logs" in [q.get_text() for q in figure.texts]
+
+
+def test_residuals_show_what_is_left_in_them() -> None:
+    experiment, run = fitted()
+    rng = np.random.default_rng(0)
+    white = 1e-5 * rng.standard_normal(len(run))
+    noisy = Experiment(run.with_columns({"force": experiment.trajectory["force"]}), {"position": 1e-5}, name="run")
+    good = Experiment(noisy.trajectory.with_columns({"position": run["position"] + white}), {"position": 1e-5})
+    pulled = run["position"] + white + 2e-7 * experiment.trajectory["force"]
+    bad = Experiment(noisy.trajectory.with_columns({"position": pulled}), {"position": 1e-5})
+    for log, expected in ((good.select(["force", "position"]), False), (bad.select(["force", "position"]), True)):
+        over_time, own, crossed, spread = plot_residuals([run], [log]).axes
+        assert texts(over_time) == "time [s]|position [mm]|residuals"
+        assert texts(own).startswith("lag [samples]||autocorrelation")
+        rho = np.asarray(line(crossed, "force")[1])
+        band = 1.96 / np.sqrt(len(run))
+        assert bool(np.abs(rho).max() > 2 * band) is expected
+        (told,) = own.texts
+        assert told.get_text().startswith("Ljung-Box p")
+        assert ("< 1e-4" in told.get_text()) is expected
+        assert (spread.get_xlabel(), spread.get_ylabel()) == ("residual / noise", "")
+
+
+def test_correlations_are_cells_and_never_a_rounded_one() -> None:
+    names = ["load.force", "friction.coulomb_asymmetry", "load.mass"]
+    covariance = pd.DataFrame([[1, 0.99998, 0], [0.99998, 1, 0], [0, 0, np.nan]], index=names, columns=names)
+    axes = plot_correlation(fit_of(TRUTH, {}, covariance)).axes[0]
+    assert [q.get_text() for q in axes.get_xticklabels()] == names[:2]
+    assert sorted(q.get_text() for q in axes.texts) == ["0.9999", "0.9999", "1.00", "1.00"]

@@ -1,13 +1,10 @@
 """"""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from pneuopt.logs.doctor import CHECKS, PISTON, examine
 from pneuopt.plotting import plot_finding
-from pneuopt.quantities.errors import InputError
 from tests.logs.bad_logs import BAD_LOGS, STATED
 from tests.plotting.fits import line, texts
 
@@ -38,9 +35,3 @@ def test_the_signals_that_contradict_each_other_stand_above_each_other_in_the_un
     assert words == ["speed", "slope of the position", "they contradict each other"]
     low, high = figure.axes[1].get_xlim()
     assert 0.5 < high - low < 2.1  # two strokes of half a second, and what noise adds
-
-
-def test_a_finding_without_signals_is_named() -> None:
-    finding = replace(examine(BAD_LOGS["work"])[0], evidence=None)
-    with pytest.raises(InputError, match="the finding 'work' has no signals to be drawn"):
-        plot_finding(finding)

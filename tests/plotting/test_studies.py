@@ -1,8 +1,7 @@
-"""The figure of a study's cases: which share keeps a bound.
+"""Maps and lines of studies, the share of cases that keep a bound, and bars of sensitivities."""
 
-The figure of sensitivities: bars as long as the indices, the axis that matters most on top.
-"""
-
+import itertools
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,10 +9,14 @@ import pandas as pd
 import pytest
 from matplotlib.patches import Rectangle
 
-from pneuopt.plotting import plot_distribution, plot_sensitivity
-from pneuopt.quantities.errors import InputError
+from pneuopt.plotting import (
+    plot_distribution,
+    plot_map,
+    plot_sensitivity,
+)
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.studies.sensitivity import LocalSensitivity, sensitivity
+from tests.plotting.fits import texts
 
 TABLE = pd.DataFrame(
     {
@@ -39,11 +42,6 @@ def test_the_bound_that_most_cases_keep_is_marked() -> None:
     table = pd.DataFrame({"Overshoot": np.arange(1.0, 101.0), "error": ""})
     (panel,) = plot_distribution(table, {"Overshoot": "%"}).axes
     assert panel.texts[0].get_text() == "95 % at most 95"
-
-
-def test_a_column_that_is_not_there_is_refused() -> None:
-    with pytest.raises(InputError, match="Overshot"):
-        plot_distribution(TABLE, {"Overshot": "%"})
 
 
 CUBE = ParameterSet(dict.fromkeys(("little", "much"), Parameter(1.0, "1")))
@@ -91,3 +89,44 @@ def test_panels_have_one_scale_whose_end_is_the_whole_variance_for_a_constant_to
     assert [low for low, _ in ends] == [0.0, 0.0]
     assert ends[0][1] >= 1.0
     assert ends[1][1] == 1.0
+
+
+def study(masses: Sequence[float], pressures: Sequence[float], errors: Mapping[int, str] | None = None) -> pd.DataFrame:
+    rows = []
+    for k, (p, m) in enumerate(itertools.product(pressures, masses)):
+        error = (errors or {}).get(k, "")
+        rows.append((p, m, *((np.nan, np.nan) if error else (0.1 * m / p, m)), error))
+    return pd.DataFrame(rows, columns=["supply.pressure", "load.mass", "SettlingTime", "Overshoot", "error"])
+
+
+def test_a_study_over_two_axes_is_a_map_that_marks_what_failed() -> None:
+    table = study([2.0, 4.0, 9.0], [6.0, 5.0], {0: "ValueError: no", 2: "interrupted"})
+    table.loc[1, "SettlingTime"] = np.nan
+    figure = plot_map(table, {"load.mass": "kg", "supply.pressure": "bar(g)"}, {"SettlingTime": "s", "Overshoot": "%"})
+    left, right = figure.axes[:2]
+    assert texts(left) == "load.mass [kg]|supply.pressure [bar(g)]|SettlingTime [s]"
+    assert texts(right) == "load.mass [kg]||Overshoot [%]"
+    cells = [["0.04", "0.08", "0.18"], ["failed", "never", "interrupted"]]
+    for j, row in enumerate(cells):
+        for i, cell in enumerate(row):
+            assert [q.get_text() for q in left.texts if q.get_position() == (i + 0.5, j + 0.5)] == [cell]
+    assert [q.get_text() for q in left.get_xticklabels()] == ["2", "4", "9"]
+    assert [q.get_text() for q in left.get_yticklabels()] == ["5", "6"]
+    assert [q.get_text() for q in right.texts] == ["2", "4", "9", "failed", "4", "interrupted"]
+
+
+def test_a_study_of_many_cases_is_a_map_without_figures() -> None:
+    table = study(np.linspace(1, 2, 20).tolist(), [4.0, 5.0])
+    (panel, _) = plot_map(table, {"load.mass": "kg", "supply.pressure": "bar(g)"}, {"SettlingTime": "s"}).axes
+    assert (len(panel.texts), len(panel.get_xticks()), len(panel.get_yticks())) == (0, 5, 2)
+
+
+def test_a_study_over_one_axis_is_a_line_that_marks_what_failed() -> None:
+    table = study([4.0, 2.0, 6.0], [5.0], {2: "ValueError: no"})
+    figure = plot_map(table, {"load.mass": "kg"}, {"SettlingTime": "s"})
+    (panel,) = figure.axes
+    assert texts(panel) == "load.mass [kg]||SettlingTime [s]"
+    x, y = panel.lines[0].get_data()
+    assert np.array_equal(x, [2, 4, 6])
+    assert np.array_equal(y, [0.04, 0.08, np.nan], equal_nan=True)
+    assert [(q.get_text(), q.get_position()[0]) for q in panel.texts] == [("failed", 6)]

@@ -10,7 +10,7 @@ import pytest
 
 import pneuopt as po
 from pneuopt.quantities.arrays import Array, Indices
-from pneuopt.studies import batch as fleet
+from pneuopt.studies.batch import PlantBatch
 from problems.shared.t32 import SPREADS, STEP, benchmark
 
 GAINS = {"pid.Kp": 2.806, "pid.Ki": 83.63, "pid.Kd": 0.1103, "dither.offset": -0.07758}
@@ -62,52 +62,41 @@ def test_a_difference_is_said() -> None:
     assert not found.checks["agrees"].all()
 
 
-def test_what_lanes_cannot_do_is_refused_with_the_remedy() -> None:
-    loop = po.ClosedLoop(po.SecondOrder().system(), po.PID())
-    cases, step = {"a": {"plant.gain": 1.0}}, po.Step(1.0)
-    with pytest.raises(po.InputError, match="MaxSensitivity: not read off"):
-        po.evaluate_batch(loop, step, loop.parameters, cases, metrics=["MaxSensitivity"])
-    with pytest.raises(po.InputError, match="recertify is a share"):
-        po.evaluate_batch(loop, step, loop.parameters, cases, recertify=2.0)
-    with pytest.raises(po.InputError, match="nonsense"):
-        po.evaluate_batch(loop, step, loop.parameters, {"a": {"nonsense": 1.0}})
-
-
 def test_a_killed_batch_goes_on_where_it_was_and_gives_the_same_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop = po.ClosedLoop(po.SecondOrder().system(), po.PID())
     rig = loop.parameters.with_values({"pid.Kp": 0.5, "pid.Ki": 2.0})
     plants, ran = po.samples(rig, {"plant.gain": 0.1}, 12), list[int]()
-    measure = fleet.PlantBatch.measure
+    measure = PlantBatch.measure
 
     def evaluate(journal: po.Journal | None) -> po.BatchEvaluation:
         one = ThreadPoolExecutor(1)
         step = po.Step(1.0, horizon=4.0)
         return po.evaluate_batch(loop, step, rig, plants, chunk=5, executor=one, journal=journal, recertify=0.3)
 
-    def measure_until_ctrl_c(self: fleet.PlantBatch, rows: Indices, columns: Mapping[str, Array]) -> None:
+    def measure_until_ctrl_c(self: PlantBatch, rows: Indices, columns: Mapping[str, Array]) -> None:
         if len(ran) == 5:
             raise KeyboardInterrupt
         ran.extend(rows.tolist())
         measure(self, rows, columns)
 
     whole = evaluate(None)
-    monkeypatch.setattr(fleet.PlantBatch, "measure", measure_until_ctrl_c)
+    monkeypatch.setattr(PlantBatch, "measure", measure_until_ctrl_c)
     journal = po.Journal(tmp_path / "journal", "batch")
     cut = evaluate(journal)
     journal.close(finished=False)
     assert (cut.table["error"] == "interrupted").sum() == 7
     assert cut.table[:5].equals(whole.table[:5])
     assert len(cut.checks) == 0
-    monkeypatch.setattr(fleet.PlantBatch, "measure", measure)
+    monkeypatch.setattr(PlantBatch, "measure", measure)
     journal = po.Journal(tmp_path / "journal", "batch", resume=True)
     assert set(journal.known) == set(list(plants)[:5])
     again = evaluate(journal)
     journal.close(finished=False)
     assert again.table.equals(whole.table)
     assert again.checks.equals(whole.checks)
-    monkeypatch.setattr(fleet.PlantBatch, "measure", None)  # nothing is left to run
+    monkeypatch.setattr(PlantBatch, "measure", None)  # nothing is left to run
     journal = po.Journal(tmp_path / "journal", "batch", resume=True)
     assert evaluate(journal).table.equals(whole.table)
     journal.close(finished=True)

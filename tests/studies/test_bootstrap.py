@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
 from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
@@ -15,8 +13,6 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.karnopp import Karnopp
-from pneuopt.quantities.errors import InputError, ModelError
-from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.studies.bootstrap import Bootstrap, bootstrap
 
@@ -99,19 +95,3 @@ def test_a_log_from_which_the_simulation_drifts_begins_anew_in_parts() -> None:
     assert fit.window is not None
     found = tried(log, fit, STICKING, count=2)
     assert found.draws["error"].tolist() == ["", ""]
-
-
-def test_what_makes_no_bootstrap_is_said(right: tuple[Experiment, IdentificationResult]) -> None:
-    log, fit = right
-    lost = replace(fit, status=Status(Code.NOT_CONVERGED, ("lost",)))
-    with pytest.raises(InputError, match="count = 1: a spread takes two sets of logs at least"):
-        bootstrap(DRIVE, log, fit, count=1)
-    with pytest.raises(InputError, match="the fit has not converged: lost; mend it first"):
-        bootstrap(DRIVE, log, lost)
-    with pytest.raises(InputError, match="the fit is of run, not of other"):
-        bootstrap(DRIVE, replace(log, name="other"), fit)
-
-
-def test_a_loop_is_refused(right: tuple[Experiment, IdentificationResult]) -> None:
-    with pytest.raises(ModelError, match="give the drive"):
-        bootstrap(ClosedLoop(DRIVE, PID(sample_time=2e-3)), *right)

@@ -1,7 +1,9 @@
 """The same study in one thread, in two processes and on a cluster of dask: identical tables, bit for bit."""
 
 import importlib
+import math
 import sys
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
@@ -21,7 +23,7 @@ from pneuopt.evaluation.scenarios import Distribution, Normal, Sampling, Spread,
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies.executors import Processes, open_executor
+from pneuopt.studies.executors import Processes, _Crew, open_executor, run_in_processes
 from pneuopt.studies.sweep import sweep
 
 RIG = ParameterSet({"mass": Parameter(5.0, "kg", 0.1, 100.0), "gain": Parameter(2.0, "1")})
@@ -104,17 +106,6 @@ def test_a_certified_loop_is_the_same_on_a_cluster(dask: Executor) -> None:
     assert_identical(sweep(certify, given, cases, executor=dask), serial)
 
 
-@pytest.mark.parametrize("word", ["", "-1", "two", "dsk", "http://host:8786"])
-def test_a_word_that_names_no_executor_is_refused(word: str) -> None:
-    with pytest.raises(InputError, match="give a number of processes, dask, or a scheduler"), open_executor(word):
-        pass
-
-
-def test_no_processes_are_refused() -> None:
-    with pytest.raises(InputError, match="a process at least, got 0"), open_executor("0"):
-        pass
-
-
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
@@ -127,6 +118,33 @@ def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.filterwarnings("default")  # dask's own
 def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="dask is not installed: pip install 'pneuopt[cluster]'")
-    monkeypatch.setattr("pneuopt.studies.executors._CONNECT_SECONDS", 0.2)
+    monkeypatch.setattr("pneuopt.studies.executors.CONNECT_SECONDS", 0.2)
     with pytest.raises(InputError, match="there is no dask scheduler"), open_executor("tcp://127.0.0.1:1"):
         pass
+
+
+def test_memory_is_limited_on_linux_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    with pytest.raises(InputError, match="needs Linux; leave it out"):
+        Processes(megabytes=100.0)
+    assert Processes(seconds=1.0).count is None
+
+
+def test_the_users_filters_of_warnings_are_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within, the successor of a process that had grown is no news: its chunk goes on."""
+    before = list(warnings.filters)
+    monkeypatch.setattr(
+        _Crew, "start", lambda _: warnings.warn("A worker was restarted while some jobs were given", stacklevel=1)
+    )
+    outcomes = dict(run_in_processes(Processes(), len, RIG, [("a", RIG)], 1))
+    assert "no process could be started" in outcomes["a"].error
+    assert list(warnings.filters) == before
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("count", 2.5), ("count", "2"), ("count", math.inf), ("seconds", "60 s"), ("seconds", None), ("megabytes", [])],
+)
+def test_a_limit_that_is_no_number_is_named(option: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"^Processes: {option} takes .*; got "):
+        Processes(**{option: value})  # type: ignore[arg-type]

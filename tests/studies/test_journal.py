@@ -17,7 +17,6 @@ import pytest
 
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies import journal as row_file
 from pneuopt.studies.journal import Journal, RowFile, parquet_bytes
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
@@ -76,7 +75,7 @@ def test_a_study_that_is_done_leaves_no_journal(tmp_path: Path) -> None:
     journal.add("a", "0", Outcome({"x": 1.0}, 0.1))
     journal.close(finished=True)
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError):
         Journal(tmp_path / "none" / "journal", "study")
 
 
@@ -116,7 +115,7 @@ def test_a_case_of_the_same_name_with_other_values_is_computed_again(tmp_path: P
 
 def test_a_study_is_resumed_only_if_nothing_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, inputs = tmp_path / "journal", {"drive.toml": "1", "tuning.toml": "2"}
-    with pytest.raises(InputError, match="there is nothing to resume; leave out --resume"):
+    with pytest.raises(InputError):
         Journal(path, inputs, resume=True)
     journal = Journal(path, inputs)
     journal.add("a", "mark", Outcome({"x": 1 / 3}, 0.1))
@@ -124,8 +123,7 @@ def test_a_study_is_resumed_only_if_nothing_has_changed(tmp_path: Path, monkeypa
     again = Journal(path, inputs, resume=True)
     again.close(finished=False)
     assert again.find("a", "mark") == Outcome({"x": 1 / 3}, 0.1)
-    said = r"is of another study, tuning\.toml changed since; put that back, or begin anew"
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=r"tuning\.toml"):
         Journal(path, {**inputs, "tuning.toml": "3"}, resume=True)
     monkeypatch.setattr("pneuopt.studies.journal.provenance", lambda: {"casadi": "9.9", "options": ""})
     with pytest.raises(InputError, match="version of casadi"):
@@ -194,8 +192,8 @@ def test_a_study_that_is_killed_loses_no_row_and_ends_in_the_same_table(tmp_path
     assert run() == (0, ["0", resumed])
 
 
-RIG_ROW_FILE = ParameterSet({"mass": Parameter(1.0, "kg")})
-CASES_ROW_FILE = {f"case {k}": {"mass": 1.0 + k} for k in range(5)}
+MASS = ParameterSet({"mass": Parameter(1.0, "kg")})
+MASSES = {f"case {k}": {"mass": 1.0 + k} for k in range(5)}
 
 
 def read(path: Path) -> pd.DataFrame:
@@ -212,14 +210,14 @@ def third(p: ParameterSet) -> dict[str, float]:
 def test_the_file_holds_each_row_as_soon_as_its_case_is_done(
     tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(row_file, "_REWRITE_SECONDS", 0.0)
-    monkeypatch.setattr(row_file, "_REWRITE_SHARE", inf)
+    monkeypatch.setattr("pneuopt.studies.journal.REWRITE_SECONDS", 0.0)
+    monkeypatch.setattr("pneuopt.studies.journal.REWRITE_SHARE", inf)
     path, seen = tmp_path / f"rows.{suffix}", list[pd.DataFrame]()
     journal = Journal(tmp_path / "journal", "study", rows=RowFile(path, lambda n: f"{n} [kg]" if n == "mass" else n))
     table = sweep(
         third,
-        RIG_ROW_FILE,
-        CASES_ROW_FILE,
+        MASS,
+        MASSES,
         executor=ThreadPoolExecutor(1),
         journal=journal,
         progress=lambda _: seen.append(read(path)),
@@ -252,7 +250,7 @@ def test_a_column_of_numbers_and_texts_is_one_of_texts() -> None:
 
 def test_parquet_without_pyarrow_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"Parquet needs pyarrow; run: pip install 'pneuopt\[parquet\]'"):
+    with pytest.raises(InputError, match="pyarrow"):
         RowFile(tmp_path / "rows.parquet")
 
 

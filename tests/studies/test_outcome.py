@@ -3,16 +3,14 @@
 import importlib
 import math
 import sys
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies.executors import Processes, _Crew, run_in_processes
+from pneuopt.studies.executors import Processes
 from pneuopt.studies.outcome import evaluate_case
 from pneuopt.studies.sweep import sweep
 
@@ -95,27 +93,6 @@ def test_nan_is_a_reason_where_no_number_came_out() -> None:
     assert outcome({"word": "none"}) == ""
 
 
-@pytest.mark.parametrize(
-    ("seconds", "megabytes", "said"),
-    [(0.0, 1.0, "time limit of a case must be positive"), (math.nan, 1.0, "time"), (1.0, -1.0, "memory limit")],
-)
-def test_limits_that_cannot_be_are_refused(seconds: float, megabytes: float, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        Processes(None, seconds, megabytes)
-
-
-def test_no_process_at_all_is_refused() -> None:
-    with pytest.raises(InputError, match="a process at least, got 0"):
-        Processes(0)
-
-
-def test_memory_is_limited_on_linux_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "platform", "win32")
-    with pytest.raises(InputError, match="needs Linux; leave it out"):
-        Processes(megabytes=100.0)
-    assert Processes(seconds=1.0).count is None
-
-
 def test_a_process_that_grows_is_replaced_and_its_successor_goes_on(
     functions: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,23 +101,3 @@ def test_a_process_that_grows_is_replaced_and_its_successor_goes_on(
     table = sweep(functions.hoarding, RIG, masses(1, 2, 3), executor=Processes(1))
     assert table["error"].tolist() == [""] * 3
     assert max(table["hoarded"]) < 3  # not all in one process
-
-
-def test_the_users_filters_of_warnings_are_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Within, the successor of a process that had grown is no news: its chunk goes on."""
-    before = list(warnings.filters)
-    monkeypatch.setattr(
-        _Crew, "start", lambda _: warnings.warn("A worker was restarted while some jobs were given", stacklevel=1)
-    )
-    outcomes = dict(run_in_processes(Processes(), len, RIG, [("a", RIG)], 1))
-    assert "no process could be started" in outcomes["a"].error
-    assert list(warnings.filters) == before
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("count", 2.5), ("count", "2"), ("count", math.inf), ("seconds", "60 s"), ("seconds", None), ("megabytes", [])],
-)
-def test_a_limit_that_is_no_number_is_named(option: str, value: object) -> None:
-    with pytest.raises(InputError, match=f"^Processes: {option} takes .*; got "):
-        Processes(**{option: value})  # type: ignore[arg-type]

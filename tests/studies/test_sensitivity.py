@@ -13,7 +13,6 @@ import pytest
 
 import pneuopt as po
 from pneuopt.evaluation.scenarios import Normal
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.studies.outcome import CaseFunction
 from pneuopt.studies.sensitivity import Sensitivity, sensitivity
@@ -81,24 +80,6 @@ def test_the_points_are_those_of_the_seed_in_any_executor() -> None:
     assert once != other
 
 
-def fails(_: ParameterSet) -> float:
-    raise InputError("no plant")
-
-
-@pytest.mark.parametrize(
-    ("fn", "options", "said"),
-    [
-        (ishigami, {"count": 100}, "count = 100: give a power of two, 16 or more"),
-        (ishigami, {"count": 16, "figures": ["speed"]}, "speed"),
-        (fails, {"count": 16}, "no case of the study gave a figure: InputError: no plant"),
-        (ishigami, {"count": 16, "spreads": {"d": 0.1}}, "'d'"),
-    ],
-)
-def test_what_tells_nothing_is_refused(fn: CaseFunction, options: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        told(fn, **options)
-
-
 METRICS = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl")
 
 
@@ -140,11 +121,3 @@ def test_a_steady_error_and_its_shares_are_those_of_the_formula() -> None:
     assert row["relative"] == pytest.approx(row["change"] / error, rel=1e-6)
     assert row["share"] == pytest.approx(1.0, abs=1e-6)
     assert "plant.gain" in found.summary().to_text()
-
-
-def test_an_axis_that_moves_the_samples_and_a_metric_of_the_linear_loop_are_refused() -> None:
-    loop, given = benchmark()
-    with pytest.raises(po.InputError, match=r"dither\.frequency: the samples of a response hang on it"):
-        po.local_sensitivity(loop, STEP, given, {"dither.frequency": 0.1})
-    with pytest.raises(po.InputError, match="MaxSensitivity: not read off"):
-        po.local_sensitivity(loop, STEP, given, SPREADS, metrics=["MaxSensitivity"])

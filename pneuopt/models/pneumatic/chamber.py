@@ -8,12 +8,9 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import ISENTROPIC_EXPONENT
+from pneuopt.models.tolerances import FLOW_REVERSAL_WIDTH, MIN_CHAMBER_PRESSURE
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-# Mass flow over which exponent or temperature change from outflow to inflow [kg/s]: a narrower one is stiffer at rest,
-# a wider one mixes the two in motion.
-FLOW_REVERSAL_WIDTH = 1e-5
-MIN_CHAMBER_PRESSURE = 1e3  # absolute pressure [Pa] below which the models are not valid
 PRESSURE = Quantity("pressure", "Pa(a)", nominal=5e5, lower=MIN_CHAMBER_PRESSURE)
 
 
@@ -157,18 +154,7 @@ class Thermal:
 
 
 def blend(flow: ca.SX, inward: ca.SX, outward: ca.SX) -> ca.SX:
-    """Property of the flowing air: `inward` for flow into the chamber, `outward` for flow out, smooth in between.
-
-    Parameters
-    ----------
-    flow : SX or float
-        Mass flow into the chamber [kg/s].
-    inward, outward : SX or float
-        The property in either direction, in any unit.
-
-    Returns
-    -------
-    SX or float
+    """Property of the air in a mass flow [kg/s]: `inward` into the chamber, `outward` out of it, smooth in between.
 
     Examples
     --------

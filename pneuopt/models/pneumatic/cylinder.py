@@ -10,11 +10,8 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import REFERENCE_PRESSURE
+from pneuopt.models.tolerances import STOP_ROUNDING
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-
-# Rounding of the end stops' onset [m]: with a larger one the stops push far inside the stroke (now 0.25 N at 10 mm from
-# a stop of 1e6 N/m), with a smaller one impacts need finer steps.
-STOP_ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -60,22 +57,12 @@ class Cylinder:
         """
         if not self.stops:
             return ca.SX(0)
-        front, rear = (_smooth_positive_part(d) for d in (y - p["stroke"], -y))
+        front, rear = ((d + ca.sqrt(d**2 + STOP_ROUNDING**2)) / 2 for d in (y - p["stroke"], -y))
         return p["stop_stiffness"] * (rear * (1 - p["stop_damping"] * v) - front * (1 + p["stop_damping"] * v))
 
 
 def areas(bore: ca.SX, rod: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Piston areas towards chamber a and towards chamber b, where the rod is.
-
-    Parameters
-    ----------
-    bore, rod : SX or float
-        Diameters [m]; rod 0 for a rodless cylinder.
-
-    Returns
-    -------
-    tuple of SX or float
-        A_a, A_b [m^2].
+    """Piston areas [m^2] towards chamber a and towards chamber b, where the rod is, from diameters [m]; rodless: 0.
 
     Examples
     --------
@@ -87,19 +74,7 @@ def areas(bore: ca.SX, rod: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def volumes(y: ca.SX, p: Symbols) -> tuple[ca.SX, ca.SX]:
-    """Volumes of both chambers [m^3] at position y [m], dead volumes included.
-
-    Parameters
-    ----------
-    y : SX or float
-        [m]
-    p : mapping
-        bore, rod, stroke [m], dead_volume_a, dead_volume_b [m^3].
-
-    Returns
-    -------
-    tuple of SX or float
-        V_a, V_b [m^3].
+    """Volumes of chambers a and b [m^3] at position y [m], with the dead volumes in the cylinder's parameters p.
 
     Examples
     --------
@@ -112,19 +87,9 @@ def volumes(y: ca.SX, p: Symbols) -> tuple[ca.SX, ca.SX]:
 
 
 def piston_leak(pressure_a: ca.SX, pressure_b: ca.SX, leak: ca.SX) -> ca.SX:
-    """Laminar leakage past the piston from b to a, ``G (p_b - p_a)(p_a + p_b) / (2 p_0)``.
+    """Laminar leakage past the piston [kg/s] from b to a, ``G (p_b - p_a)(p_a + p_b) / (2 p_0)``.
 
-    Parameters
-    ----------
-    pressure_a, pressure_b : SX or float
-        Absolute [Pa].
-    leak : SX or float
-        G [kg/(s Pa)], at a mean pressure p_0 = 100 kPa.
-
-    Returns
-    -------
-    SX or float
-        [kg/s]
+    Pressures are absolute [Pa]; the leak G [kg/(s Pa)] is that at a mean pressure p_0 of 100 kPa.
 
     Examples
     --------
@@ -132,7 +97,3 @@ def piston_leak(pressure_a: ca.SX, pressure_b: ca.SX, leak: ca.SX) -> ca.SX:
     6.0
     """
     return leak * (pressure_b - pressure_a) * (pressure_a + pressure_b) / (2 * REFERENCE_PRESSURE)
-
-
-def _smooth_positive_part(d: ca.SX) -> ca.SX:
-    return (d + ca.sqrt(d**2 + STOP_ROUNDING**2)) / 2

@@ -1,14 +1,15 @@
 """`PneumaticDrive`: supply, proportional valve, cylinder and load in one ODE.
 
-Sections and keys of a pneumatic drive in a file, with a catalogue's nominal flow in place of a conductance.
-
-Rest and steady motion of a `PneumaticDrive`: spool position and pressures at which only the position changes.
+Below the drive stand its sections and keys in a file, with a catalogue's nominal flow in place of a conductance; its
+rest and steady motion, the spool position and pressures at which only the position changes; impossible hardware; and
+the limits where the model ends, end stops and empty chambers.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, ClassVar
+from math import inf
+from typing import Any, ClassVar, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -22,6 +23,7 @@ from pneuopt.dynamics.hooks import (
     LogWarningHook,
     Rest,
     SeparatingRun,
+    ValidityLimit,
     Width,
 )
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
@@ -31,14 +33,7 @@ from pneuopt.models.friction import LOAD_HINTS, FrictionModel, Stribeck, law_inp
 from pneuopt.models.friction_laws import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import LOAD_FORCE, LOAD_KEYS, Load
-from pneuopt.models.pneumatic.chamber import (
-    MIN_CHAMBER_PRESSURE,
-    ChamberModel,
-    Inflow,
-    Polytropic,
-    Surroundings,
-    Thermal,
-)
+from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings, Thermal
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.pneumatic.gas import (
     CRITICAL_RATIO,
@@ -48,16 +43,24 @@ from pneuopt.models.pneumatic.gas import (
     Smoothing,
     conductance_of_nominal_flow,
 )
-from pneuopt.models.pneumatic.limits import check_hardware, check_start, cylinder_limits, position_warning
 from pneuopt.models.pneumatic.log_checks import LinePressureCheck, PressureZeroCheck
 from pneuopt.models.pneumatic.starts import PneumaticStarts
 from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve, Spool
+from pneuopt.models.tolerances import (
+    EMPTY_CHAMBER_RATIO,
+    MAX_COMPRESSION_RATIO,
+    MAX_POSITION_ZERO_ERROR,
+    MAX_STOP_TRAVEL,
+    MIN_CHAMBER_PRESSURE,
+    ROUNDING_FACTOR,
+    STOP_ROUNDING,
+)
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import UnitError, require
+from pneuopt.quantities.errors import HardwareError, UnitError, require
 from pneuopt.quantities.keys import Key, choice, flag, table
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import read_value
+from pneuopt.quantities.units import read_value, write_value
 
 SIDES = ("a", "b")
 PRESSURE_SIGNALS = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
@@ -138,17 +141,24 @@ class PneumaticDrive:
         parameters : ParameterSet
             Missing parameters have their defaults.
         start : mapping of state to value, optional
+            State from which a run begins, if its position is to be checked too.
 
         Raises
         ------
         InputError
             Names parameter, value, source and possible values.
         """
-        defaults = self.parameters
-        used = defaults | parameters.select(n for n in parameters if n in defaults)
-        check_hardware(used)
+        used = self._complete(parameters)
+        for name, limit in _hardware_limits(used).items():
+            if name in used and not limit.allows(used.value(name)):
+                source = f" (source: {used[name].source})" if used[name].source else ""
+                shown = write_value(used.value(name), used[name].unit)
+                raise HardwareError(f"{name} = {shown}{source} is impossible; {limit.remedy}", name, limit.remedy)
         if start is not None:
-            check_start(used, start)
+            stroke, y = used.value("cylinder.stroke"), start.get("position", 0.0)
+            room = MAX_STOP_TRAVEL * stroke  # a piston that presses on a stop is slightly outside
+            shown, end = write_value(y, "m"), write_value(stroke, "m")
+            require(-room <= y <= stroke + room, f"a start at position = {shown} lies outside the stroke, 0 to {end}")
 
     def rest(
         self,
@@ -187,8 +197,7 @@ class PneumaticDrive:
             at this speed.
         """
         self.check(parameters)
-        own = self.parameters
-        used = own | parameters.select(n for n in parameters if n in own)
+        used = self._complete(parameters)
         stroke = used.value("cylinder.stroke")
         y = used.value("cylinder.start") * stroke if position is None else position
         require(0 <= y <= stroke, f"a start at position = {y:g} m lies outside the stroke, 0 to {stroke:g} m")
@@ -213,10 +222,13 @@ class PneumaticDrive:
             A_a (p_a - p_o) - A_b (p_b - p_o) [N], with the noise of the pressures.
         """
         self.check(parameters)
-        own = self.parameters
-        used = own | parameters.select(n for n in parameters if n in own)
+        used = self._complete(parameters)
         numbers = {n: q.value for n, q in used.items()}
         return np.asarray(_air_force(numbers, *(measured[q.name] for q in PRESSURE_SIGNALS)))
+
+    def _complete(self, parameters: ParameterSet) -> ParameterSet:
+        """The drive's own parameters, with defaults for those that are missing."""
+        return self.parameters | parameters.select(n for n in parameters if n in self.parameters)
 
     @cached_property
     def _system(self) -> System:
@@ -260,7 +272,8 @@ class PneumaticDrive:
             "a": [(through.supply_a, outside), (-through.a_exhaust, outside), (leak, ports["b"].temperature)],
             "b": [(through.supply_b, outside), (-through.b_exhaust, outside), (-leak, ports["a"].temperature)],
         }
-        swept = dict(zip(SIDES, (_piston_areas(p)[0] * x["speed"], -_piston_areas(p)[1] * x["speed"]), strict=True))
+        area_a, area_b = areas(p["cylinder.bore"], p["cylinder.rod"])
+        swept = {"a": area_a * x["speed"], "b": -area_b * x["speed"]}
         rates: dict[str, ca.SX] = {}
         for side, volume in zip(SIDES, volumes(x["position"], without_prefix(p, "cylinder")), strict=True):
             around = Surroundings(volume, swept[side], outside, R)
@@ -290,9 +303,7 @@ class PneumaticDrive:
     def _meter_function(self) -> ca.Function:
         """Function ``(t, x, u, p)`` for air from the supply [kg/s], spool position [half travels], air power [W].
 
-        Air power is the work that this air could do in an isothermal expansion to ambient pressure: the integral of
-        p dV of an ideal gas, p V = m R T, per unit time, ``m' R T ln(p_s/p_o)``; its flow exergy at ambient
-        temperature.
+        Air power is the work of this air in an isothermal expansion to ambient pressure, ``m' R T ln(p_s/p_o)``.
         """
         x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
         through = self._edge_flows(x, u, p)
@@ -326,25 +337,23 @@ class PneumaticDrive:
     def _find_rest(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
         known = ("position", "speed", "pressure_b", *names(self.load.outputs))
         others = ", ".join(sorted(outputs.keys() - set(known)))
-        told = f"a cylinder starts from {', '.join(known[:-1])} and {known[-1]}, not from {others}; leave {others} out"
-        require(not others, told)
+        message = (
+            f"a cylinder starts from {', '.join(known[:-1])} and {known[-1]}, not from {others}; leave {others} out"
+        )
+        require(not others, message)
         start = dict(outputs)
         if LOAD_FORCE.name in start:
-            start["position"] = self._pressed_position(parameters, start.pop(LOAD_FORCE.name), "position" in start)
+            force, alone = start.pop(LOAD_FORCE.name), "position" not in start
+            require(alone, "a spring's force says where the piston is; start from load_force or position, not both")
+            used = self._complete(parameters)
+            stiffness = used.value("load.stiffness")
+            require(
+                stiffness > 0, f"load.stiffness is {stiffness:g} N/m: without a spring there is no force to control"
+            )
+            start["position"] = used.value("load.rest_position") + force / stiffness
         return self.rest(parameters, **start)
 
-    def _pressed_position(self, parameters: ParameterSet, force: float, stated: bool) -> float:
-        """Position at which the spring on the load is pressed with a force [N]."""
-        require(not stated, "a spring's force says where the piston is; start from load_force or position, not both")
-        used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
-        stiffness = used.value("load.stiffness")
-        require(stiffness > 0, f"load.stiffness is {stiffness:g} N/m: without a spring there is no force to control")
-        return used.value("load.rest_position") + force / stiffness
 
-
-# factor of a search over the rounding of the valve's edges [1]: a smaller one takes more trials, a larger one leaves
-# out the rounding of a worn valve
-_ROUNDING_FACTOR = 4.0
 _FLOW_PARAMETERS = frozenset({"valve.conductance", "valve.critical_ratio", "supply.pressure", "valve.leak"})
 _FLOW_HINTS = IdentificationHints(
     runs=(
@@ -354,7 +363,7 @@ _FLOW_HINTS = IdentificationHints(
             "log chambers filling up to the supply's pressure and emptying to the ambient's",
         ),
     ),
-    widths=(Width("valve.rounding", _ROUNDING_FACTOR, hides="valve.dead_zone"),),
+    widths=(Width("valve.rounding", ROUNDING_FACTOR, hides="valve.dead_zone"),),
 )
 _AIR_PARAMETERS = ParameterSet(
     {
@@ -374,10 +383,7 @@ _AIR_PARAMETERS = ParameterSet(
 
 
 def _log_warnings(zeros: LogWarningHook, lines: LogWarningHook, logs: Mapping[str, Log]) -> Sequence[str]:
-    """Warnings of impossible positions or, where there are none, of pressures: wrong zero points, or before a line.
-
-    A wrong position gives wrong chamber volumes, from which no zero point of a pressure can be judged.
-    """
+    """Warnings of impossible positions; where there are none, of wrong pressures, which a wrong position would hide."""
     moved = {name: log for name, log in logs.items() if "position" in log.measured}
     found = {name: position_warning(log.parameters, log.measured["position"]) for name, log in moved.items()}
     outside = [f"{name}: {sentence}" for name, sentence in found.items() if sentence]
@@ -388,10 +394,6 @@ def _air_force(p: Mapping[str, Any], a: Any, b: Any) -> Any:
     """Force of the air on the piston [N], from symbols or numbers."""
     area_a, area_b = areas(p["cylinder.bore"], p["cylinder.rod"])
     return area_a * (a - p["ambient.pressure"]) - area_b * (b - p["ambient.pressure"])
-
-
-def _piston_areas(p: Symbols) -> tuple[ca.SX, ca.SX]:
-    return areas(p["cylinder.bore"], p["cylinder.rod"])
 
 
 _CRITICAL_RATIO = "valve.critical_ratio"
@@ -425,16 +427,12 @@ def _build_drive(sections: DriveSections) -> PneumaticDrive:
     options = sections.options("valve")
     valve = ProportionalValve(options["law"](), options["spool"], Smoothing(**options["smoothing"]))
     cylinder, load = Cylinder(**sections.options("cylinder")), Load(**sections.options("load"))
-    return PneumaticDrive(valve, read_friction(sections), load, _read_chamber(sections), cylinder)
-
-
-def _read_chamber(sections: DriveSections) -> ChamberModel:
-    options = sections.options("chamber")
-    if options["model"] is Polytropic:
-        return Polytropic(options["mixed"])
+    air = sections.options("chamber")
+    is_polytropic = air["model"] is Polytropic
     message = f"{sections.place('chamber', 'mixed')}: a thermal chamber has no exponents; leave it out"
-    require(not sections.has("chamber", "mixed"), message)
-    return Thermal()
+    require(is_polytropic or not sections.has("chamber", "mixed"), message)
+    chamber = Polytropic(air["mixed"]) if is_polytropic else Thermal()
+    return PneumaticDrive(valve, read_friction(sections), load, chamber, cylinder)
 
 
 def _read_nominal_flow(entry: Any, values: Mapping[str, float], where: str) -> float:
@@ -478,20 +476,13 @@ PNEUMATIC_KIND = DriveKind(
 
 
 BALANCE_RATES = ("pressure_a", "pressure_b", "speed")
-MAX_COMPRESSION_RATIO = 20.0  # largest chamber pressure over supply pressure [1] that is searched in steady motion
 
 
 @dataclass(frozen=True, eq=False)
 class MotionBalance:
-    """Rates of a drive at a position [m] and speed [m/s] as functions of spool position and pressures.
+    """Rates of a drive at a position [m] and speed [m/s] as functions of spool position and pressures."""
 
-    Attributes
-    ----------
-    function : casadi.Function
-        ``(position, speed, spool, pressure_a, pressure_b, p) -> (BALANCE_RATES; states)``.
-    """
-
-    function: ca.Function
+    function: ca.Function  # (position, speed, spool, pressure_a, pressure_b, p) -> (BALANCE_RATES; states)
     p: Array
     position: float
     speed: float
@@ -528,34 +519,28 @@ class MotionBalance:
 
 
 def solve_steady_motion(glide: MotionBalance, p: ParameterSet, pressure_b: float | None) -> tuple[list[float], float]:
-    """States and valve voltage at which only the position changes.
-
-    Parameters
-    ----------
-    p : ParameterSet
-        All parameters of the drive.
-    pressure_b : float, optional
-        Pressure that a closed valve has trapped [Pa(a)]; chamber a balances it.
-
-    Raises
-    ------
-    InputError
-        If no spool position balances the load, or there is no such motion.
-    """
+    """States and voltage at which only the position changes; pressure_b [Pa(a)], where given, is trapped."""
     if glide.speed:
-        _check_motion(p, glide.speed, pressure_b)
+        verdict = f"no steady motion at speed = {glide.speed:g} m/s: "
+        require(pressure_b is None, verdict + "trapped air (pressure_b) holds a drive still; give only one of the two")
+        spring = p.value("load.stiffness") if "load.stiffness" in p else 0.0
+        require(spring == 0, verdict + f"load.stiffness = {spring:g} N/m pulls more the farther it goes; start at rest")
     if pressure_b is None:
         spool, a, b = _solve_balance(glide, p)
     else:
-        spool, a, b = 0.0, _balance_pressure_a(glide, p, pressure_b), pressure_b
+        spool, b = 0.0, pressure_b
+        require(
+            b > MIN_CHAMBER_PRESSURE,
+            f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {MIN_CHAMBER_PRESSURE:g} Pa",
+        )
+        low, high = p.value("ambient.pressure"), p.value("supply.pressure")
+        at_low, at_high = (glide.rates(spool, a, b)[2] for a in (low, high))
+        a = low - at_low * (high - low) / (at_high - at_low)  # the force is linear in the pressure
+        require(
+            a > MIN_CHAMBER_PRESSURE,
+            f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more",
+        )
     return glide.states(spool, a, b), p.value("valve.centre") + spool * p.value("valve.span")
-
-
-def _check_motion(p: ParameterSet, speed: float, pressure_b: float | None) -> None:
-    verdict = f"no steady motion at speed = {speed:g} m/s: "
-    require(pressure_b is None, verdict + "trapped air (pressure_b) holds a drive still; give only one of the two")
-    spring = p.value("load.stiffness") if "load.stiffness" in p else 0.0
-    require(spring == 0, verdict + f"load.stiffness = {spring:g} N/m pulls more the farther it goes; start at rest")
 
 
 def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float, float]:
@@ -598,22 +583,6 @@ def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float,
     return spool, a, pressure_b_at
 
 
-def _balance_pressure_a(glide: MotionBalance, p: ParameterSet, b: float) -> float:
-    """Pressure in chamber a that balances pressure b; the force is linear in it."""
-    require(
-        b > MIN_CHAMBER_PRESSURE,
-        f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {MIN_CHAMBER_PRESSURE:g} Pa",
-    )
-    low, high = p.value("ambient.pressure"), p.value("supply.pressure")
-    at_low, at_high = (glide.rates(0.0, a, b)[2] for a in (low, high))
-    a = low - at_low * (high - low) / (at_high - at_low)
-    require(
-        a > MIN_CHAMBER_PRESSURE,
-        f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more",
-    )
-    return a
-
-
 def _zero_crossing_or_end(rate: Callable[[float], float], low: float, high: float) -> float:
     """Pressure at which its rate falls through zero; an end of the range where it does not."""
     if rate(high) >= 0:
@@ -623,3 +592,102 @@ def _zero_crossing_or_end(rate: Callable[[float], float], low: float, high: floa
 
 def _brent_root(function: Callable[[float], float], low: float, high: float) -> float:
     return float(brentq(function, low, high, xtol=1e-14 * (high - low), rtol=1e-15))
+
+
+def position_warning(p: ParameterSet, position: Array) -> str:
+    """A sentence on a logged position [m] that is outside the stroke by more than a zero error; else empty."""
+    stroke = p.value("cylinder.stroke")
+    low, high = (float(np.nanpercentile(position, q)) for q in (1, 99))
+    if -MAX_POSITION_ZERO_ERROR * stroke <= low and high <= (1 + MAX_POSITION_ZERO_ERROR) * stroke:
+        return ""
+    where = f"position runs from {write_value(low, 'm')} to {write_value(high, 'm')}"
+    remedy = "check its sign, unit and zero, and cylinder.stroke"
+    return f"{where}, outside the stroke, 0 to {write_value(stroke, 'm')}: {remedy}"
+
+
+def cylinder_limits(stops: bool) -> tuple[ValidityLimit, ...]:
+    """Validity limits that a simulation watches: the ends of the stroke, with stops or not, and empty chambers."""
+    what = "reached the {} end stop" if stops else "left the stroke at the {}"
+    meaning = "the response is the stop's" if stops else "the model, which has no stops, means nothing"
+    margin = STOP_ROUNDING if stops else 0.0
+    ends = [
+        ValidityLimit("position", partial(limit, margin), way, f"the piston {what.format(end)}", meaning)
+        for limit, way, end in ((_rear_limit, -1, "rear"), (_front_limit, 1, "front"))
+    ]
+    meaning = "real seals let air in, the model does not"
+    chambers = [
+        ValidityLimit(f"pressure_{side}", _empty_chamber_pressure, -1, f"chamber {side} was emptied", meaning)
+        for side in SIDES
+    ]
+    return *ends, *chambers
+
+
+# These limits are functions of the module, not lambdas: a system goes to other processes (pickle).
+def _front_limit(margin: float, p: ParameterSet) -> float:
+    return p.value("cylinder.stroke") - margin
+
+
+def _rear_limit(margin: float, p: ParameterSet) -> float:  # noqa: ARG001 - as `_front_limit`
+    return margin
+
+
+def _empty_chamber_pressure(p: ParameterSet) -> float:
+    return EMPTY_CHAMBER_RATIO * p.value("ambient.pressure")
+
+
+class _Limit(NamedTuple):
+    """Possible range of a parameter, with the remedy for a value outside."""
+
+    remedy: str
+    lower: float = -inf
+    upper: float = inf
+    exclusive: bool = True
+
+    def allows(self, value: float) -> bool:
+        return self.lower < value < self.upper or (not self.exclusive and value in (self.lower, self.upper))
+
+
+_POSITIVE_REMEDIES = {
+    "cylinder.bore": "a bore is positive",
+    "cylinder.stroke": "a stroke is positive",
+    "cylinder.dead_volume_a": "ports and hoses always hold some air: a few percent of the swept volume are usual",
+    "cylinder.dead_volume_b": "ports and hoses always hold some air: a few percent of the swept volume are usual",
+    "valve.conductance": "a conductance is positive, about 2e-8 m^3/(s*Pa) for 500 l/min(ANR)",
+    "valve.rounding": "edges are round: 1e-4 is very sharp",
+    "valve.span": "give the voltage of full opening, 5 V for a 0-10 V valve",
+    "valve.bandwidth": "a bandwidth is positive, or take a valve without a lag",
+    "valve.damping": "a damping ratio is positive, 0.5 to 0.8 for most valves",
+    "ambient.temperature": "an absolute temperature is positive",
+    "gas.constant": "air has 287.05 J/(kg*K)",
+    "load.mass": "the piston alone weighs something",
+}
+_NON_NEGATIVE_REMEDIES = {
+    "cylinder.leak": "no leakage is 0",
+    "cylinder.stop_stiffness": "no stop is 0, or Cylinder(stops=False)",
+    "cylinder.stop_damping": "no damping is 0",
+    "valve.leak": "no leakage is 0",
+    "chamber.wall_conductance": "no heat transfer is 0",
+}
+
+
+def _hardware_limits(p: ParameterSet) -> dict[str, _Limit]:
+    bore, ambient = (write_value(p.value(n), p[n].unit) for n in ("cylinder.bore", "ambient.pressure"))
+    exponents = {
+        n: _Limit("1 is isothermal, 1.4 adiabatic", 0.0) for n in p if n.startswith("chamber.") and "exponent" in n
+    }
+    return {
+        **{n: _Limit(remedy, 0.0) for n, remedy in _POSITIVE_REMEDIES.items()},
+        **{n: _Limit(remedy, 0.0, exclusive=False) for n, remedy in _NON_NEGATIVE_REMEDIES.items()},
+        **exponents,
+        "cylinder.rod": _Limit(
+            f"a rod is thinner than the bore, {bore}; rodless is 0", -1e-300, p.value("cylinder.bore")
+        ),
+        "cylinder.start": _Limit("a start lies within the stroke, 0 to 1", 0.0, 1.0, exclusive=False),
+        "valve.critical_ratio": _Limit(
+            "a critical pressure ratio lies between 0 and 1, 0.2 to 0.5 for most valves", -1e-300, 1.0
+        ),
+        "ambient.pressure": _Limit("an absolute pressure is positive; sea level is 101325 Pa(a)", MIN_CHAMBER_PRESSURE),
+        "supply.pressure": _Limit(
+            f"the supply lies above the ambient pressure, {ambient}", p.value("ambient.pressure")
+        ),
+    }

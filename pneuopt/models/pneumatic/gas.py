@@ -27,22 +27,11 @@ CRITICAL_RATIO = (2 / (ISENTROPIC_EXPONENT + 1)) ** (ISENTROPIC_EXPONENT / (ISEN
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Rounding widths of the flow laws.
+    """Rounding widths of the flow laws."""
 
-    Parameters
-    ----------
-    corner : float
-        Rounding of the corner to the choked plateau [-].
-    zero : float
-        Rounding of the square root at zero flow [-]; a chamber's decay rate, and so stiffness, grows with its power
-        -1/2.
-    pressure : float
-        Rounding of the maximum of the two pressures [Pa].
-    """
-
-    corner: float = 0.02
-    zero: float = 1e-3
-    pressure: float = 100.0
+    corner: float = 0.02  # of the corner to the choked plateau [-]
+    zero: float = 1e-3  # of the square root at zero flow [-]; a chamber's decay rate grows with its power -1/2
+    pressure: float = 100.0  # of the maximum of the two pressures [Pa]
 
 
 class FlowLaw(Protocol):
@@ -113,19 +102,9 @@ class IsentropicNozzle:
 
 
 def clip_pressure_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoothing) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Higher pressure, clipped ratio z in (-1, 1) and its rounded magnitude s, which every flow law needs.
+    """Higher pressure [Pa], clipped ratio z in (-1, 1), s = sqrt(z^2 + zero^2), from absolute pressures [Pa].
 
-    Parameters
-    ----------
-    p1, p2 : SX
-        Absolute pressures [Pa]; flow from 1 to 2 is positive.
-    b : SX or float
-        Critical pressure ratio [-], below 1.
-
-    Returns
-    -------
-    tuple of SX
-        p_h [Pa], z [-], s = sqrt(z^2 + zero^2) [-].
+    Flow from 1 to 2 is positive; b is the critical pressure ratio.
 
     Examples
     --------
@@ -140,21 +119,9 @@ def clip_pressure_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoot
 
 
 def conductance_of_area(area: float) -> float:
-    """ISO 6358 conductance of an isentropic orifice.
+    """ISO 6358 conductance C [m^3/(s Pa)] of an isentropic orifice with the effective area C_d A [m^2].
 
-    Parameters
-    ----------
-    area : float
-        Effective area C_d A [m^2].
-
-    Returns
-    -------
-    float
-        C [m^3/(s Pa)] with the same choked mass flow at 293.15 K.
-
-    Notes
-    -----
-    w = C_d A p sqrt(k/(R T)) (2/(k+1))^((k+1)/(2(k-1))) = C rho_0 p sqrt(T_0/T).
+    Same choked flow at 293.15 K: w = C_d A p sqrt(k/(R T)) (2/(k+1))^((k+1)/(2(k-1))) = C rho_0 p sqrt(T_0/T).
 
     Examples
     --------
@@ -167,23 +134,9 @@ def conductance_of_area(area: float) -> float:
 
 
 def conductance_of_nominal_flow(flow: float, b: float = 0.3) -> float:
-    """ISO 6358 conductance of a catalogue's nominal flow, 6 to 5 bar gauge.
+    """ISO 6358 conductance C [m^3/(s Pa)] of a catalogue's nominal flow Q [m^3/s, ANR], 6 to 5 bar gauge.
 
-    Parameters
-    ----------
-    flow : float
-        Q_nN [m^3/s, ANR].
-    b : float
-        Critical pressure ratio [-].
-
-    Returns
-    -------
-    float
-        C [m^3/(s Pa)]
-
-    Notes
-    -----
-    Q = C p_1 sqrt(1 - ((r - b)/(1 - b))^2) at p_1 = 7.013 bar, r = 6.013/7.013.
+    Q = C p_1 sqrt(1 - ((r - b)/(1 - b))^2) at p_1 = 7.013 bar, r = 6.013/7.013; b is the critical pressure ratio.
 
     Examples
     --------

@@ -1,16 +1,14 @@
-"""Check that a log's pressures are those of the chambers, and not of a line before them, by the chambers' mass balance.
+"""Checks of a log's pressures by the mass balance of the chambers: the chambers' or a line's, gauge or absolute.
 
-A sensor at the valve reads the chamber's pressure plus what the line drops, which grows with the flow: it leads the
-chamber. The flow is the valve's in the mass balance itself, so that a drop is tried by taking it off the readings, the
-flow from the corrected pressures again. A sensor's lag has the opposite sign; a valve that is faster than stated, or a
-command that is logged late, looks alike.
+`LinePressureCheck`: a sensor at the valve reads the chamber's pressure plus what the line drops, which grows with the
+flow: it leads the chamber. The flow is the valve's in the mass balance itself, so that a drop is tried by taking it off
+the readings, the flow from the corrected pressures again. A sensor's lag has the opposite sign; a valve that is faster
+than stated, or a command that is logged late, looks alike.
 
-Check that a log's pressures are absolute, by the mass balance of the chambers.
-
-By Boyle's law a moving piston changes a pressure in proportion to its absolute value, and the valve's flow depends on
-the ratio of absolute pressures. A gauge pressure that is read as absolute violates this, whatever the valve's
-conductance and leak. If sensors and supply are all off by an atmosphere, nearly every ratio stays the same; a wrong
-exponent looks alike, so this case is not detected.
+`PressureZeroCheck`: by Boyle's law a moving piston changes a pressure in proportion to its absolute value, and the
+valve's flow depends on the ratio of absolute pressures. A gauge pressure that is read as absolute violates this,
+whatever the valve's conductance and leak. If sensors and supply are all off by an atmosphere, nearly every ratio stays
+the same; a wrong exponent looks alike, so this case is not detected.
 """
 
 import itertools
@@ -24,33 +22,29 @@ import numpy as np
 from pneuopt.dynamics.hooks import Log
 from pneuopt.models.pneumatic.cylinder import volumes
 from pneuopt.models.pneumatic.starts import PRESSURE_NAMES, PneumaticLog, valve_shapes
-from pneuopt.models.starts.friction import filter_channel
+from pneuopt.models.starts import filter_channel
+from pneuopt.models.tolerances import (
+    LEADS,
+    MAX_RESIDUAL_SHARE,
+    MAX_START_SAMPLES,
+    MAX_UNQUESTIONED_SHARE,
+    MAX_WORSE_LEADS,
+    MIN_LOG_DURATION,
+    MIN_RESIDUAL_RATIO,
+    PASSES,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import without_prefix
 from pneuopt.quantities.units import ATMOSPHERE
 
-LEADS = (2e-3, 4e-3, 6e-3, 9e-3, 13e-3, 20e-3, 30e-3, 45e-3)
-"""Times [s] by which a line's drop leads that are tried: shorter ones are a sensor's, longer ones no hose has."""
-PASSES = 3
-"""Times that the flow is found anew from the corrected pressures: with fewer a large drop is half found."""
-MAX_WORSE_LEADS = 2
-"""Leads in a row that are worse than the best at which no longer one is tried: residuals rise from the best lead on (28
-drives of problems/identify/random_plants.py, without a line); fewer trust one residual, more take time."""
-MAX_LINE_RESIDUAL_SHARE = 0.25
-"""Share of a pressure's squared rates that a drop may leave [1]: with more, the model does not fit anyhow."""
+PrepareLogs = Callable[[Mapping[str, Log]], Mapping[str, PneumaticLog]]
 
 
 @dataclass(frozen=True, eq=False)
 class LinePressureCheck:
-    """Log warning hook of a pneumatic drive, for logs with pressures, motion and command.
+    """Log warning hook of a pneumatic drive; `prepare` is `PneumaticStarts.prepare_logs`."""
 
-    Parameters
-    ----------
-    prepare : callable
-        Prepares logs as the start hook does, `PneumaticStarts.prepare_logs`.
-    """
-
-    prepare: Callable[[Mapping[str, Log]], Mapping[str, PneumaticLog]]
+    prepare: PrepareLogs
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """Return a sentence for each log whose chambers' equations hold better behind a line's drop."""
@@ -61,25 +55,19 @@ class LinePressureCheck:
         given = min((self._balance(log, shape) for shape in trial_shapes(log)), key=lambda found: found.residual)
         if given.residual < MAX_UNQUESTIONED_SHARE * given.total:
             return ""
-        lead, best = self._best_lead(log, given)
-        if best.residual > min(given.residual / MIN_RESIDUAL_RATIO**2, MAX_LINE_RESIDUAL_SHARE * best.total):
-            return ""
-        drop = lead * max(float(np.quantile(np.abs(flow), 0.999)) for flow in best.flows)
-        ratio = np.sqrt(given.residual / best.residual)
-        found = f"{name}: the pressures lead the chambers by {1e3 * lead:.2g} ms, as before a line that drops up to "
-        found += f"{drop / 1e5:.2g} bar (their mass balance then leaves {ratio:.1f} times smaller residuals)"
-        return f"{found}: put the sensors at the cylinder, or leave them out; else raise valve.bandwidth"
-
-    def _best_lead(self, log: Log, given: "Balance") -> tuple[float, "Balance"]:
-        """The lead of least residual, and its balance; 0 and the given one where none is better."""
         lead, best, worse = 0.0, given, 0
         for tried in LEADS:
             found = self._behind_line(log, given, tried)
-            is_better = found.residual < best.residual
-            lead, best, worse = (tried, found, 0) if is_better else (lead, best, worse + 1)
+            lead, best, worse = (tried, found, 0) if found.residual < best.residual else (lead, best, worse + 1)
             if worse == MAX_WORSE_LEADS:
                 break
-        return lead, best
+        if best.residual > min(given.residual / MIN_RESIDUAL_RATIO**2, MAX_RESIDUAL_SHARE * best.total):
+            return ""
+        drop = lead * max(float(np.quantile(np.abs(flow), 0.999)) for flow in best.flows)
+        ratio = np.sqrt(given.residual / best.residual)
+        message = f"{name}: the pressures lead the chambers by {1e3 * lead:.2g} ms, as before a line that drops up to "
+        message += f"{drop / 1e5:.2g} bar (their mass balance then leaves {ratio:.1f} times smaller residuals)"
+        return f"{message}: put the sensors at the cylinder, or leave them out; else raise valve.bandwidth"
 
     def _behind_line(self, log: Log, given: "Balance", lead: float) -> "Balance":
         """The balance of the pressures behind a line that leads so much, with its own flow."""
@@ -107,37 +95,15 @@ class LinePressureCheck:
 
 
 class Balance(NamedTuple):
-    """What the chambers' mass balance leaves of the pressures' rates.
+    """What the chambers' mass balance leaves of the pressures' rates."""
 
-    Attributes
-    ----------
-    shape : mapping of str to float
-        Of the valve.
-    channels : tuple of str
-        The logged pressures.
-    residual, total : float
-        Squared residuals and squared rates, summed [Pa^2/s^2].
-    flows : list of ndarray
-        The valve's flow into each chamber, as the rate of its pressure at its mean volume [Pa/s].
-    """
-
-    shape: Mapping[str, float]
-    channels: tuple[str, ...]
-    residual: float
-    total: float
-    flows: list[Array]
+    shape: Mapping[str, float]  # of the valve
+    channels: tuple[str, ...]  # the logged pressures
+    residual: float  # squared residuals, summed [Pa^2/s^2]
+    total: float  # squared rates, summed [Pa^2/s^2]
+    flows: list[Array]  # the valve's flow into each chamber, as the rate of its pressure at its mean volume [Pa/s]
 
 
-PrepareLogs = Callable[[Mapping[str, Log]], Mapping[str, PneumaticLog]]
-# Ratio of residuals by which another zero point must be better to be advised: a smaller one warns of right pressures, a
-# larger one misses wrong ones (tests/models/pneumatic/test_log_checks.py).
-MIN_RESIDUAL_RATIO = 1.5
-# Share of a pressure's squared rates that a zero point may leave without a check of others: a wrong one leaves 0.03 or
-# more (tests/models/pneumatic/test_log_checks.py), a smaller share checks right ones at the cost of time.
-MAX_UNQUESTIONED_SHARE = 0.02
-MAX_RESIDUAL_SHARE = 0.2  # largest such share that an advised zero point may leave: with more, the model does not fit
-MIN_LOG_DURATION = 1.0  # duration from which a log is checked alone as well [s]; shorter ones hold too little motion
-MAX_SAMPLES_PER_LOG = 2000  # samples of a log that are checked; more only cost time
 SUPPLY_PRESSURE = "supply.pressure"
 ATMOSPHERE_ADDED, ATMOSPHERE_TAKEN_OFF = f"{ATMOSPHERE / 1e5:.3f} bar added", f"{ATMOSPHERE / 1e5:.3f} bar taken off"
 
@@ -162,13 +128,7 @@ ZERO_SHIFTS = (
 
 @dataclass(frozen=True, eq=False)
 class PressureZeroCheck:
-    """Log warning hook of a pneumatic drive, for logs with pressures, motion and command.
-
-    Parameters
-    ----------
-    prepare : callable
-        Prepares logs as the start hook does, `PneumaticStarts.prepare_logs`.
-    """
+    """Log warning hook of a pneumatic drive; `prepare` is `PneumaticStarts.prepare_logs`."""
 
     prepare: PrepareLogs
 
@@ -183,9 +143,10 @@ class PressureZeroCheck:
 
     def _doubtful_residuals(self, logs: Mapping[str, Log]) -> dict[str, dict[str, Array]]:
         """Squared rates of each pressure of doubtful logs, and the squared residuals with each shift [Pa^2/s^2]."""
-        spread = {
-            name: {n: _rate_sum_of_squares(log, n) for n in _pressure_channels(log)} for name, log in logs.items()
-        }
+        spread: dict[str, dict[str, float]] = {}
+        for name, log in logs.items():
+            rates = {n: filter_channel(log.measured, n, 1) for n in _pressure_channels(log)}
+            spread[name] = {n: float(np.sum((rate - rate.mean()) ** 2)) for n, rate in rates.items()}
         found = [self._shift_residuals(logs, ZERO_SHIFTS[0])]
         doubtful = {
             name: log
@@ -200,8 +161,14 @@ class PressureZeroCheck:
 
     def _shift_residuals(self, logs: Mapping[str, Log], remedy: ZeroShift) -> dict[str, dict[str, float]]:
         """Squared residuals of each log's pressure rates with shifted zero points [Pa^2/s^2]."""
+        shifted: dict[str, Log] = {}
+        for name, log in logs.items():
+            p, readings = log.parameters, {n: log.measured[n] for n in _pressure_channels(log)}
+            measured = log.measured.with_columns({n: v + remedy.sensors * ATMOSPHERE for n, v in readings.items()})
+            moved = {SUPPLY_PRESSURE: p.value(SUPPLY_PRESSURE) + remedy.supply * ATMOSPHERE}
+            shifted[name] = Log(measured, p.with_bounds(dict.fromkeys(moved, (0.0, math.inf))).with_values(moved))
         left: dict[str, dict[str, float]] = {}
-        for name, run in self.prepare({n: _shift_zero(log, remedy) for n, log in logs.items()}).items():
+        for name, run in self.prepare(shifted).items():
             parts = [run.valve_columns(shape) for shape in trial_shapes(logs[name])]
             left[name] = {
                 n: min(_regression_residual(columns[:, k], wanted[:, k]) for columns, wanted in parts)
@@ -221,32 +188,18 @@ def is_informative(log: Log) -> bool:
 def most_active_part(log: Log) -> Log:
     """Part of a long log in which the pressures change most, which is enough for the check and cheap."""
     data = log.measured
-    if len(data) <= MAX_SAMPLES_PER_LOG:
+    if len(data) <= MAX_START_SAMPLES:
         return log
     path = np.sum(
         [np.abs(filter_channel(data, n, 1)) / float(np.nanmean(data[n])) for n in _pressure_channels(log)], axis=0
     )
-    within = np.convolve(path, np.ones(MAX_SAMPLES_PER_LOG), "valid")
+    within = np.convolve(path, np.ones(MAX_START_SAMPLES), "valid")
     first = int(np.argmax(within))
-    return log._replace(measured=data.rows(first, first + MAX_SAMPLES_PER_LOG))
+    return log._replace(measured=data.rows(first, first + MAX_START_SAMPLES))
 
 
 def _pressure_channels(log: Log) -> list[str]:
     return [n for n in PRESSURE_NAMES if n in log.measured]
-
-
-def _rate_sum_of_squares(log: Log, name: str) -> float:
-    """Sum of the squared deviations of a pressure's rates from their mean."""
-    rates = filter_channel(log.measured, name, 1)
-    return float(np.sum((rates - rates.mean()) ** 2))
-
-
-def _shift_zero(log: Log, remedy: ZeroShift) -> Log:
-    """Log with the zero points shifted by whole atmospheres."""
-    measured, p = log.measured, log.parameters
-    measured = measured.with_columns({n: measured[n] + remedy.sensors * ATMOSPHERE for n in _pressure_channels(log)})
-    moved = {SUPPLY_PRESSURE: p.value(SUPPLY_PRESSURE) + remedy.supply * ATMOSPHERE}
-    return Log(measured, p.with_bounds(dict.fromkeys(moved, (0.0, math.inf))).with_values(moved))
 
 
 def trial_shapes(log: Log) -> Iterator[dict[str, float]]:

@@ -1,14 +1,10 @@
 """Starts of the identification of a `PneumaticDrive` without a guess from the user: equation error on the logs.
 
-States that are not logged (a pressure, the spool, a temperature) are integrated along the logged motion. A logged
-pressure's rate is linear in the valve's conductance and in conductance times leak. Where no pressure is logged, a
-search finds the valve with the best balance of forces. Friction is then the same regression as for a known force (see
-`starts.friction`).
-
-`AirSimulator`: states of a drive that a log lacks, integrated along the logged ones.
-
-With position, speed and command known, the chambers' pressures follow an ODE of their own. It is stable, because a
-chamber forgets its initial pressure through the open edges, and it does not depend on friction.
+States that are not logged (a pressure, the spool, a temperature) are integrated along the logged motion: with position,
+speed and command known, the air follows an ODE of its own (`AirSimulator`). It is stable, because a chamber forgets its
+initial pressure through the open edges, and it does not depend on friction. A logged pressure's rate is linear in the
+valve's conductance and in conductance times leak. Where no pressure is logged, a search finds the valve with the best
+balance of forces. Friction is then the same regression as for a known force (see `models.starts`).
 """
 
 import functools
@@ -26,8 +22,7 @@ from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector, stack
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
-from pneuopt.models.starts.friction import (
-    FILTER_TIMES,
+from pneuopt.models.starts import (
     RegressionRows,
     choose_filter_time,
     filter_channel,
@@ -37,31 +32,27 @@ from pneuopt.models.starts.friction import (
     load_columns,
     per_log_values,
 )
+from pneuopt.models.tolerances import (
+    CENTRE_SHIFTS,
+    CONDUCTANCE_FACTORS,
+    FILTER_TIMES,
+    GRID_REFINEMENTS,
+    LEAK_GRID,
+    MAX_INTEGRATION_STEP,
+    MAX_USUAL_STEPS,
+    MIN_LEAK,
+    REFINEMENT_STEPS,
+    VALVE_SHAPE_GRID,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 PRESSURE_NAMES = ("pressure_a", "pressure_b")
-# Largest step [s]: a chamber of a few cm^3 at the end of its stroke has a time constant of 1e-4 s, which a larger step
-# makes unstable; smaller ones cost time in proportion.
-MAX_INTEGRATION_STEP = 5e-5
-# Usual steps [1] of a log that the air is followed over from sample to sample: more cost a hole of seconds thousands of
-# integration steps at every sample, fewer cut short a log that lost some samples.
-MAX_USUAL_STEPS = 20
 
 
 class AirSimulator:
-    """Compiled integration of a pneumatic drive along given states.
-
-    Friction's states stay at zero, since the air does not depend on them.
-
-    Parameters
-    ----------
-    system : System
-        A pneumatic drive's system.
-    given_states : sequence of str
-        Names of the states that are given; position and speed at least.
-    """
+    """Compiled integration of a pneumatic drive along given states, position and speed at least, without friction's."""
 
     def __init__(self, system: System, given_states: Sequence[str]) -> None:
         self.given_states = tuple(given_states)
@@ -82,35 +73,25 @@ class AirSimulator:
         self._rollout = Rollout(Pieces(discretise(inner).step))
 
     def simulate_states(self, given: Trajectory, sets: Sequence[ParameterSet]) -> list[dict[str, Array]]:
-        """States that are not given, for each of several parameter sets; pressures start between ambient and supply.
-
-        Parameters
-        ----------
-        given : Trajectory
-            The drive's inputs, held over each sample, and the given states, linear in between.
-
-        Returns
-        -------
-        list of dict
-            Arrays of shape (n,) by state, for each parameter set.
-        """
+        """States that are not given, arrays (n,) by name, by parameter set; pressures start amid ambient and supply."""
         u = given.matrix(self._inputs)
         inner = [i for i, n in enumerate(self._inputs) if n in self.given_states]
         u[:-1, inner] = (u[:-1, inner] + u[1:, inner]) / 2
         h = np.append(np.diff(given.t), 0.0)
         h = np.minimum(h, MAX_USUAL_STEPS * np.median(h))  # behind a hole of the log the air soon forgets its start
-        x0 = np.array([[self._initial_value(q.name, p) for q in self.states] for p in sets]).reshape(len(sets), -1)
+        x0 = np.zeros((len(sets), len(self.states)))
+        for row, p in zip(x0, sets, strict=True):
+            for k, name in enumerate(names(self.states)):
+                if name in PRESSURE_NAMES:
+                    row[k] = (p.value("supply.pressure") + p.value("ambient.pressure")) / 2
+                elif name.startswith("temperature"):
+                    row[k] = p.value("ambient.temperature")
         substeps = max(1, math.ceil(float(h.max()) / MAX_INTEGRATION_STEP))
         x = self._roll_out(x0, u, sets, (given.t, h), substeps, states=True)
         return [dict(zip(names(self.states), columns.T, strict=True)) for columns in x]
 
     def pressure_rates(self, given: Trajectory, sets: Sequence[ParameterSet]) -> Array:
-        """Rates of both pressures at every sample [Pa/s], for each of several parameter sets; every state is given.
-
-        Returns
-        -------
-        ndarray, shape (len(sets), n, 2)
-        """
+        """Rates of both pressures at every sample [Pa/s], shape (len(sets), n, 2); every state is given."""
         still = (given.t, np.zeros_like(given.t))
         return self._roll_out(np.empty((len(sets), 0)), given.matrix(self._inputs), sets, still, 1, states=False)
 
@@ -131,32 +112,11 @@ class AirSimulator:
             run = self._rollout.run(x0, inputs, p, t, h, substeps=substeps, states=states)
         return run.y if run.x is None else run.x
 
-    def _initial_value(self, name: str, p: ParameterSet) -> float:
-        if name in PRESSURE_NAMES:
-            return (p.value("supply.pressure") + p.value("ambient.pressure")) / 2
-        return p.value("ambient.temperature") if name.startswith("temperature") else 0.0
-
 
 ValveValues = Mapping[str, float]
 AirForce = Callable[[Mapping[str, Any], Any, Any], Any]
 VALVE_CONDUCTANCE, VALVE_LEAK = "valve.conductance", "valve.leak"
-# Values of the valve's shape that are tried where they are free [1].
-VALVE_SHAPE_GRID = {"valve.critical_ratio": (0.15, 0.3, 0.45), "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2)}
 CENTRE, SPAN = "valve.centre", "valve.span"
-CENTRE_SHIFTS = (-0.02, 0.0, 0.02)  # that are tried where the centre is free [half travels]
-LEAK_GRID = (0.003, 0.01, 0.03, 0.1)  # leaks that are tried where no pressure is logged [1]
-CONDUCTANCE_FACTORS = 2.0 ** np.arange(-1, 5)  # conductances tried there, over `PneumaticLog.min_conductance`
-MIN_LEAK = 1e-4  # least leak of a start [1]: at zero the search would begin on a bound
-# First steps of the refinement: factors on conductance and leak, then differences of critical ratio, dead zone [1] and
-# centre [V].
-REFINEMENT_STEPS = {
-    VALVE_CONDUCTANCE: 1.4,
-    VALVE_LEAK: 1.8,
-    "valve.critical_ratio": 0.08,
-    "valve.dead_zone": 0.02,
-    CENTRE: 0.1,
-}
-GRID_REFINEMENTS = 5  # refinements, each with half the step of the last
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,18 +125,11 @@ class PneumaticStarts:
 
     For a log without position, the position is the integral of the speed from cylinder.start of the stroke. The fit
     corrects that start, which the air in both chambers determines (from 20 mm off in 200 mm it did).
-
-    Parameters
-    ----------
-    system : callable
-        Returns the drive's System, which holds this hook and is therefore not held here.
-    air_force : callable
-        Maps the parameters and both pressures [Pa] to the force of the air on the piston [N].
     """
 
-    system: Callable[[], System]
+    system: Callable[[], System]  # the drive's, which holds this hook and is therefore not held here
     friction: FrictionModel
-    air_force: AirForce
+    air_force: AirForce  # (parameters, both pressures [Pa]) -> force of the air on the piston [N]
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates with one valve, and with friction for each scanned Stribeck velocity."""
@@ -222,7 +175,11 @@ class PneumaticLog:
         self._air_by_centre: dict[float, dict[str, Array]] = {}
         position, speed, self._acceleration = filter_motion(self.measured, window)
         if "position" not in self.measured:
-            position = position + self._start_position(position)
+            # from cylinder.start, or the nearest position that keeps the travel within the stroke
+            stroke = self.parameters.value("cylinder.stroke")
+            lowest, highest = -float(position.min()), stroke - float(position.max())
+            start = max(self.parameters.value("cylinder.start") * stroke, lowest)
+            position = position + min(start, max(lowest, highest))
         self.logged_pressures = tuple(n for n in PRESSURE_NAMES if n in self.measured)
         self.known_states = {
             "position": position,
@@ -230,12 +187,6 @@ class PneumaticLog:
             **{n: filter_channel(self.measured, n, 0, window) for n in self.logged_pressures},
         }
         self._known_signals = self.measured.select(["valve_voltage"]).with_columns(self.known_states)
-
-    def _start_position(self, travel: Array) -> float:
-        """Initial position of a log without position [m]: cylinder.start, or the nearest that stays in the stroke."""
-        stroke = self.parameters.value("cylinder.stroke")
-        lowest, highest = -float(travel.min()), stroke - float(travel.max())
-        return min(max(self.parameters.value("cylinder.start") * stroke, lowest), max(lowest, highest))
 
     def force_balance(self, valve: ValveValues) -> RegressionRows:
         """Rows for the regression of friction, with this valve."""
@@ -257,27 +208,21 @@ class PneumaticLog:
         return RegressionRows(measured, self.parameters, states["speed"], force, columns, states)
 
     def valve_columns(self, shape: ValveValues) -> tuple[Array, Array]:
-        """Regression of the m logged pressures' rates on conductance, and conductance times leak.
-
-        Returns
-        -------
-        columns : ndarray, shape (n, m, 2)
-        rates : ndarray, shape (n, m)
-            Logged rates less those with a closed valve [Pa/s].
-        """
+        """Columns (n, m, 2) of conductance and its product with leak in a regression on m pressures' rates (n, m)."""
         unit, leak = 1e-8, 0.01  # the rates are linear in both, so any two values give the columns
         probes = [{**shape, VALVE_CONDUCTANCE: c, VALVE_LEAK: x} for c, x in ((1e-12, 0.0), (unit, 0.0), (unit, leak))]
-        air = self._air_states(shape.get(CENTRE, self.parameters.value(CENTRE)))
-        closed, edges, leaking = self._pressure_rates(probes, air)
+        # the states that are not logged, with the other given values, depend on the centre, which the spool follows
+        centre = shape.get(CENTRE, self.parameters.value(CENTRE))
+        if centre not in self._air_by_centre:
+            self._air_by_centre[centre] = self._simulate_air([{CENTRE: centre}])[0]
+        air = self._air_by_centre[centre]
+        given = self._known_signals.with_columns(air)
+        simulator = self._simulator_for((*self.known_states, *air))
+        which = [PRESSURE_NAMES.index(n) for n in self.logged_pressures]
+        closed, edges, leaking = simulator.pressure_rates(given, self._with_valves(probes))[:, :, which]
         columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
         rates = [filter_channel(self.measured, n, 1, self._window) for n in self.logged_pressures]
         return columns, np.column_stack(rates) - closed
-
-    def _pressure_rates(self, valves: Sequence[ValveValues], air: Mapping[str, Array]) -> Array:
-        """Rates of the logged pressures with each of several valves [Pa/s], shape (len(valves), n, m)."""
-        given = self._known_signals.with_columns(air)
-        rates = self._simulator_for((*self.known_states, *air)).pressure_rates(given, self._with_valves(valves))
-        return rates[:, :, [PRESSURE_NAMES.index(n) for n in self.logged_pressures]]
 
     def min_conductance(self) -> float:
         """Conductance of a choked edge that feeds the fastest motion at half the supply pressure [m^3/(s*Pa)]."""
@@ -285,12 +230,6 @@ class PneumaticLog:
         gas = self.parameters.value("gas.constant") * self.parameters.value("ambient.temperature")
         area = math.pi / 4 * self.parameters.value("cylinder.bore") ** 2
         return max(area * fastest * 0.5 / (REFERENCE_DENSITY * gas), 1e-10)
-
-    def _air_states(self, centre: float) -> dict[str, Array]:
-        """States that are not logged, with this centre, which the spool follows, and the other given values."""
-        if centre not in self._air_by_centre:
-            self._air_by_centre[centre] = self._simulate_air([{CENTRE: centre}])[0]
-        return self._air_by_centre[centre]
 
     def _simulate_air(self, valves: Sequence[ValveValues]) -> list[dict[str, Array]]:
         return self._simulator_for(tuple(self.known_states)).simulate_states(
@@ -327,9 +266,14 @@ def _estimate_valve(friction: FrictionModel, runs: Mapping[str, PneumaticLog]) -
         )
         return best | _fit_valve_to_pressures(runs, free, best)[0]
     needed = max(run.min_conductance() for run in runs.values())
-    tried = {VALVE_CONDUCTANCE: tuple(needed * CONDUCTANCE_FACTORS), VALVE_LEAK: LEAK_GRID}
+    tried = {VALVE_CONDUCTANCE: tuple(needed * factor for factor in CONDUCTANCE_FACTORS), VALVE_LEAK: LEAK_GRID}
     tried = {n: tried.get(n, (parameters.value(n),)) for n in free}
-    return _search_values(tried, parameters, lambda values: _force_misfits(friction, runs, values))
+
+    def force_misfits(valves: Sequence[ValveValues]) -> list[float]:
+        balances = {name: run.force_balances(valves) for name, run in runs.items()}
+        return [force_misfit(friction, {name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]
+
+    return _search_values(tried, parameters, force_misfits)
 
 
 def _search_values(
@@ -366,28 +310,16 @@ def _fit_valve_to_pressures(
     parts = [run.valve_columns(shape) for run in runs.values() if run.logged_pressures]
     A = np.concatenate([columns.reshape(-1, 2) for columns, _ in parts])
     y = np.concatenate([rates.ravel() for _, rates in parts])
-    known, basis = _affine_basis(
-        parameters.value(VALVE_CONDUCTANCE), parameters.value(VALVE_LEAK), VALVE_CONDUCTANCE in free, VALVE_LEAK in free
-    )
+    conductance, leak = parameters.value(VALVE_CONDUCTANCE), parameters.value(VALVE_LEAK)
+    # the vector (C, C * leak) as a known part and a basis for the free part
+    if VALVE_CONDUCTANCE in free:
+        known, basis = np.zeros(2), np.eye(2) if VALVE_LEAK in free else np.array([[1.0], [leak]])
+    elif VALVE_LEAK in free:
+        known, basis = np.array([conductance, 0.0]), np.array([[0.0], [conductance]])
+    else:
+        known, basis = np.array([conductance, conductance * leak]), np.empty((2, 0))
     known = known + basis @ np.linalg.lstsq(A @ basis, y - A @ known, rcond=None)[0]
     leak = float(known[1] / known[0]) if known[0] > 0 else 0.0
     found = {VALVE_CONDUCTANCE: float(known[0]), VALVE_LEAK: max(leak, MIN_LEAK)}
     values = {n: float(np.clip(v, parameters[n].lower, parameters[n].upper)) for n, v in found.items() if n in free}
     return values, float(np.sum((y - A @ known) ** 2))
-
-
-def _affine_basis(conductance: float, leak: float, conductance_free: bool, leak_free: bool) -> tuple[Array, Array]:
-    """Vector (C, C * leak) as a known part and a basis for the free part."""
-    if conductance_free:
-        return np.zeros(2), np.eye(2) if leak_free else np.array([[1.0], [leak]])
-    if leak_free:
-        return np.array([conductance, 0.0]), np.array([[0.0], [conductance]])
-    return np.array([conductance, conductance * leak]), np.empty((2, 0))
-
-
-def _force_misfits(
-    friction: FrictionModel, runs: Mapping[str, PneumaticLog], valves: Sequence[ValveValues]
-) -> list[float]:
-    """Misfit of the force balance with each of several valves [N]."""
-    balances = {name: run.force_balances(valves) for name, run in runs.items()}
-    return [force_misfit(friction, {name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]

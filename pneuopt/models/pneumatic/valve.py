@@ -112,9 +112,12 @@ class ProportionalValve:
         """Mass flows [kg/s] at a spool position [1]."""
 
         def edge_flow(upstream: Port, downstream: Port, x: ca.SX) -> ca.SX:
-            scale = p["conductance"] * REFERENCE_DENSITY * opening(x, p)
-            cooling = ca.sqrt(REFERENCE_TEMPERATURE / self._upstream_temperature(upstream, downstream))
-            return scale * cooling * self.law.flow(upstream.pressure, downstream.pressure, p, self.smoothing)
+            # the air has the temperature of the port with the higher pressure, smooth in between
+            fall = upstream.pressure - downstream.pressure
+            share = (1 + fall / ca.sqrt(fall**2 + self.smoothing.pressure**2)) / 2
+            temperature = downstream.temperature + (upstream.temperature - downstream.temperature) * share
+            scale = p["conductance"] * REFERENCE_DENSITY * opening(x, p) * ca.sqrt(REFERENCE_TEMPERATURE / temperature)
+            return scale * self.law.flow(upstream.pressure, downstream.pressure, p, self.smoothing)
 
         return Flows(
             edge_flow(supply, a, spool),
@@ -123,27 +126,9 @@ class ProportionalValve:
             edge_flow(b, exhaust, spool),
         )
 
-    def _upstream_temperature(self, one: Port, two: Port) -> ca.SX:
-        """Temperature of the port with the higher pressure, smooth in between."""
-        fall = one.pressure - two.pressure
-        share = (1 + fall / ca.sqrt(fall**2 + self.smoothing.pressure**2)) / 2
-        return two.temperature + (one.temperature - two.temperature) * share
-
 
 def opening(x: ca.SX, p: Symbols) -> ca.SX:
-    """Opening of one edge as a fraction of the full one; see `ProportionalValve`.
-
-    Parameters
-    ----------
-    x : SX or float
-        Spool position towards this edge's opening [1].
-    p : mapping
-        dead_zone, rounding, leak [1].
-
-    Returns
-    -------
-    SX or float
-        [1], positive.
+    """Opening of one edge, a positive fraction of the full one, at a spool position x [1] towards it.
 
     Examples
     --------

@@ -1,9 +1,8 @@
 """Starts of an identification of friction without a guess from the user: equation error on the filtered log.
 
 A drive's force is linear in its parameters, except a few that the law scans, such as the Stribeck velocity. So each of
-a few values gives a candidate by one bounded linear least squares, in milliseconds. The law declares this (`start`).
-
-Filtered motion and channels of a log, from which the starts of an identification read states and rates.
+a few values gives a candidate by one bounded linear least squares, in milliseconds. The law declares this (`start`). At
+the end stands the filter that gives motion and channels of a log with their rates.
 """
 
 import functools
@@ -19,54 +18,40 @@ from scipy.signal import savgol_filter
 from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.models.friction import FrictionModel, FrictionSamples, FrictionStart, law_inputs
 from pneuopt.models.load import GRAVITY
+from pneuopt.models.tolerances import (
+    FILTER_TIMES,
+    MAX_JITTER,
+    MAX_START_SAMPLES,
+    MIN_BALANCE_GAIN,
+    MIN_LEVEL_EXCESS,
+    PRESLIDING_DEFLECTIONS,
+    RIDGE_WEIGHT,
+    SLIDING_SPEED,
+    SLOW_SPEED,
+    STATIC_QUANTILE,
+    STATIC_WEIGHT,
+    STUCK_WEIGHT,
+    USUAL_SMOOTHING,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-# Unexplained share of the force over that with a longer window [1] below which the shorter one is taken: a higher ratio
-# takes chance for a better balance, a lower one keeps slips flattened.
-MIN_BALANCE_GAIN = 0.85
-# Speed above which a sample shows sliding friction [m/s]: below a smaller one the drive sticks, a larger one drops the
-# Stribeck curve.
-SLIDING_SPEED = 4e-3
-# Ridge on columns of unit length, which splits what no row separates: for motion one way, Coulomb friction and a
-# constant force. A larger one biases the other parameters, a smaller one leaves the split to rounding.
-RIDGE_WEIGHT = 1e-2
-# Least excess of a level (static) over the one below it (Coulomb), as a fraction of that one: with less, a search
-# starts without a Stribeck curve and finds none.
-MIN_LEVEL_EXCESS = 0.03
-DEFAULT_SMOOTHING = 1e-3  # speed over which the sign of the speed turns, for laws without a smoothing parameter [m/s]
-MAX_VALVE_SAMPLES = 2000  # approximate samples of a log from which a valve is estimated; more only cost time
-# Travel since the last reversal within which bristles still bend, in bristle deflections: with a smaller one,
-# presliding counts as sliding; a larger one drops sliding samples.
-PRESLIDING_DEFLECTIONS = 3.0
-SLOW_SPEED = 1e-2  # speed below which friction is near its static level and bristles still bend [m/s]
-STATIC_QUANTILE = 0.995  # quantile of the force in slow samples that counts as static friction; 1 would be an outlier
-STATIC_WEIGHT = 0.003  # squared weight of that sample, in sliding samples; with more it bends the whole curve
-STUCK_WEIGHT = 10.0  # the same where nothing slides: with less, presliding counts as friction that hardly holds
-
 
 def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
-    """Starts of a `ForceDrive`: states from the filtered logs, parameters from M a + F_f(v) + F_L = F.
+    """Starts of a `ForceDrive`: states from the filtered logs, parameters from M a + F_f(v) + F_L = F."""
 
-    Raises
-    ------
-    LogError
-        If a log has neither position nor speed.
-    """
-    filtered = functools.cache(functools.partial(_force_balances, logs))
-    return friction_candidates(friction, filtered(choose_filter_time(friction, filtered)))
+    @functools.cache
+    def balances(window: float) -> dict[str, RegressionRows]:
+        rows = {}
+        for name, (measured, parameters, _) in logs.items():
+            position, speed, acceleration = filter_motion(measured, window)
+            columns, states = load_columns(parameters, position, acceleration), {"position": position, "speed": speed}
+            rows[name] = RegressionRows(measured, parameters, speed, measured["force"], columns, states)
+        return rows
 
-
-def _force_balances(logs: Mapping[str, Log], window: float) -> dict[str, "RegressionRows"]:
-    """The rows of logs of a force, filtered with a window [s]."""
-    rows = {}
-    for name, (measured, parameters, _) in logs.items():
-        position, speed, acceleration = filter_motion(measured, window)
-        columns, states = load_columns(parameters, position, acceleration), {"position": position, "speed": speed}
-        rows[name] = RegressionRows(measured, parameters, speed, measured["force"], columns, states)
-    return rows
+    return friction_candidates(friction, balances(choose_filter_time(friction, balances)))
 
 
 def motion_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
@@ -105,9 +90,11 @@ class RegressionRows:
 
 def friction_candidates(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> Sequence[Start]:
     """Starts from the rows of all logs, one for each set of values of the parameters that the law scans."""
-    parameters = next(iter(logs.values())).parameters
-    tried = _scanned_values(friction.start, parameters)
-    return Starts([functools.partial(_candidate, friction, logs, parameters, values) for values in tried])
+    parameters, scanned = next(iter(logs.values())).parameters, friction.start.scanned
+    free = {n: parameters[f"friction.{n}"] for n in scanned if f"friction.{n}" in parameters.free_names}
+    tried = [dict.fromkeys(np.clip(scanned[n], p.lower, p.upper).tolist()) for n, p in free.items()]
+    sets = [dict(zip(free, values, strict=True)) for values in itertools.product(*tried)]
+    return Starts([functools.partial(_candidate, friction, logs, parameters, values) for values in sets])
 
 
 def _candidate(
@@ -129,32 +116,30 @@ def _candidate(
 
 
 def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:
-    """Mean absolute force in sliding samples that friction does not explain [N]."""
-    thinned = {name: _thin_rows(rows) for name, rows in logs.items()}
+    """Mean absolute force in sliding samples that friction does not explain [N]; of long logs, some samples tell."""
+    thinned = {}
+    for name, rows in logs.items():
+        every = slice(None, None, max(1, len(rows.measured) // MAX_START_SAMPLES))
+        measured = Trajectory(rows.measured.t[every], {n: rows.measured[n][every] for n in rows.measured})
+        columns, states = ({n: c[every] for n, c in part.items()} for part in (rows.columns, rows.states))
+        speed, force = rows.speed[every], rows.force[every]
+        thinned[name] = RegressionRows(measured, rows.parameters, speed, force, columns, states)
     if not all(np.isfinite(rows.force).all() for rows in thinned.values()):
         return math.inf
     return _unexplained_force(friction, thinned)[0]
 
 
 def choose_filter_time(friction: FrictionModel, balances: Callable[[float], Mapping[str, RegressionRows]]) -> float:
-    """The window of the filter with which the least share of the force stays unexplained [s].
+    """The longest window of the filter [s], unless a shorter one leaves clearly less of the force unexplained.
 
-    Parameters
-    ----------
-    balances : callable
-        Returns the rows of the logs that are filtered with a window [s].
-
-    Returns
-    -------
-    float
-        The longest one, unless a shorter one leaves clearly less; none is tried after one that leaves no less.
+    `balances` gives the rows of the logs that are filtered with a window [s].
     """
     chosen, left, least = FILTER_TIMES[0], math.inf, math.inf
     for window in FILTER_TIMES:
         unexplained, force = _unexplained_force(friction, balances(window))
         share = unexplained / max(force, np.finfo(float).tiny)
         if not share < least:
-            break
+            break  # no shorter one is tried after one that leaves no less
         least = share
         if share < MIN_BALANCE_GAIN * left:
             chosen, left = window, share
@@ -169,40 +154,18 @@ def _unexplained_force(friction: FrictionModel, logs: Mapping[str, RegressionRow
     return float(np.mean(np.abs(unexplained))), float(np.mean(np.abs(force)))
 
 
-def _scanned_values(start: FrictionStart, parameters: ParameterSet) -> list[dict[str, float]]:
-    """Sets of values to try of the free scanned parameters, within their bounds."""
-    free = {n: parameters[f"friction.{n}"] for n in start.scanned if f"friction.{n}" in parameters.free_names}
-    tried = [dict.fromkeys(np.clip(start.scanned[n], p.lower, p.upper).tolist()) for n, p in free.items()]
-    return [dict(zip(free, values, strict=True)) for values in itertools.product(*tried)]
-
-
 def per_log_values(name: str, value: float, logs: Mapping[str, ParameterSet]) -> dict[str, float]:
     """Start value of a parameter, one for each log where the parameter is `per_log`."""
     per_log = any(parameters[name].per_log for parameters in logs.values())
-    return (
-        {f"{name}[{log}]": value for log, parameters in logs.items() if parameters[name].free}
-        if per_log
-        else {name: value}
-    )
-
-
-def _thin_rows(rows: RegressionRows) -> RegressionRows:
-    """Rows of about `MAX_VALVE_SAMPLES` samples at most."""
-    every = slice(None, None, max(1, len(rows.measured) // MAX_VALVE_SAMPLES))
-    measured = Trajectory(rows.measured.t[every], {n: rows.measured[n][every] for n in rows.measured})
-    columns, states = ({n: c[every] for n, c in part.items()} for part in (rows.columns, rows.states))
-    return replace(
-        rows, measured=measured, speed=rows.speed[every], force=rows.force[every], columns=columns, states=states
-    )
+    if not per_log:
+        return {name: value}
+    return {f"{name}[{log}]": value for log, parameters in logs.items() if parameters[name].free}
 
 
 def _regress(
     friction: FrictionModel, logs: Mapping[str, RegressionRows], parameters: ParameterSet, tried: Mapping[str, float]
 ) -> tuple[dict[str, float], Array, Array]:
-    """Bounded robust least squares over all logs' sliding samples: the values, their residuals and forces [N].
-
-    Where nothing slides, friction is its static level, and the samples tell of little else.
-    """
+    """Bounded robust least squares over all logs' sliding samples: the values, their residuals and forces [N]."""
     parts = [_log_columns(friction, name, rows, tried) for name, rows in logs.items()]
     free = list(dict.fromkeys(n for columns, _ in parts for n in columns))
     A = np.vstack(
@@ -223,10 +186,13 @@ def _regress(
         return {}, y[rows], y[rows]
     bases = {n: parameters[n.split("[")[0]] for n in free}
     lower, upper = _regression_bounds(friction.start, bases, float(np.median(np.abs(y[rows]))))
-    if not slides:  # nothing tells static friction from Coulomb's
+    if not slides:  # friction is its static level, and nothing tells that from Coulomb's
         upper = np.where(np.isin([n.split("[")[0] for n in free], _excesses(friction.start)), lower + 1e-9, upper)
     weight = math.sqrt((STATIC_WEIGHT if slides else STUCK_WEIGHT) * np.count_nonzero(rows))
-    stuck = [(_coefficient_row(columns, free), level) for columns, level in _static_levels(friction, logs, tried)]
+    stuck = [
+        (np.array([columns.get(n, 0.0) for n in free]), level)
+        for columns, level in _static_levels(friction, logs, tried)
+    ]
     given = np.array([row for row, _ in stuck]).reshape(-1, len(free)), np.array([level for _, level in stuck])
     x = _robust_least_squares(A[rows], y[rows], lower, upper, (weight * given[0], weight * given[1]))
     values = _raise_levels(friction.start, dict(zip(free, x.tolist(), strict=True)), parameters)
@@ -244,10 +210,6 @@ def _raise_levels(start: FrictionStart, values: dict[str, float], parameters: Pa
         below = values.get(f"{base}[{log}", usual) if log else usual
         out[name] = below + max(values[name], MIN_LEVEL_EXCESS * below)
     return out
-
-
-def _coefficient_row(columns: Mapping[str, float], free: Sequence[str]) -> Array:
-    return np.array([columns.get(n, 0.0) for n in free])
 
 
 def _static_levels(
@@ -270,10 +232,17 @@ def _log_columns(
 ) -> tuple[dict[str, Array], Array]:
     """Columns of a log's free parameters ("name[log]" if per log), and its force less the terms of fixed ones.
 
-    For `stuck` see `_friction_columns`.
+    With `stuck`, the sign of the force that pulls, friction has its static level, whatever the filtered speed.
     """
-    p = rows.parameters
-    columns = {n: c for n, c in {**rows.columns, **_friction_columns(friction, rows, tried, stuck)}.items() if n in p}
+    p, speed = rows.parameters, rows.speed
+    values = {n: p.value(f"friction.{n}") for n in friction.parameters} | dict(tried)
+    signals = {**{n: rows.measured[n] for n in rows.measured}, "force": rows.force}
+    inputs = law_inputs(friction, signals, {n: p.value(n) for n in p if n.startswith("ambient.")})
+    samples = FrictionSamples(speed, np.tanh(speed / values.get("smoothing", USUAL_SMOOTHING)), speed, inputs, values)
+    if stuck is not None:
+        samples = replace(samples, side=stuck, level_speed=np.zeros_like(speed))
+    columns = {n: c for n, c in rows.columns.items() if n in p}
+    columns |= {f"friction.{n}": c for n, c in friction.start.columns(samples).items() if f"friction.{n}" in p}
     known = {n: p.value(n) for n in columns}
     for level, base in ((f"friction.{n}", f"friction.{below}") for n, below in friction.start.above.items()):
         known[level] -= p.value(base)
@@ -285,23 +254,6 @@ def _log_columns(
         (known[n] * c for n, c in columns.items() if not p[n].free), start=np.zeros(len(rows.force))
     )
     return {f"{n}[{name}]" if p[n].per_log else n: c for n, c in columns.items() if p[n].free}, target
-
-
-def _friction_columns(
-    friction: FrictionModel, rows: RegressionRows, tried: Mapping[str, float], stuck: Array | None = None
-) -> dict[str, Array]:
-    """Regression columns of the friction parameters.
-
-    With `stuck`, the sign of the force that pulls, friction has its static level, whatever the filtered speed.
-    """
-    p, speed = rows.parameters, rows.speed
-    values = {n: p.value(f"friction.{n}") for n in friction.parameters} | dict(tried)
-    signals = {**{n: rows.measured[n] for n in rows.measured}, "force": rows.force}
-    inputs = law_inputs(friction, signals, {n: p.value(n) for n in p if n.startswith("ambient.")})
-    samples = FrictionSamples(speed, np.tanh(speed / values.get("smoothing", DEFAULT_SMOOTHING)), speed, inputs, values)
-    if stuck is not None:
-        samples = replace(samples, side=stuck, level_speed=np.zeros_like(speed))
-    return {f"friction.{n}": c for n, c in friction.start.columns(samples).items()}
 
 
 def _robust_least_squares(
@@ -347,7 +299,11 @@ def _bristle_deflections(
         return {}
     parameters = next(iter(logs.values())).parameters
     law = {n: values.get(f"friction.{n}", parameters.value(f"friction.{n}")) for n in friction.parameters}
-    forces = {n: _friction_force(n, rows, values) for n, rows in logs.items()}
+    forces = {}
+    for n, rows in logs.items():  # less those of inertia, load and offsets [N]
+        p, columns = rows.parameters, {c: column for c, column in rows.columns.items() if c in rows.parameters}
+        terms = (values.get(c, values.get(f"{c}[{n}]", p.value(c))) * column for c, column in columns.items())
+        forces[n] = np.asarray(rows.force - sum(terms))
     name = f"friction.{bristles.stiffness}"
     stiffness = parameters[name]
     if stiffness.free:
@@ -367,12 +323,10 @@ def _presliding_slope(logs: Mapping[str, RegressionRows], friction: Mapping[str,
         rate.append(np.gradient(friction[n], rows.measured.t)[presliding])
         speed.append(rows.speed[presliding])
     v = np.concatenate(speed)
+    if not v.size:
+        return 0.0
     # a step of the force, or the log's edge, is no presliding: the robust weights suppress it
-    return (
-        float(_robust_least_squares(v[:, None], np.concatenate(rate), np.zeros(1), np.full(1, np.inf))[0])
-        if v.size
-        else 0.0
-    )
+    return float(_robust_least_squares(v[:, None], np.concatenate(rate), np.zeros(1), np.full(1, np.inf))[0])
 
 
 def _distance_since_reversal(rows: RegressionRows) -> Array:
@@ -381,22 +335,6 @@ def _distance_since_reversal(rows: RegressionRows) -> Array:
     path = np.concatenate([[0.0], np.cumsum(np.abs(v[1:] + v[:-1]) / 2 * step)])
     turns = np.append(False, np.diff(np.sign(v)) != 0)
     return np.asarray(path - np.maximum.accumulate(np.where(turns, path, 0.0)))
-
-
-def _friction_force(name: str, rows: RegressionRows, values: Mapping[str, float]) -> Array:
-    """Friction force: the force less those of inertia, load and offsets [N]."""
-    p = rows.parameters
-    used = {n: c for n, c in rows.columns.items() if n in p}
-    taken = (values.get(n, values.get(f"{n}[{name}]", p.value(n))) * c for n, c in used.items())
-    return np.asarray(rows.force - sum(taken))
-
-
-# Spread of the steps [1], over the usual one, that the filter takes as even: above, derivatives of a log that lacks
-# samples are wrong; below, every log with jitter is resampled.
-MAX_JITTER = 0.5
-# Windows of the Savitzky-Golay filter of order 3 that are tried [s]: shorter ones leave noise in the acceleration,
-# longer ones flatten stick and slip of a light load.
-FILTER_TIMES = (0.031, 0.021, 0.015, 0.011, 0.007)
 
 
 def filter_motion(measured: Trajectory, window: float = FILTER_TIMES[0]) -> tuple[Array, Array, Array]:

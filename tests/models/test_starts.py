@@ -9,16 +9,15 @@ from pneuopt.dynamics.system import DiscreteSystem, discretise, names, parameter
 from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.load import Load
-from pneuopt.models.starts.friction import (
-    FILTER_TIMES,
+from pneuopt.models.starts import (
     RegressionRows,
     choose_filter_time,
     filter_motion,
     force_misfit,
     load_columns,
 )
+from pneuopt.models.tolerances import FILTER_TIMES
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -169,13 +168,6 @@ def test_motion_is_filtered_from_position_or_speed() -> None:
         assert position == pytest.approx(y, abs=2e-3)
         assert speed == pytest.approx(v, abs=2e-2)
         assert acceleration[20:-20] == pytest.approx(a[20:-20], abs=1)
-
-
-def test_without_motion_it_is_refused() -> None:
-    with pytest.raises(LogError, match="neither 'position' nor 'speed'"):
-        filter_motion(Trajectory([0.0, 1.0], {"force": [0.0, 0.0]}))
-    with pytest.raises(LogError, match="channel 'position' has no samples"):
-        filter_motion(Trajectory(np.arange(20.0), {"position": np.full(20, np.nan)}))
 
 
 def test_a_short_log_takes_a_shorter_filter() -> None:
