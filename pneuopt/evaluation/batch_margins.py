@@ -1,10 +1,8 @@
 """Margins and sensitivity peaks of many loops at once, for searches; `margins` gives one loop's exactly.
 
-`sensitivity_peaks`: the largest sensitivity of many loops, from their poles alone.
-
 The sensitivity of a loop whose open loop rolls off is ``S(s) = prod (s - p)/prod (s - q)`` over the poles p of the open
-and q of the closed loop. So it takes no frequency response of the plant, and its resonances are known beforehand: they
-lie near the closed loop's poles.
+and q of the closed loop. So `sensitivity_peaks` takes no frequency response of the plant, and the resonances are known
+beforehand: they lie near the closed loop's poles.
 """
 
 from collections.abc import Callable, Collection
@@ -40,29 +38,20 @@ Matrices4 = tuple[Array, Array, Array, Array]  # and D, shape (m, 1, 1)
 
 MarginFunction = Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]
 """``(p, x, u, only) -> found``; see `batch_margin_function`."""
+Responses = Callable[[Array], tuple[ComplexArray, ComplexArray]]
+"""``w -> (L, C)``: responses of m loops and of their controllers from measurement to command."""
 
 
 def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: float = 0.0) -> MarginFunction:
     """Function that gives margins, sensitivities and noise gains for many gains and operating points at once.
 
-    Parameters
-    ----------
-    loop : ClosedLoop
-    omega : array_like, shape (n,)
-        [rad/s], positive, increasing.
-    lowest_noise : float
-        Frequency from which on a noise gain counts (`lowest_noise_frequency`) [rad/s].
-
-    Returns
-    -------
-    callable
-        ``(p, x, u, only) -> found``: parameters, shape (m, n_parameters), in the order of ``loop.parameters``, and
-        the plant's states and inputs at k operating points of each, shapes (k, m, n_plant_states) and
-        (k, m, n_plant_inputs), means under dither. The result has an array of shape (m,) for each name in `only`, the
-        worst over the points: "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as
-        in `Margins`, and "NoiseGain". Crossings are interpolated, peaks refined between the grid's frequencies. Where
-        a closed loop is unstable, its margins are NaN, its sensitivities and noise gain infinite. Arguments are not
-        checked.
+    The frequencies `omega` [rad/s], shape (n,), are positive, increasing; from `lowest_noise` on a noise gain counts.
+    The function ``(p, x, u, only) -> found`` takes parameters, shape (m, n_parameters), in the order of
+    ``loop.parameters``, and the plant's states and inputs at k operating points of each, shapes (k, m, n_plant_states)
+    and (k, m, n_plant_inputs), means under dither; its arguments are not checked. It gives an array of shape (m,) for
+    each name in `only`, the worst over the points: "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin",
+    "PhaseMargin" [deg] as in `Margins`, and "NoiseGain". Crossings are interpolated, peaks refined between the grid's
+    frequencies. Where a closed loop is unstable, its margins are NaN, its sensitivities and noise gain infinite.
     """
     w = np.asarray(omega, dtype=float)
     if loop.is_composed:
@@ -73,7 +62,8 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
         plants = linearise(p, x, u)
         gains = linear_gains(loop, p.T, plants.measured, u[:, command]).full()
         controllers, matrices = controller_matrices(gains, loop.dead_time), plants.with_sensor()
-        closed = _close_loops(matrices, controllers)
+        (A, B, C), (Ac, Bc, Cc, Dc) = matrices, controllers
+        closed = np.block([[A - B @ Dc @ C, B @ Cc], [-Bc @ C, Ac]])
         poles = _poles(closed)
         if set(only) == {MAX_SENSITIVITY} and not plants.D.any():
             opened = np.concatenate([_poles(matrices[0]), _poles(controllers[0])], axis=1)
@@ -94,7 +84,12 @@ def _read_worst(read_points: MarginFunction) -> MarginFunction:
     def read_margins(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
         k, m = x.shape[:2]
         found = read_points(np.tile(p, (k, 1)), x.reshape(k * m, -1), u.reshape(k * m, -1), only)
-        return {n: _worst_in_columns(n, v.reshape(k, m)[-counted_points(n, k) :]) for n, v in found.items()}
+        worst = {}
+        for n, each in found.items():
+            values = each.reshape(k, m)[-counted_points(n, k) :]
+            cost = np.where(np.isnan(values), inf, METRICS[n].requirement_value(values))  # NaN is an unstable loop's
+            worst[n] = np.asarray(values[np.argmax(cost, axis=0), np.arange(m)])
+        return worst
 
     return read_margins
 
@@ -105,11 +100,14 @@ def _composed_reader(loop: ClosedLoop, w: Array, lowest_noise: float) -> MarginF
 
     def read_points(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
         opened, noise = linearise(p, x, u)
-        loops, controllers = (_matrix_response(own, w) for own in (opened, noise))
+        parts = [_partial_fraction_response(A, B[..., 0], C[:, 0], w) for A, B, C, _ in (opened, noise)]
         (A, B, C, D), ends = opened, (opened[3][:, 0, 0], noise[3][:, 0, 0])
-        found = _read_responses(
-            lambda w: (loops(w), controllers(w)), np.abs(ends[1] / (1 + ends[0])), w, lowest_noise, only
-        )
+
+        def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
+            L, control = (part(w) + end[:, None] for part, end in zip(parts, ends, strict=True))
+            return L, control
+
+        found = _read_responses(responses, np.abs(ends[1] / (1 + ends[0])), w, lowest_noise, only)
         if MAX_SENSITIVITY in only:
             found[MAX_SENSITIVITY] = np.maximum(found[MAX_SENSITIVITY], np.abs(1 / (1 + ends[0])))
         closed = A - B @ C / (1 + D)
@@ -118,21 +116,10 @@ def _composed_reader(loop: ClosedLoop, w: Array, lowest_noise: float) -> MarginF
     return read_points
 
 
-def _matrix_response(system: Matrices4, typical: Array) -> Callable[[Array], ComplexArray]:
-    """Responses of m systems with one input and one output."""
-    A, B, C, D = system
-    response = _partial_fraction_response(A, B[..., 0], C[:, 0], typical)
-    return lambda w: np.asarray(response(w) + D[:, 0])
-
-
 def _mark_unstable(found: dict[str, Array], closed: Array, poles: ComplexArray) -> dict[str, Array]:
     """Metrics with those of unstable loops NaN or infinite, by the closed loops' matrices and poles."""
     stable = are_stable(closed, poles)
     return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
-
-
-Responses = Callable[[Array], tuple[ComplexArray, ComplexArray]]
-"""``w -> (L, C)``: responses of m loops and of their controllers from measurement to command."""
 
 
 def _pid_responses(gains: Array, plant: Callable[[Array], ComplexArray]) -> tuple[Responses, Array]:
@@ -159,12 +146,6 @@ def _read_responses(
     if NOISE_GAIN in only:
         found[NOISE_GAIN] = np.maximum(found[NOISE_GAIN], noise_at_infinity)
     return found
-
-
-def _worst_in_columns(metric: str, values: Array) -> Array:
-    """The worst of each column; NaN where a loop is unstable."""
-    cost = np.where(np.isnan(values), inf, METRICS[metric].requirement_value(values))
-    return np.asarray(values[np.argmax(cost, axis=0), np.arange(values.shape[1])])
 
 
 def _refine_peaks(
@@ -205,10 +186,7 @@ class _Plants:
     lag: Array
 
     def response(self, dead_time: float, typical: Array) -> Callable[[Array], ComplexArray]:
-        """Responses with sensor and hold, a function of frequencies of shape (n,) or (m, n).
-
-        On the frequencies `typical` it is checked that partial fractions are exact enough.
-        """
+        """Responses with sensor and hold, a function of frequencies (n,) or (m, n); checked on typical ones."""
         plant = _partial_fraction_response(self.A, self.B, self.C, typical)
 
         def response(w: Array) -> ComplexArray:
@@ -218,8 +196,15 @@ class _Plants:
         return response
 
     def with_sensor(self) -> Matrices:
-        """A, B and C of the plants with their sensors."""
-        return _add_sensor((self.A, self.B[..., None], self.C[:, None]), self.lag)
+        """A, B and C of the plants with their first-order sensors, where any of them has one."""
+        (A, B, C), m = (self.A, self.B[..., None], self.C[:, None]), len(self.lag)
+        if not self.lag.any():
+            return A, B, C
+        n, has_lag = A.shape[-1], self.lag > 0
+        rate = 1 / np.where(has_lag, self.lag, 1.0)[..., None]
+        sensed = np.block([[A, np.zeros((m, n, 1))], [C * rate, -rate]])
+        reading = np.where(has_lag[..., None], np.eye(1, n + 1, n), np.concatenate([C, np.zeros((m, 1, 1))], axis=2))
+        return sensed, np.concatenate([B, np.zeros((m, 1, 1))], axis=1), reading
 
 
 def _plants(loop: ClosedLoop) -> Callable[[Array, Array, Array], _Plants]:
@@ -234,24 +219,6 @@ def _plants(loop: ClosedLoop) -> Callable[[Array, Array, Array], _Plants]:
     return linearise
 
 
-def _add_sensor(plant: Matrices, lag: Array) -> Matrices:
-    """A, B and C of plants with a first-order sensor of lag [s], shape (m, 1), where any of them has one."""
-    if not lag.any():
-        return plant
-    (A, B, C), m = plant, len(lag)
-    n, has_lag = A.shape[-1], lag > 0
-    rate = 1 / np.where(has_lag, lag, 1.0)[..., None]
-    sensed = np.block([[A, np.zeros((m, n, 1))], [C * rate, -rate]])
-    reading = np.where(has_lag[..., None], np.eye(1, n + 1, n), np.concatenate([C, np.zeros((m, 1, 1))], axis=2))
-    return sensed, np.concatenate([B, np.zeros((m, 1, 1))], axis=1), reading
-
-
-def _close_loops(plant: Matrices, controller: Matrices4) -> Array:
-    """State matrices of m loops with negative feedback, shape (m, n, n)."""
-    (A, B, C), (Ac, Bc, Cc, Dc) = plant, controller
-    return np.block([[A - B @ Dc @ C, B @ Cc], [-Bc @ C, Ac]])
-
-
 def _poles(A: Array) -> ComplexArray:
     """Eigenvalues of m matrices, shape (m, n); those of NaN matrices are 1, so that they count as unstable."""
     sound = np.asarray(np.isfinite(A).all(axis=(1, 2)))
@@ -260,10 +227,7 @@ def _poles(A: Array) -> ComplexArray:
 
 
 def _gain_margins(L: ComplexArray) -> Array:
-    """Gain margins, shape (m,); crossings of -180 deg are interpolated in phase and logarithm of gain.
-
-    Where L(0) is negative the first frequency counts as well.
-    """
+    """Gain margins (m,), crossings of -180 deg interpolated in phase and log gain; a negative L(0) counts as well."""
     phase, gain = np.angle(-L), np.log(np.abs(L))
     at, crossing = _interpolate_crossings(phase, gain, np.abs(np.diff(phase, axis=1)) < np.pi)
     at_rest = np.where(rests_below_zero(L[:, :2]), -gain[:, 0], inf)
@@ -302,10 +266,7 @@ _PEAK_FUNCTIONS: dict[str, Callable[[ComplexArray, ComplexArray], Array]] = {
 
 
 def _partial_fraction_response(A: Array, B: Array, C: Array, typical: Array) -> Callable[[Array], ComplexArray]:
-    """Function for ``C (jw I - A)^-1 B`` of m systems, shape (m, n), by partial fractions; a solve where inexact.
-
-    It takes frequencies of shape (n,), the same for all systems, or (m, n).
-    """
+    """Function of frequencies (n,) or (m, n) for ``C (jw I - A)^-1 B`` of m systems by partial fractions, if exact."""
     try:
         poles, V = np.linalg.eig(A)
         parts = (C[:, None] @ V)[:, 0] * np.linalg.solve(V, B[..., None].astype(complex))[..., 0]
@@ -329,14 +290,7 @@ def _partial_fraction_response(A: Array, B: Array, C: Array, typical: Array) -> 
 
 
 def sensitivity_peaks(opened: ComplexArray, closed: ComplexArray, low: float, high: float) -> Array:
-    """The largest ``|S(jw)|`` of m loops for low <= w <= high [rad/s], shape (m,).
-
-    Parameters
-    ----------
-    opened, closed : ndarray of complex, shape (m, n)
-        The poles of the open and of the closed loop [rad/s].
-    low, high : float
-        [rad/s]
+    """The largest ``|S(jw)|`` of m loops (m,) by their poles (m, n) [rad/s], for low <= w <= high [rad/s].
 
     Examples
     --------

@@ -1,10 +1,7 @@
-"""`dither_effect`: what a dither moves, by harmonic balance of the nonlinear plant, and why it acts as it does.
+"""`judge_dither` and `judge_compensators`: whether what is added to a command against friction is useful, and why.
 
-`read_ending`: how a response ends with its ripple: its error over the last cycles, its settling, its ripple.
-
-`judge_dither`: whether a dither is useful: the loop's metrics with and without it, and what the dither moves.
-
-`judge_compensators`: whether what is added to a command against friction is useful, judged as a dither is.
+The loop's responses with it and a rival's without it are compared, each continued until it is plain how it ends, ripple
+included (`DitheredEnding`). `dither_effect` adds what a dither moves, by harmonic balance of the plant.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,16 +19,16 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.hooks import Axis, FinalElement, Rest
 from pneuopt.dynamics.system import System, names
-from pneuopt.evaluation.certificate import ContinuedResponse, Ending, continue_response
+from pneuopt.evaluation.certificate import Ending, continue_response
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases
 from pneuopt.evaluation.metric import Band, band_share, describe_ripple, entry_for_good, measure_ripple, period_mean
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.response import command_range
 from pneuopt.evaluation.tolerances import (
     FINAL_PERIODS,
-    LAST_CYCLES,
     MAX_RIPPLE_SHARE,
     MIN_CURE,
+    MIN_CYCLES,
     MIN_LOOSENING_FORCE,
     TAIL_SHARE,
 )
@@ -43,351 +40,6 @@ from pneuopt.quantities.results import Result
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-@dataclass(frozen=True)
-class DitherEffect:
-    """Amplitudes that a dither causes, by harmonic balance of the nonlinear plant; NaN where they are not known.
-
-    Attributes
-    ----------
-    amplitude, frequency : float
-        [command's unit], [Hz]
-    spool : float
-        Amplitude of the final element's moving part, a valve's spool [half travels].
-    valve_gain : float
-        Ratio of the spool's amplitude to the command's, which the valve's lag reduces [1].
-    force : float
-        Amplitude of the force on a body held fast at rest [the axis's unit of force].
-    speed, travel : float
-        Amplitudes of a body that moves at the reference's final speed [its speed's unit], [that times s].
-    drive_frequency : float
-        Natural frequency of the load on the element's medium, the air in the chambers, without friction [Hz].
-    """
-
-    amplitude: float
-    frequency: float
-    spool: float = nan
-    valve_gain: float = nan
-    force: float = nan
-    speed: float = nan
-    travel: float = nan
-    drive_frequency: float = nan
-
-
-def dither_effect(
-    loop: ClosedLoop, reference: Reference, parameters: ParameterSet, *, speed: float | None = None
-) -> DitherEffect:
-    """Amplitudes that the dither causes: the motion and, behind a final element, its travel and force.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    reference : Reference
-        The body is held at its start.
-    parameters : ParameterSet
-        Values with the dither's amplitude and frequency.
-    speed : float, optional
-        Speed at which the body moves [its unit]; by default the reference's final value where the loop feeds back a
-        speed, and otherwise the step's size over the time that is left to make it.
-    """
-    full = loop.complete(parameters)
-    found = DitherEffect(full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY))
-    axis = loop.plant.axis or Axis()
-    moves, held = _operating_points(loop, axis, reference, speed)
-    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
-    if axis.speed in moving:
-        swing = abs(moving[axis.speed])
-        found = replace(found, speed=swing, travel=swing / (2 * pi * found.frequency))
-    if axis.final_element is None:
-        return found
-    return _add_effect_at_rest(found, loop, axis, axis.final_element, held, full)
-
-
-def describe_swing(
-    loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, band: Band
-) -> str | None:
-    """Sentence for a dither that moves the measured signal out of the settling band; None for others.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : sequence of Reference
-    parameters : ParameterSet
-        Values with the dither's amplitude and frequency.
-    band : float or Tolerance
-        Half width of the settling band, a fraction of the step or in the measured unit.
-    """
-    full, step = loop.complete(parameters), min(references, key=lambda r: abs(r.nominal_size))
-    if loop.dither_period(full) is None:
-        return None
-    moves, _ = _operating_points(loop, loop.plant.axis or Axis(), step, None)
-    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
-    share = band_share(band, step)
-    swing, half = abs(moving.get(loop.feedback.name, 0.0)), share * abs(step.nominal_size)
-    if swing <= half:
-        return None
-    signal, command = loop.feedback, loop.command
-    amplitude, frequency = full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY)
-    swings, allowed = (format_with_prefix(v, signal.unit) for v in (swing, half))
-    return (
-        f"the given dither of {amplitude:.3g} {command.unit} at {frequency:.4g} Hz swings the {signal.name} by "
-        f"+-{swings}, beyond the settling band of +-{allowed} (+-{100 * share:.3g} % of step {step.label}): only the "
-        f"mean over its period can settle; lower {DITHER_AMPLITUDE}, raise {DITHER_FREQUENCY}, or widen the band"
-    )
-
-
-def _operating_points(
-    loop: ClosedLoop, axis: Axis, reference: Reference, speed: float | None
-) -> tuple[dict[str, float], dict[str, float]]:
-    """What is known of the plant where the body moves, half way of a step in position, and where it is held."""
-    if loop.feedback.name == axis.position:
-        half = (reference.initial + reference.final) / 2
-        fast = reference.size / (reference.horizon - reference.at) if speed is None else speed
-        return {axis.position: half, axis.speed: fast}, {axis.position: reference.origin, **reference.start}
-    start = {n: v for n, v in reference.start.items() if n == axis.position}
-    fast = (reference.final or reference.initial) if speed is None else speed
-    return {axis.speed: fast, **start}, {axis.speed: reference.origin, **reference.start}
-
-
-def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
-    """Sentences on why the dither acts as it does: clipping, lag and dead zone, static friction, motion.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    effect : DitherEffect
-    parameters : ParameterSet
-        Every parameter of the loop.
-    """
-    p, e, sentences = parameters, effect, list[str]()
-    sentences += _describe_clipping(loop, p)
-    axis = loop.plant.axis or Axis()
-    if axis.final_element is not None and not isnan(e.valve_gain):
-        sentences.append(_describe_final_element(axis.final_element, e, p))
-    static = next((p.value(f"friction.{n}") for n in ("static", "coulomb") if f"friction.{n}" in p), nan)
-    if not isnan(e.force):
-        against = "" if isnan(static) else f" against a static friction of {static:.3g} {axis.force}"
-        weak = ": too little to loosen it" if e.force < MIN_LOOSENING_FORCE * static else ""
-        force = format_with_prefix(e.force, axis.force)
-        sentences.append(f"the force on a {axis.noun} at rest swings by +-{force}{against}{weak}")
-    if not isnan(e.speed):
-        unit = next(q.unit for q in loop.plant.states if q.name == axis.speed)
-        speed, travel = format_with_prefix(e.speed, unit), format_with_prefix(e.travel, unit.removesuffix("/s"))
-        sentences.append(f"a moving {axis.noun} swings by +-{speed} and +-{travel}")
-    if axis.final_element is not None and not isnan(e.drive_frequency):
-        ratio = e.frequency / e.drive_frequency
-        natural = f"the {e.drive_frequency:.3g} Hz at which the load swings on the {axis.final_element.medium}"
-        sentences.append(f"the dither's {e.frequency:.3g} Hz are {ratio:.2g} times {natural}")
-    return tuple(sentences)
-
-
-def format_with_prefix(value: float, unit: str) -> str:
-    """Value with its unit and an SI prefix that avoids leading zeros.
-
-    Examples
-    --------
-    >>> format_with_prefix(0.00076, "N"), format_with_prefix(6.4e-11, "m"), format_with_prefix(12.1, "N")
-    ('0.76 mN', '0.064 nm', '12 N')
-    """
-    for factor, prefix in ((1.0, ""), (1e3, "m"), (1e6, "u"), (1e9, "n")):
-        if abs(value) * factor >= 0.1 or prefix == "n" or value == 0:
-            break
-    return f"{value * factor:.2g} {prefix}{unit}"
-
-
-def _add_effect_at_rest(
-    found: DitherEffect,
-    loop: ClosedLoop,
-    axis: Axis,
-    element: FinalElement,
-    known: Mapping[str, float],
-    full: ParameterSet,
-) -> DitherEffect:
-    """Add what the dither moves where the body is held at rest: the final element, and the force behind it."""
-    rest = _try_rest(loop.plant, full, known)
-    held = _state_harmonics(loop, _clamp_body(loop.plant, axis), full, rest)
-    if rest is None or not held:
-        return found
-    command = found.amplitude / full.value(element.limit)
-    spool = abs(held[element.stroke]) if element.stroke in held else min(1.0, command)
-    linear = loop.plant.linearise(np.array([*rest.states.values()]), rest.inputs, full)
-    row = dict(zip(linear.states, linear.A[linear.states.index(axis.speed)], strict=True))
-    force = full.value(axis.inertia) * abs(sum(row[n] * held[n] for n in element.pushing))
-    kept = [linear.states.index(n) for n in (axis.speed, *element.pushing)]
-    block = linear.A[np.ix_(kept, kept)]
-    block[0, 0] = 0.0  # without friction
-    rate = float(np.abs(np.linalg.eigvals(block)).max())
-    return replace(found, spool=spool, valve_gain=spool / command, force=float(force), drive_frequency=rate / (2 * pi))
-
-
-def _describe_final_element(element: FinalElement, e: DitherEffect, p: ParameterSet) -> str:
-    """Sentence on how far the final element follows the dither, and on its dead zone."""
-    dead = p.value(element.dead_zone)
-    lag = f" at {p.value(element.bandwidth):.3g} Hz bandwidth" if element.bandwidth in p else ""
-    zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
-    follows = f"the {element.moving_part} follows {100 * e.valve_gain:.0f} % of the dither{lag}"
-    return f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}"
-
-
-def _describe_clipping(loop: ClosedLoop, p: ParameterSet) -> list[str]:
-    """Sentence where offset and amplitude alone exceed the limits of command or final element; none otherwise."""
-    low, high, whose = command_range(loop, p)
-    least, most = (p.value(DITHER_OFFSET) + side * p.value(DITHER_AMPLITUDE) for side in (-1, 1))
-    if low <= least and most <= high:
-        return []
-    unit = loop.command.unit
-    return [
-        f"offset and amplitude alone reach {least:.3g} to {most:.3g} {unit}, and {whose} ends at {low:.3g} and "
-        f"{high:.3g} {unit}: the peaks are cut"
-    ]
-
-
-def _try_rest(plant: System, p: ParameterSet, known: Mapping[str, float]) -> Rest | None:
-    """Rest or steady motion of the plant with these values; None where there is none."""
-    if plant.rest_hook is None:
-        return None
-    try:
-        return plant.rest_hook(p, known)
-    except (InputError, ConvergenceError):
-        return None
-
-
-def _state_harmonics(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Rest | None) -> dict[str, complex]:
-    """First harmonics of the states about a rest; empty where the harmonic balance does not converge."""
-    assert loop.dither is not None
-    at = None if rest is None else {**rest.states, **rest.inputs}
-    try:
-        return ripple(plant, p, at=at, actuated=loop.command.name, waveform=loop.dither.waveform)
-    except ConvergenceError:
-        return {}
-
-
-def _clamp_body(plant: System, axis: Axis) -> System:
-    """The plant with its body clamped: position, speed and friction states have no rate."""
-    t, x, u, p = (ca.SX.sym(n, plant.ode.size1_in(k)) for k, n in enumerate("txup"))
-    xdot, y = plant.ode(t, x, u, p)
-    clamped = [n in (axis.position, axis.speed) or n.startswith("friction.") for n in names(plant.states)]
-    rates = ca.vertcat(*(ca.SX(0) if c else xdot[k] for k, c in enumerate(clamped)))
-    return replace(plant, ode=ca.Function("ode", [t, x, u, p], [rates, y], ["t", "x", "u", "p"], ["xdot", "y"]))
-
-
-@dataclass(frozen=True, eq=False)
-class DitheredEnding:
-    """How a response ends.
-
-    Attributes
-    ----------
-    metrics : dict of str to float
-        Those of `evaluate`, with the settling times and the error of the continued response, infinite where it never
-        settles, and RemainingError, the largest error of the signal itself over the last cycles [% of the step].
-    ending : Ending
-        Of the response, continued until it is decided.
-    ripple : float
-        Peak to peak of its dither's ripple in the end [measured unit].
-    speed : float or None
-        The largest mean speed of a body that is positioned [its unit]; None where the reference is a speed.
-    ripple_note : str or None
-        Sentence where only the mean settles.
-    """
-
-    metrics: dict[str, float]
-    ending: Ending
-    ripple: float
-    speed: float | None
-    ripple_note: str | None
-
-    def describe(self, which: str) -> Iterator[str]:
-        """What a table of metrics does not show, a sentence each; `which` is "with" or "without" the dither."""
-        course, cycle = self.ending.course, self.ending.cycle
-        if cycle is not None:
-            yield f"{which} it the loop ends in {cycle.describe(course.loop.feedback.unit)}"
-        if self.ripple_note is not None:
-            yield self.ripple_note
-        if course.contact and self.ending.hunts:
-            until = f"{course.t[-1]:.3g} s after the step"
-            yield f"{which} it the response is judged until {until}: {course.contact}"
-
-
-def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
-    """Continue a response until it stands, shows whether it hunts or meets a limit, and read how it ends.
-
-    Parameters
-    ----------
-    found : CaseEvaluation
-    band : float or Tolerance
-        Half width of the settling band, a fraction of the step or in the measured unit.
-
-    Raises
-    ------
-    ConvergenceError
-        If the simulation stops.
-    """
-    share = band_share(band, found.case.reference)
-    course, size = continue_response(found, share), abs(found.case.reference.nominal_size)
-    ending = Ending(course, share, found.case.label)
-    begin, mean = begin_of_end(ending), np.abs(course.error)
-    t, raw = (
-        course.t[course.before_contact],
-        np.abs(course.signal[course.before_contact] - course.reference.final) / size,
-    )
-    errors = {
-        "RemainingError": 100 * float(raw[t >= begin].max()),
-        "SteadyStateError": 100 * float(mean[course.at >= begin].max()),
-    }
-    settled = {
-        "SettlingTime": _settling_time(ending, found.metrics["SettlingTime"], course.at, mean),
-        "SettlingTimeRaw": _settling_time(ending, found.metrics["SettlingTimeRaw"], t, raw),
-    }
-    return DitheredEnding(
-        {**found.metrics, **errors, **settled},
-        ending,
-        _ripple(course),
-        _largest_speed(found),
-        describe_ripple(found.metrics, size, share),
-    )
-
-
-def begin_of_end(ending: Ending) -> float:
-    """Instant from which the error counts as the one in the end: that of the last cycles of a loop that hunts [s].
-
-    It lies before the last instant at which a mean over the dither's period is known.
-    """
-    end, cycle = float(ending.course.at[-1]), ending.cycle
-    if cycle is not None:
-        return end - LAST_CYCLES / cycle.frequency
-    if ending.stands or ending.drifts:
-        return end - max(TAIL_SHARE * end, FINAL_PERIODS * (ending.course.period or 0.0))
-    return end / 2
-
-
-def _settling_time(ending: Ending, within_horizon: float, t: Array, error: Array) -> float:
-    """That within the horizon, if the continuation does not refute it; else its own; infinite for never [s]."""
-    inside = ending.is_inside(error)
-    if isfinite(within_horizon) and inside[t > ending.course.horizon].all():
-        return within_horizon
-    return entry_for_good(t, inside)
-
-
-def _ripple(course: ContinuedResponse) -> float:
-    """Peak to peak of what repeats with the dither in the end [measured unit]."""
-    if course.period is None:
-        return 0.0
-    signal, k = course.signal[None], len(course.at)
-    means = period_mean(course.t, signal, course.reference.initial, course.period, course.at)
-    return float(measure_ripple(course.at, signal[:, :k] - means, course.period)[0])
-
-
-def _largest_speed(found: CaseEvaluation) -> float | None:
-    """The largest mean speed of a positioned body within the horizon [its unit]; None for other loops."""
-    axis, period, run = found.loop.plant.axis, found.loop.dither_period(found.parameters), found.response
-    if axis is None or found.loop.feedback.name != axis.position or axis.speed not in run:
-        return None
-    speed = run[axis.speed]
-    if period is not None and period <= run.t[-1] - run.t[0]:
-        at = run.t[run.t <= run.t[-1] - period / 2]
-        speed = period_mean(run.t, speed[None], float(speed[0]), period, at)[0]
-    return float(speed[np.abs(speed).argmax()])
 
 
 class Usefulness(Enum):
@@ -431,6 +83,36 @@ PRICE_METRICS = {
     "ValveTravel": "valve travel",
     "PeakControl": "largest command",
 }
+
+
+@dataclass(frozen=True)
+class DitherEffect:
+    """Amplitudes that a dither causes, by harmonic balance of the nonlinear plant; NaN where they are not known.
+
+    Attributes
+    ----------
+    amplitude, frequency : float
+        [command's unit], [Hz]
+    spool : float
+        Amplitude of the final element's moving part, a valve's spool [half travels].
+    valve_gain : float
+        Ratio of the spool's amplitude to the command's, which the valve's lag reduces [1].
+    force : float
+        Amplitude of the force on a body held fast at rest [the axis's unit of force].
+    speed, travel : float
+        Amplitudes of a body that moves at the reference's final speed [its speed's unit], [that times s].
+    drive_frequency : float
+        Natural frequency of the load on the element's medium, the air in the chambers, without friction [Hz].
+    """
+
+    amplitude: float
+    frequency: float
+    spool: float = nan
+    valve_gain: float = nan
+    force: float = nan
+    speed: float = nan
+    travel: float = nan
+    drive_frequency: float = nan
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -520,92 +202,13 @@ def judge_dither(
     plain = full if without is None else full | without
     plain = plain.with_bounds({DITHER_AMPLITUDE: (0.0, plain[DITHER_AMPLITUDE].upper)})
     plain = plain.with_values({DITHER_AMPLITUDE: 0.0})
-    before, after = (read_endings(loop, steps, p, band) for p in (plain, full))
-    table = worst_metrics(before, after)
+    before, after = (_read_endings(loop, steps, p, band) for p in (plain, full))
     effect = dither_effect(loop, steps[0], full, speed=after[0].speed)
-    objections = [
-        text for step, found in zip(steps, after, strict=True) for text in _object_to_swing(step, found, effect)
-    ]
-    hunts, narrowest = any(e.ending.hunts for e in after), min(band_share(band, r) for r in steps)
-    usefulness, changes = weigh_changes(table, narrowest, loop, objections, hunts=hunts)
-    notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
-    rival = "gains tuned without it"
-    if without is None:
-        usefulness = Usefulness.HELPS_THESE_GAINS if usefulness is Usefulness.USEFUL else usefulness
-        rival, notes = "the same gains without it", [*notes, NO_RIVAL]
-    reasons = (*changes, *dict.fromkeys(notes), *explain_effect(loop, effect, full))
-    return DitherVerdict(usefulness, reasons, table, effect, rival, loop.command.unit)
-
-
-def read_endings(
-    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, band: Band
-) -> list[DitheredEnding]:
-    """How a loop's response to each reference ends."""
-    return [read_ending(found, band) for found in evaluate_cases(loop, steps, parameters, band=band)]
-
-
-def worst_metrics(before: Sequence[DitheredEnding], after: Sequence[DitheredEnding]) -> "pd.DataFrame":
-    """Worst metrics over the references, without and with dither."""
-    import pandas as pd
-
-    designs = {"without": before, "with": after}
-    return pd.DataFrame({n: pd.DataFrame([e.metrics for e in endings]).max() for n, endings in designs.items()})
-
-
-def _object_to_swing(reference: Reference, found: DitheredEnding, effect: DitherEffect) -> Iterator[str]:
-    """Objection to a dither that swings the signal by a large part of the step, in the end or while the body moves."""
-    loop = found.ending.course.loop
-    signal, axis = loop.feedback, loop.plant.axis or Axis()
-    moving = {axis.speed: effect.speed, axis.position: effect.travel}.get(signal.name, nan)
-    swing, size = max(found.ripple, 0.0 if isnan(moving) else 2 * moving), abs(reference.nominal_size)
-    if swing >= MAX_RIPPLE_SHARE * size:
-        text = f"worse: the dither swings {signal.name} by {format_with_prefix(swing, signal.unit)} from peak to peak"
-        yield f"{text}, {100 * swing / size:.0f} % of the step"
-
-
-def weigh_changes(
-    table: "pd.DataFrame", band: float, loop: ClosedLoop, objections: list[str], *, hunts: bool
-) -> tuple[Usefulness, tuple[str, ...]]:
-    """Verdict and its reasons, from the objections that are known beforehand and the changes of the metrics.
-
-    Of a loop that hunts with the dither only settling and errors count.
-    """
-    reasons, signs = [*objections], [-1] * len(objections)
-    for metric, criterion in CRITERIA.items():
-        if hunts and not criterion.counts_in_hunting:
-            continue
-        least = 100 * band if metric == "RemainingError" else 0.0  # inside the band no error counts
-        before, after = (max(least, float(table[c][metric])) for c in ("without", "with"))
-        share = MIN_CURE if hunts and after < before else criterion.relative
-        room = max(criterion.absolute, share * max(before, after))
-        if before == after or (isfinite(before) == isfinite(after) and abs(after - before) <= room):
-            continue
-        signs.append(1 if after < before else -1)
-        shown = [_format_metric(metric, float(table[c][metric]), loop) for c in ("without", "with")]
-        word = "better" if after < before else "worse"
-        reasons.append(f"{word}: {criterion.label} {shown[0]} without, {shown[1]} with it")
-    if not signs:
-        kept = ("RemainingError",) if hunts else ("SettlingTimeRaw", "SteadyStateError")
-        figures = [f"{CRITERIA[m].label} {_format_metric(m, float(table['with'][m]), loop)}" for m in kept]
-        reasons.append(f"nothing changes: {'it still hunts, ' if hunts else ''}{', '.join(figures)}")
-    reasons.append("price: " + ", ".join(_price_clause(n, table, loop) for n in PRICE_METRICS if n in table.index))
-    verdict = Usefulness.USELESS if not signs else Usefulness.USEFUL if signs[0] > 0 else Usefulness.HARMFUL
-    return verdict, tuple(reasons)
-
-
-def _price_clause(metric: str, table: "pd.DataFrame", loop: ClosedLoop) -> str:
-    before, after = (_format_metric(metric, float(table[c][metric]), loop) for c in ("without", "with"))
-    return f"{PRICE_METRICS[metric]} {after} (without {before})"
-
-
-def _format_metric(metric: str, value: float, loop: ClosedLoop) -> str:
-    if metric == "RemainingError":
-        return f"{value:.3g} %"
-    if metric in ("SettlingTime", "SettlingTimeRaw") and value == inf:
-        return "never"
-    if metric == "Ripple":
-        return format_with_prefix(value, loop.feedback.unit)
-    return f"{value:.3g} {METRICS[metric].shown_unit(loop.command.unit, loop.feedback.unit)}".rstrip()
+    pairs = zip(steps, after, strict=True)
+    objections = [text for step, found in pairs for text in _object_to_swing(step, found, effect)]
+    found = _compare(before, after, objections, is_tuned=without is not None)
+    reasons = (*found.reasons, *explain_effect(loop, effect, full))
+    return DitherVerdict(found.usefulness, reasons, found.table, effect, found.baseline, loop.command.unit)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -677,14 +280,347 @@ def judge_compensators(
     require(bool(loop.compensators), "there is nothing to judge: ClosedLoop(plant, pid, compensators=(Knocker(),))")
     steps, full, bare = as_references(references), loop.complete(parameters), replace(loop, compensators=())
     plain = (full if without is None else full | without).select(bare.parameters)
-    before, after = (read_endings(one, steps, p, band) for one, p in ((bare, plain), (loop, full)))
-    table, hunts = worst_metrics(before, after), any(e.ending.hunts for e in after)
-    narrowest = min(band_share(band, r) for r in steps)
-    usefulness, changes = weigh_changes(table, narrowest, loop, [], hunts=hunts)
-    notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
-    rival = "gains tuned without it"
-    if without is None:
-        usefulness = Usefulness.HELPS_THESE_GAINS if usefulness is Usefulness.USEFUL else usefulness
-        rival, notes = "the same gains without it", [*notes, NO_RIVAL]
-    names = tuple(c.section for c in loop.compensators)
-    return CompensatorVerdict(usefulness, (*changes, *dict.fromkeys(notes)), table, rival, names)
+    before, after = (_read_endings(one, steps, p, band) for one, p in ((bare, plain), (loop, full)))
+    sections = tuple(c.section for c in loop.compensators)
+    return CompensatorVerdict(*_compare(before, after, [], is_tuned=without is not None), sections)
+
+
+@dataclass(frozen=True, eq=False)
+class DitheredEnding:
+    """How a response ends, its dither's ripple included."""
+
+    # Those of `evaluate`, with the settling times and the error of the continued response, infinite where it never
+    # settles, and RemainingError, the largest error of the signal itself over the last cycles [% of the step].
+    metrics: dict[str, float]
+    ending: Ending
+    ripple: float  # peak to peak of its dither's ripple in the end [measured unit]
+    speed: float | None  # the largest mean speed of a positioned body [its unit]; None where the reference is a speed
+    ripple_note: str | None  # sentence where only the mean settles
+
+    def describe(self, which: str) -> Iterator[str]:
+        """What a table of metrics does not show, a sentence each; `which` is "with" or "without" the dither."""
+        response, cycle = self.ending.response, self.ending.cycle
+        if cycle is not None:
+            yield f"{which} it the loop ends in {cycle.describe(response.loop.feedback.unit)}"
+        if self.ripple_note is not None:
+            yield self.ripple_note
+        if response.contact and self.ending.hunts:
+            until = f"{response.t[-1]:.3g} s after the step"
+            yield f"{which} it the response is judged until {until}: {response.contact}"
+
+
+class _Comparison(NamedTuple):
+    """A design and its rival: the verdict, its reasons, the worst metrics of each, and what the rival is."""
+
+    usefulness: Usefulness
+    reasons: tuple[str, ...]
+    table: "pd.DataFrame"
+    baseline: str
+
+
+def _compare(
+    before: Sequence[DitheredEnding], after: Sequence[DitheredEnding], objections: list[str], *, is_tuned: bool
+) -> _Comparison:
+    """Compare endings over the references; a rival that is not tuned leaves "useful with these gains" at best."""
+    import pandas as pd
+
+    designs = {"without": before, "with": after}
+    table = pd.DataFrame({n: pd.DataFrame([e.metrics for e in endings]).max() for n, endings in designs.items()})
+    hunts, narrowest = any(e.ending.hunts for e in after), min(e.ending.band for e in after)
+    usefulness, changes = _weigh_changes(table, narrowest, after[0].ending.response.loop, objections, hunts=hunts)
+    notes = [note for which, endings in designs.items() for e in endings for note in e.describe(which)]
+    if is_tuned:
+        return _Comparison(usefulness, (*changes, *dict.fromkeys(notes)), table, "gains tuned without it")
+    usefulness = Usefulness.HELPS_THESE_GAINS if usefulness is Usefulness.USEFUL else usefulness
+    return _Comparison(usefulness, (*changes, *dict.fromkeys([*notes, NO_RIVAL])), table, "the same gains without it")
+
+
+def _weigh_changes(
+    table: "pd.DataFrame", band: float, loop: ClosedLoop, objections: list[str], *, hunts: bool
+) -> tuple[Usefulness, tuple[str, ...]]:
+    """Verdict and its reasons, from objections known beforehand and the metrics' changes, in hunting of some only."""
+    reasons, signs = [*objections], [-1] * len(objections)
+    for metric, criterion in CRITERIA.items():
+        if hunts and not criterion.counts_in_hunting:
+            continue
+        least = 100 * band if metric == "RemainingError" else 0.0  # inside the band no error counts
+        before, after = (max(least, float(table[c][metric])) for c in ("without", "with"))
+        share = MIN_CURE if hunts and after < before else criterion.relative
+        room = max(criterion.absolute, share * max(before, after))
+        if before == after or (isfinite(before) == isfinite(after) and abs(after - before) <= room):
+            continue
+        signs.append(1 if after < before else -1)
+        shown = [_format_metric(metric, float(table[c][metric]), loop) for c in ("without", "with")]
+        word = "better" if after < before else "worse"
+        reasons.append(f"{word}: {criterion.label} {shown[0]} without, {shown[1]} with it")
+    if not signs:
+        kept = ("RemainingError",) if hunts else ("SettlingTimeRaw", "SteadyStateError")
+        figures = [f"{CRITERIA[m].label} {_format_metric(m, float(table['with'][m]), loop)}" for m in kept]
+        reasons.append(f"nothing changes: {'it still hunts, ' if hunts else ''}{', '.join(figures)}")
+    prices = []
+    for metric, name in ((n, name) for n, name in PRICE_METRICS.items() if n in table.index):
+        shown = [_format_metric(metric, float(table[c][metric]), loop) for c in ("with", "without")]
+        prices.append(f"{name} {shown[0]} (without {shown[1]})")
+    reasons.append("price: " + ", ".join(prices))
+    verdict = Usefulness.USELESS if not signs else Usefulness.USEFUL if signs[0] > 0 else Usefulness.HARMFUL
+    return verdict, tuple(reasons)
+
+
+def _format_metric(metric: str, value: float, loop: ClosedLoop) -> str:
+    if metric == "RemainingError":
+        return f"{value:.3g} %"
+    if metric in ("SettlingTime", "SettlingTimeRaw") and value == inf:
+        return "never"
+    if metric == "Ripple":
+        return format_with_prefix(value, loop.feedback.unit)
+    return f"{value:.3g} {METRICS[metric].shown_unit(loop.command.unit, loop.feedback.unit)}".rstrip()
+
+
+def _read_endings(
+    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, band: Band
+) -> list[DitheredEnding]:
+    """How a loop's response to each reference ends."""
+    return [read_ending(found, band) for found in evaluate_cases(loop, steps, parameters, band=band)]
+
+
+def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
+    """Continue a response until it stands, shows whether it hunts or meets a limit, and read how it ends."""
+    share, size = band_share(band, found.case.reference), abs(found.case.reference.nominal_size)
+    response = continue_response(found, share)
+    ending, judged = Ending(response, share, found.case.label), response.before_contact
+    begin, mean = begin_of_end(ending), np.abs(response.error)
+    t, raw = response.t[judged], np.abs(response.signal[judged] - response.reference.final) / size
+    errors = {
+        "RemainingError": 100 * float(raw[t >= begin].max()),
+        "SteadyStateError": 100 * float(mean[response.times >= begin].max()),
+    }
+    settled = {
+        "SettlingTime": _settling_time(ending, found.metrics["SettlingTime"], response.times, mean),
+        "SettlingTimeRaw": _settling_time(ending, found.metrics["SettlingTimeRaw"], t, raw),
+    }
+    swing = 0.0
+    if response.period is not None:
+        signal, k = response.signal[None], len(response.times)
+        means = period_mean(response.t, signal, response.reference.initial, response.period, response.times)
+        swing = float(measure_ripple(response.times, signal[:, :k] - means, response.period)[0])
+    metrics, note = {**found.metrics, **errors, **settled}, describe_ripple(found.metrics, size, share)
+    return DitheredEnding(metrics, ending, swing, _largest_speed(found), note)
+
+
+def begin_of_end(ending: Ending) -> float:
+    """Instant from which the error counts as the one in the end: that of the last cycles of a loop that hunts [s].
+
+    It lies before the last instant at which a mean over the dither's period is known.
+    """
+    end, cycle = float(ending.response.times[-1]), ending.cycle
+    if cycle is not None:
+        return end - MIN_CYCLES / cycle.frequency
+    if ending.stands or ending.drifts:
+        return end - max(TAIL_SHARE * end, FINAL_PERIODS * (ending.response.period or 0.0))
+    return end / 2
+
+
+def _settling_time(ending: Ending, within_horizon: float, t: Array, error: Array) -> float:
+    """That within the horizon, if the continuation does not refute it; else its own; infinite for never [s]."""
+    inside = ending.is_inside(error)
+    if isfinite(within_horizon) and inside[t > ending.response.horizon].all():
+        return within_horizon
+    return entry_for_good(t, inside)
+
+
+def _largest_speed(found: CaseEvaluation) -> float | None:
+    """The largest mean speed of a positioned body within the horizon [its unit]; None for other loops."""
+    axis, period, run = found.loop.plant.axis, found.loop.dither_period(found.parameters), found.response
+    if axis is None or found.loop.feedback.name != axis.position or axis.speed not in run:
+        return None
+    speed = run[axis.speed]
+    if period is not None and period <= run.t[-1] - run.t[0]:
+        at = run.t[run.t <= run.t[-1] - period / 2]
+        speed = period_mean(run.t, speed[None], float(speed[0]), period, at)[0]
+    return float(speed[np.abs(speed).argmax()])
+
+
+def _object_to_swing(reference: Reference, found: DitheredEnding, effect: DitherEffect) -> Iterator[str]:
+    """Objection to a dither that swings the signal by a large part of the step, in the end or while the body moves."""
+    loop = found.ending.response.loop
+    signal, axis = loop.feedback, loop.plant.axis or Axis()
+    moving = {axis.speed: effect.speed, axis.position: effect.travel}.get(signal.name, nan)
+    swing, size = max(found.ripple, 0.0 if isnan(moving) else 2 * moving), abs(reference.nominal_size)
+    if swing >= MAX_RIPPLE_SHARE * size:
+        text = f"worse: the dither swings {signal.name} by {format_with_prefix(swing, signal.unit)} from peak to peak"
+        yield f"{text}, {100 * swing / size:.0f} % of the step"
+
+
+def dither_effect(
+    loop: ClosedLoop, reference: Reference, parameters: ParameterSet, *, speed: float | None = None
+) -> DitherEffect:
+    """Amplitudes that the dither causes: the motion and, behind a final element, its travel and force.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    reference : Reference
+        The body is held at its start.
+    parameters : ParameterSet
+        Values with the dither's amplitude and frequency.
+    speed : float, optional
+        Speed at which the body moves [its unit]; by default the reference's final value where the loop feeds back a
+        speed, and otherwise the step's size over the time that is left to make it.
+    """
+    full = loop.complete(parameters)
+    found = DitherEffect(full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY))
+    axis = loop.plant.axis or Axis()
+    moves, held = _operating_points(loop, axis, reference, speed)
+    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
+    if axis.speed in moving:
+        swing = abs(moving[axis.speed])
+        found = replace(found, speed=swing, travel=swing / (2 * pi * found.frequency))
+    if axis.final_element is None:
+        return found
+    return _add_effect_at_rest(found, loop, axis, axis.final_element, held, full)
+
+
+def describe_swing(
+    loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, band: Band
+) -> str | None:
+    """Sentence for a dither that moves the measured signal out of the settling band; None for others."""
+    full, step = loop.complete(parameters), min(references, key=lambda r: abs(r.nominal_size))
+    if loop.dither_period(full) is None:
+        return None
+    moves, _ = _operating_points(loop, loop.plant.axis or Axis(), step, None)
+    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
+    share = band_share(band, step)
+    swing, half = abs(moving.get(loop.feedback.name, 0.0)), share * abs(step.nominal_size)
+    if swing <= half:
+        return None
+    signal, command = loop.feedback, loop.command
+    amplitude, frequency = full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY)
+    swings, allowed = (format_with_prefix(v, signal.unit) for v in (swing, half))
+    return (
+        f"the given dither of {amplitude:.3g} {command.unit} at {frequency:.4g} Hz swings the {signal.name} by "
+        f"+-{swings}, beyond the settling band of +-{allowed} (+-{100 * share:.3g} % of step {step.label}): only the "
+        f"mean over its period can settle; lower {DITHER_AMPLITUDE}, raise {DITHER_FREQUENCY}, or widen the band"
+    )
+
+
+def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
+    """Sentences on why the dither acts as it does: clipping, lag and dead zone, static friction, motion."""
+    p, e, sentences = parameters, effect, list[str]()
+    sentences += _describe_clipping(loop, p)
+    axis = loop.plant.axis or Axis()
+    if axis.final_element is not None and not isnan(e.valve_gain):
+        sentences.append(_describe_final_element(axis.final_element, e, p))
+    static = next((p.value(f"friction.{n}") for n in ("static", "coulomb") if f"friction.{n}" in p), nan)
+    if not isnan(e.force):
+        against = "" if isnan(static) else f" against a static friction of {static:.3g} {axis.force}"
+        weak = ": too little to loosen it" if e.force < MIN_LOOSENING_FORCE * static else ""
+        force = format_with_prefix(e.force, axis.force)
+        sentences.append(f"the force on a {axis.noun} at rest swings by +-{force}{against}{weak}")
+    if not isnan(e.speed):
+        unit = next(q.unit for q in loop.plant.states if q.name == axis.speed)
+        speed, travel = format_with_prefix(e.speed, unit), format_with_prefix(e.travel, unit.removesuffix("/s"))
+        sentences.append(f"a moving {axis.noun} swings by +-{speed} and +-{travel}")
+    if axis.final_element is not None and not isnan(e.drive_frequency):
+        ratio = e.frequency / e.drive_frequency
+        natural = f"the {e.drive_frequency:.3g} Hz at which the load swings on the {axis.final_element.medium}"
+        sentences.append(f"the dither's {e.frequency:.3g} Hz are {ratio:.2g} times {natural}")
+    return tuple(sentences)
+
+
+def format_with_prefix(value: float, unit: str) -> str:
+    """Value with its unit and an SI prefix that avoids leading zeros.
+
+    Examples
+    --------
+    >>> format_with_prefix(0.00076, "N"), format_with_prefix(6.4e-11, "m"), format_with_prefix(12.1, "N")
+    ('0.76 mN', '0.064 nm', '12 N')
+    """
+    for factor, prefix in ((1.0, ""), (1e3, "m"), (1e6, "u"), (1e9, "n")):
+        if abs(value) * factor >= 0.1 or prefix == "n" or value == 0:
+            break
+    return f"{value * factor:.2g} {prefix}{unit}"
+
+
+def _operating_points(
+    loop: ClosedLoop, axis: Axis, reference: Reference, speed: float | None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """What is known of the plant where the body moves, half way of a step in position, and where it is held."""
+    if loop.feedback.name == axis.position:
+        half = (reference.initial + reference.final) / 2
+        fast = reference.size / (reference.horizon - reference.at) if speed is None else speed
+        return {axis.position: half, axis.speed: fast}, {axis.position: reference.origin, **reference.start}
+    start = {n: v for n, v in reference.start.items() if n == axis.position}
+    fast = (reference.final or reference.initial) if speed is None else speed
+    return {axis.speed: fast, **start}, {axis.speed: reference.origin, **reference.start}
+
+
+def _add_effect_at_rest(
+    found: DitherEffect,
+    loop: ClosedLoop,
+    axis: Axis,
+    element: FinalElement,
+    known: Mapping[str, float],
+    full: ParameterSet,
+) -> DitherEffect:
+    """Add what the dither moves where the body is held at rest: the final element, and the force behind it."""
+    plant, rest = loop.plant, _try_rest(loop.plant, full, known)
+    t, x, u, p = (ca.SX.sym(n, plant.ode.size1_in(k)) for k, n in enumerate("txup"))
+    xdot, y = plant.ode(t, x, u, p)
+    clamped = [n in (axis.position, axis.speed) or n.startswith("friction.") for n in names(plant.states)]
+    rates = ca.vertcat(*(ca.SX(0) if c else xdot[k] for k, c in enumerate(clamped)))
+    ode = ca.Function("ode", [t, x, u, p], [rates, y], ["t", "x", "u", "p"], ["xdot", "y"])
+    held = _state_harmonics(loop, replace(plant, ode=ode), full, rest)
+    if rest is None or not held:
+        return found
+    command = found.amplitude / full.value(element.limit)
+    spool = abs(held[element.stroke]) if element.stroke in held else min(1.0, command)
+    linear = plant.linearise(np.array([*rest.states.values()]), rest.inputs, full)
+    row = dict(zip(linear.states, linear.A[linear.states.index(axis.speed)], strict=True))
+    force = full.value(axis.inertia) * abs(sum(row[n] * held[n] for n in element.pushing))
+    kept = [linear.states.index(n) for n in (axis.speed, *element.pushing)]
+    block = linear.A[np.ix_(kept, kept)]
+    block[0, 0] = 0.0  # without friction
+    rate = float(np.abs(np.linalg.eigvals(block)).max())
+    return replace(found, spool=spool, valve_gain=spool / command, force=float(force), drive_frequency=rate / (2 * pi))
+
+
+def _describe_final_element(element: FinalElement, e: DitherEffect, p: ParameterSet) -> str:
+    """Sentence on how far the final element follows the dither, and on its dead zone."""
+    dead = p.value(element.dead_zone)
+    lag = f" at {p.value(element.bandwidth):.3g} Hz bandwidth" if element.bandwidth in p else ""
+    zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
+    follows = f"the {element.moving_part} follows {100 * e.valve_gain:.0f} % of the dither{lag}"
+    return f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}"
+
+
+def _describe_clipping(loop: ClosedLoop, p: ParameterSet) -> list[str]:
+    """Sentence where offset and amplitude alone exceed the limits of command or final element; none otherwise."""
+    low, high, whose = command_range(loop, p)
+    least, most = (p.value(DITHER_OFFSET) + side * p.value(DITHER_AMPLITUDE) for side in (-1, 1))
+    if low <= least and most <= high:
+        return []
+    unit = loop.command.unit
+    return [
+        f"offset and amplitude alone reach {least:.3g} to {most:.3g} {unit}, and {whose} ends at {low:.3g} and "
+        f"{high:.3g} {unit}: the peaks are cut"
+    ]
+
+
+def _try_rest(plant: System, p: ParameterSet, known: Mapping[str, float]) -> Rest | None:
+    """Rest or steady motion of the plant with these values; None where there is none."""
+    if plant.rest_hook is None:
+        return None
+    try:
+        return plant.rest_hook(p, known)
+    except (InputError, ConvergenceError):
+        return None
+
+
+def _state_harmonics(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Rest | None) -> dict[str, complex]:
+    """First harmonics of the states about a rest; empty where the harmonic balance does not converge."""
+    assert loop.dither is not None
+    at = None if rest is None else {**rest.states, **rest.inputs}
+    try:
+        return ripple(plant, p, at=at, actuated=loop.command.name, waveform=loop.dither.waveform)
+    except ConvergenceError:
+        return {}

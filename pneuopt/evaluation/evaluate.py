@@ -1,4 +1,7 @@
-"""`evaluate`: the metrics of a loop's gains, by a simulation that no search takes part in; or those of a rig."""
+"""`evaluate`: the metrics of a loop's gains, by a simulation that no search takes part in; or those of a rig.
+
+Then the evaluation of single cases, and metrics as tables show them.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,11 +32,8 @@ from pneuopt.evaluation.response import (
 from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.tolerances import (
-    MAX_COMPARED_COLUMNS,
-    MAX_REFERENCE_COLUMNS,
     MAX_REFINEMENTS,
     MIN_RELATIVE_AMPLITUDE,
-    MIN_SHOWN_PERCENT,
     POINTS_PER_READING,
     TRANSIENT_SHARE,
 )
@@ -46,8 +46,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LIMIT_CYCLE_METRICS = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
-DITHER_METRICS = ("Ripple", "SettlingTimeRaw")
-"""Metrics that say something of a loop with dither only."""
+DITHER_METRICS = ("Ripple", "SettlingTimeRaw")  # they say something of a loop with dither only
 TIMES_OR_NEVER = ("SettlingTime", "SettlingTimeRaw")
 
 
@@ -90,7 +89,7 @@ def evaluate(
         ("0 to 0.25 [load.mass high]"). The rows: those of `step_metrics`; LimitCycleAmplitude [measured unit], 0
         without hunting, LimitCycleFrequency [Hz] and StickShare; the metrics that the plant's meter shows, AirUse
         [l(ANR)], ValveTravel [half travels] and EnergyUse [J]; and, not for a rig, the worst over the response's
-        operating points (`operating_point_margins`: at rest, sliding, at the end) of the linearised loop's
+        operating points (at rest, sliding, at the end) of the linearised loop's
         MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin [deg], NoiseGain [command's unit/measured
         unit], and FrictionSlope [N s/m] for drives with a load. Where the loop is unstable at one of them, its margins
         are NaN, its sensitivities and noise gain infinite.
@@ -138,28 +137,14 @@ def evaluate(
 
 @dataclass(frozen=True, eq=False)
 class CaseEvaluation:
-    """One reference on one plant as `evaluate` finds it.
+    """One reference on one plant as `evaluate` finds it."""
 
-    Attributes
-    ----------
-    loop : ClosedLoop
-        With inputs for the references' disturbances.
-    case : TuningCase
-    parameters : ParameterSet
-        Every parameter of the loop, with this case's values.
-    metrics : dict of str to float
-    response : Trajectory
-        States and outputs up to the horizon; a rig's truth.
-    margins : tuple of dict
-        The rows of `operating_point_margins`; none for a rig.
-    """
-
-    loop: ClosedLoop
+    loop: ClosedLoop  # with inputs for the references' disturbances
     case: TuningCase
-    parameters: ParameterSet
+    parameters: ParameterSet  # every parameter of the loop, with this case's values
     metrics: dict[str, float]
-    response: Trajectory
-    margins: tuple[dict[str, Any], ...] = ()
+    response: Trajectory  # states and outputs up to the horizon; a rig's truth
+    margins: tuple[dict[str, Any], ...] = ()  # of `margin_rows`; none for a rig
 
 
 def tabulate_metrics(evaluations: Iterable[CaseEvaluation]) -> "pd.DataFrame":
@@ -240,13 +225,7 @@ def _evaluate_case(
 def limit_cycle_metrics(
     loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
 ) -> dict[str, float]:
-    """Metrics of the limit cycle after the transient, which takes the first 40 % after the step; amplitude 0: none.
-
-    Returns
-    -------
-    dict of str to float
-        LimitCycleAmplitude [measured unit], LimitCycleFrequency [Hz] and StickShare, the share of time at a standstill.
-    """
+    """LimitCycleAmplitude after the transient [measured unit], LimitCycleFrequency [Hz] and StickShare [1]; 0: none."""
     signal, period = response[loop.feedback.name], loop.dither_period(parameters)
     start = reference.at + TRANSIENT_SHARE * (response.t[-1] - reference.at)
     least = MIN_RELATIVE_AMPLITUDE * abs(reference.nominal_size)
@@ -293,29 +272,23 @@ def report_metrics(
     title: str = "certified",
     beside: tuple[str, "pd.DataFrame | None"] = ("", None),
     limits: Mapping[str, float] | None = None,
+    most_columns: int = 3,
 ) -> Report:
-    """Metrics, a column a reference, or their worst where there are many.
+    """Metrics, a column a reference, or their worst where there are too many; with others beside them one fewer fits.
 
-    Parameters
-    ----------
-    metrics : DataFrame
-        Of `evaluate`, or a `TuningResult`: a row a metric, a column a reference.
-    units : mapping of str to str
-        Of `relevant_units`.
-    title : str
-        What the figures are.
-    beside : (str, DataFrame or None)
-        Figures of the same references that stand beside them, and their heading: "was", with the gains before.
-    limits : mapping of str to float, optional
-        Of `metric_limits`.
+    Those `beside` are of the same references, with their heading: "was", with the gains before; `title` says what the
+    figures are, `units` are of `relevant_units`, `limits` of `metric_limits`.
     """
-    (heading, other), allowed = beside, {n: _format_limit(n, limit) for n, limit in (limits or {}).items()}
-    several = len(metrics.columns) > (MAX_REFERENCE_COLUMNS if other is None else MAX_COMPARED_COLUMNS)
+    heading, other = beside
+    sides = {n: ">=" if larger_is_better(n) else "<=" for n in limits or {}}
+    allowed = {n: f"{sides[n]}{TIED}{format_number(limit, 4)}" for n, limit in (limits or {}).items()}
+    several = len(metrics.columns) > most_columns - (other is not None)
     unit = units.get("", "")
     names = [f"worst of {len(metrics.columns)}"] if several else [f"{c}\n{unit}" if unit else str(c) for c in metrics]
     figures = [word for name in names for word in ((name,) if other is None else (name, heading))]
+    hunts = LIMIT_CYCLE_METRICS[0] in metrics.index and bool((metrics.loc[LIMIT_CYCLE_METRICS[0]] > 0).any())
     rows = []
-    for metric in (m for m in units if m in metrics.index and _is_relevant(m, metrics)):
+    for metric in (m for m in units if m in metrics.index and (hunts or m not in LIMIT_CYCLE_METRICS)):
         now, then = (_metric_values(frame, metric, several) for frame in (metrics, other))
         cells = [metric_cell(metric, v) for v in now]
         if other is not None:
@@ -327,22 +300,13 @@ def report_metrics(
     return Report((Table(columns, tuple(rows)),) if rows else ())
 
 
-def metric_cell(metric: str, value: float, digits: int = 4) -> str:
-    """A metric's figure in a table."""
+def metric_cell(metric: str, value: float, digits: int = 4, least_percent: float = 1e-3) -> str:
+    """A metric's figure in a table; of a smaller percentage than the least only that it is smaller."""
     if metric in TIMES_OR_NEVER and isnan(value):
         return "never"
-    if percent_factor(metric) == 100 and 0 < abs(value) < MIN_SHOWN_PERCENT:
-        return f"<{TIED}{MIN_SHOWN_PERCENT:g}"
+    if percent_factor(metric) == 100 and 0 < abs(value) < least_percent:
+        return f"<{TIED}{least_percent:g}"
     return format_number(value, digits)
-
-
-def _format_limit(metric: str, limit: float) -> str:
-    return f"{'>=' if larger_is_better(metric) else '<='}{TIED}{format_number(limit, 4)}"
-
-
-def _is_relevant(metric: str, metrics: "pd.DataFrame") -> bool:
-    """A limit cycle only where there is one."""
-    return metric not in LIMIT_CYCLE_METRICS or bool((metrics.loc[LIMIT_CYCLE_METRICS[0]] > 0).any())
 
 
 def _metric_values(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float]:

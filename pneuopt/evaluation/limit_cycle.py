@@ -14,22 +14,19 @@ from numpy.typing import ArrayLike
 from pneuopt.evaluation.metric import period_mean, remove_ripple
 from pneuopt.evaluation.tolerances import (
     CROSSING_HYSTERESIS,
+    DECAY_RATIO,
     MAX_PERIOD_SPREAD,
     MIN_AUTOCORRELATION,
     MIN_CYCLES,
     MIN_RELATIVE_AMPLITUDE,
     PHASES_PER_CYCLE,
     STANDSTILL_FRACTION,
+    SUSTAINED_RATIO,
     TRANSIENT_SHARE,
     WINDOWS_PER_PERIOD,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
-
-# Growth of the amplitude per period, as a logarithm. A ringing decays where its growth is below the first by two
-# standard errors, or below the second whatever its error.
-MIN_SUSTAINED_GROWTH = log(0.98)
-MAX_DECAY_GROWTH = log(0.8)
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,10 @@ def find_limit_cycle(
     lag = _period_in_samples(swing) if np.ptp(swing) >= 2 * smallest > 0 else 0
     if lag == 0:
         return None
-    swing = _remove_trend(swing, lag)
+    # the trend is the straight line through the means over whole periods, on which part of a period has no effect
+    whole = np.convolve(swing, np.ones(lag) / lag, "valid")
+    line = np.polyfit(np.arange(len(whole)) + (lag - 1) / 2, whole, 1)
+    swing = swing - np.polyval(line, np.arange(len(swing)))
     smooth = np.convolve(swing, np.ones(1 + lag // WINDOWS_PER_PERIOD) / (1 + lag // WINDOWS_PER_PERIOD), "same")
     crossings = _rising_crossings(at, smooth)
     if len(crossings) <= MIN_CYCLES or np.std(np.diff(crossings)) > MAX_PERIOD_SPREAD * np.mean(np.diff(crossings)):
@@ -162,13 +162,6 @@ def _period_in_samples(swing: Array) -> int:
     return int(below[0] + np.argmax(r[below[0] :]))
 
 
-def _remove_trend(swing: Array, lag: int) -> Array:
-    """Signal less the straight line through its means over whole periods, on which part of a period has no effect."""
-    whole = np.convolve(swing, np.ones(lag) / lag, "valid")
-    line = np.polyfit(np.arange(len(whole)) + (lag - 1) / 2, whole, 1)
-    return np.asarray(swing - np.polyval(line, np.arange(len(swing))))
-
-
 def _rising_crossings(t: Array, swing: Array) -> Array:
     """Instants of the rising zero crossings that pass `CROSSING_HYSTERESIS` standard deviations on both sides."""
     level = CROSSING_HYSTERESIS * np.std(swing)
@@ -189,4 +182,4 @@ def _is_decaying(sizes: Array) -> bool:
     slope = float(k @ logs / (k @ k))
     left = logs - logs.mean() - slope * k
     error = float(np.sqrt(left @ left / max(1, len(sizes) - 2) / (k @ k)))
-    return slope < MAX_DECAY_GROWTH or slope + 2 * error < MIN_SUSTAINED_GROWTH
+    return slope < log(DECAY_RATIO) or slope + 2 * error < log(SUSTAINED_RATIO)

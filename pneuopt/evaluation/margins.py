@@ -1,15 +1,10 @@
-"""Frequency response and robustness margins of a loop, and its sensitivity as a smooth constraint for a search.
+"""Frequency response and robustness margins of a loop, at each operating point of a step response; the worst counts.
 
-A search limits the maximum sensitivity Ms like this::
+`margins` gives those of one linear loop, to machine precision: crossings and peaks are bracketed on a grid that
+resolves the loop's features, and refined. `are_stable` judges each pole by how far rounding may have moved it.
 
-    omega = frequency_grid(open_loop(loop, parameters), 20)   # or any grid of your own
-    terms = sensitivity_terms(loop, omega, parameters)       # once
-    terms(p) >= 1 / Ms**2                                    # p in the order of loop.parameters: numbers, SX or MX
-
-Operating points of a step response, and a loop's margins at each of them; the worst one counts.
-
-A nonlinear loop has as many margins as it has operating points. Three count here, since a loop stays near each of them
-for long enough to oscillate there:
+A nonlinear loop has as many margins as it has operating points. Three count here (`operating_points`), since a loop
+stays near each of them for long enough to oscillate there:
 
 * where it waits for the step, "at rest", or "at the start" where it moves: bristles or a steep Coulomb curve stiffen a
   resting drive, a dead zone or an overlap opens its loop;
@@ -21,14 +16,12 @@ A passage through the friction's falling branch on the way is no such point: it 
 can grow. Under dither the points are those of the response without its ripple, and the loop is averaged over the ripple
 there. A mean over the dither's period alone would smooth a fast command, even under a dither of a picovolt. A plant
 whose Jacobian is the same everywhere has one point, its end.
-
-`are_stable`: which closed loops are stable, each pole judged by how far rounding may have moved it.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from math import inf, isnan, nan
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -58,226 +51,10 @@ from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-
 AT_REST, AT_THE_START, SLIDING, AT_THE_END = "at rest", "at the start", "sliding", "at the end"
 FRICTION_SLOPE, NOISE_GAIN = "FrictionSlope", "NoiseGain"
 MARGIN_METRICS = tuple(metric.name for metric in METRICS.values() if metric.source is Source.LINEAR_LOOP)
-
-
-@dataclass(frozen=True, eq=False)
-class OperatingPoint:
-    """A point at which a loop is linearised.
-
-    Attributes
-    ----------
-    name : str
-        "at rest", "at the start", "sliding" or "at the end".
-    t : float
-        When the response passes it [s].
-    x : ndarray, shape (n_plant_states,)
-    inputs : mapping of str to float
-        The plant's inputs there, the command and the disturbances; absent ones are zero.
-    """
-
-    name: str
-    t: float
-    x: Array
-    inputs: Mapping[str, float]
-
-
-def operating_points(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
-) -> tuple[OperatingPoint, ...]:
-    """The operating points that a step response passes; see the module.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        With inputs for the reference's disturbances (`add_disturbances`).
-    parameters : ParameterSet
-        Every parameter of the loop.
-    reference : Reference
-    response : Trajectory
-        The loop's states and outputs.
-    """
-    return tuple(_find_points(loop, parameters, reference, response))
-
-
-def operating_point_margins(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
-) -> "pd.DataFrame":
-    """A row for each of the `operating_points`: "point", "t" [s], the metrics of the linear loop, and "stable".
-
-    Parameters as for `operating_points`; the metrics as in `evaluate`.
-    """
-    import pandas as pd
-
-    return pd.DataFrame(margin_rows(loop, parameters, reference, response))
-
-
-def margin_rows(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
-) -> tuple[dict[str, Any], ...]:
-    """The rows of `operating_point_margins`."""
-    return tuple(
-        _margin_row(loop, parameters, point, reference.horizon)
-        for point in operating_points(loop, parameters, reference, response)
-    )
-
-
-def without_ripple(t: Array, y: Array, period: float) -> Array:
-    """Signals without their dither's ripple (`remove_ripple`), as they are where the record is shorter than a period.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        [s]
-    y : ndarray, shape (m, n)
-    period : float
-        [s]; 0: no dither.
-
-    Returns
-    -------
-    ndarray, shape (m, n)
-    """
-    if not 0 < period <= t[-1] - t[0]:
-        return y
-    first, averaged = y[:, :1], t[t <= t[-1] - period / 2]
-    return remove_ripple(t, y, first + period_mean(t, y - first, 0.0, period, averaged), period).signal
-
-
-def first_largest(speeds: Array) -> Indices:
-    """Index of the first entry of each row that is as large as its largest magnitude, but for `SPEED_TOLERANCE`."""
-    sizes = np.abs(speeds)
-    return np.asarray(np.argmax(sizes >= (1 - SPEED_TOLERANCE) * sizes.max(axis=1, keepdims=True), axis=1))
-
-
-def worst_margins(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """The worst of each metric over operating points: NaN and infinite where the loop is unstable at one of them.
-
-    Of a gain margin that is the closest to one, of a phase margin the smallest magnitude, of a friction's slope the
-    smallest value. A noise gain does not count before the step: a body that sticks answers a constant error of its
-    speed's measurement by a command that grows without bound.
-    """
-    given = list(rows)
-    named = [n for n in MARGIN_METRICS if given and n in given[0]]
-    return {n: _worst(n, [row[n] for row in given[-counted_points(n, len(given)) :]]) for n in named}
-
-
-def counted_points(metric: str, count: int) -> int:
-    """How many of the last of so many operating points count for a metric; see `worst_margins`."""
-    return max(1, count - 1) if metric == NOISE_GAIN else count
-
-
-def worst_open_loop(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
-) -> tuple[str, Linearisation]:
-    """The open loop at the operating point where its sensitivity peak is the largest, and the point's name."""
-    points = operating_points(loop, parameters, reference, response)
-    loops = [(point.name, open_loop(loop, parameters, point.x, point.inputs)) for point in points]
-    peaks = [m.max_sensitivity if m.stable else inf for m in (margins(linear) for _, linear in loops)]
-    return loops[int(np.argmax(peaks))]
-
-
-def friction_slope(loop: ClosedLoop, parameters: ParameterSet, linear: Linearisation) -> dict[str, float]:
-    """FrictionSlope: derivative of the steady friction force to speed [N s/m]; for drives with a load.
-
-    This is the viscous friction of the linearised plant, or open loop, at low frequencies, where the bristles follow
-    the speed. A negative slope makes crawl likely.
-    """
-    states, axis = names(loop.plant.states), loop.plant.axis
-    if axis is None or not any(n.startswith("friction.") for n in loop.plant.parameters):
-        return {}
-    A = linear.A
-    v, z = states.index(axis.speed), [k for k, n in enumerate(states) if n.startswith("friction.")]
-    bristles = A[v, z] @ np.linalg.solve(A[np.ix_(z, z)], A[z, v]) if z else 0.0
-    return {FRICTION_SLOPE: float(-parameters.value(axis.inertia) * (A[v, v] - bristles))}
-
-
-def _find_points(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
-) -> Iterator[OperatingPoint]:
-    disturbed = {disturbance_input(n): v for n, v in reference.disturbance.items()}
-    t, signals = response.t, response.matrix([*names(loop.plant.states), "control"]).T
-    signals = without_ripple(t, signals, loop.dither_period(parameters) or 0.0)
-
-    def point(name: str, k: int) -> OperatingPoint:
-        inputs = {loop.command.name: float(signals[-1, k]), **disturbed}
-        return OperatingPoint(name, float(t[k]), signals[:-1, k], inputs)
-
-    if not is_affine(loop.plant):
-        axis = loop.plant.axis
-        at_rest = set_sliding_direction(loop, parameters, reference.origin)
-        x, command = find_rest(loop, at_rest, reference.origin, reference.start)
-        v = None if axis is None else names(loop.plant.states).index(axis.speed)
-        moves = v is not None and abs(x[v]) > RESTING_SPEED * loop.plant.states[v].nominal
-        yield OperatingPoint(AT_THE_START if moves else AT_REST, float(t[0]), x, {loop.command.name: command})
-        if v is not None:
-            first = int(np.searchsorted(t, reference.at))
-            yield point(SLIDING, first + int(first_largest(signals[v, None, first:])[0]))
-    yield point(AT_THE_END, -1)
-
-
-def _margin_row(loop: ClosedLoop, parameters: ParameterSet, point: OperatingPoint, horizon: float) -> dict[str, Any]:
-    linear, lowest = open_loop(loop, parameters, point.x, point.inputs), lowest_noise_frequency(horizon)
-    on_grid = GridResponse.of(linear)
-    robust, at = margins(linear, on_grid), (loop, parameters, point.x, point.inputs)
-    controller = noise_path(*at) if loop.is_composed else operating_gains(*at)
-    found = {
-        "MaxSensitivity": robust.max_sensitivity,
-        "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
-        "GainMargin": robust.gain_margin,
-        "PhaseMargin": robust.phase_margin,
-        NOISE_GAIN: noise_gain(linear, controller, lowest, on_grid),
-    }
-    if not robust.stable:
-        found = {n: nan if n.endswith("Margin") else inf for n in found}
-    slope = friction_slope(loop, parameters, linear)
-    return {"point": point.name, "t": point.t, **found, **slope, "stable": robust.stable}
-
-
-def _worst(metric: str, values: list[float]) -> float:
-    if any(isnan(v) for v in values):
-        return nan
-    if metric == FRICTION_SLOPE:
-        return min(values)
-    return max(values, key=lambda v: float(METRICS[metric].requirement_value(v)))
-
-
 ComplexArray = NDArray[np.complex128]
-
-
-def are_stable(closed: Array, poles: ComplexArray | None = None) -> NDArray[np.bool_]:
-    """Which closed loops are stable, by their state matrices, shape (m, n, n), and their poles where they are known.
-
-    Poles at zero are allowed: a position in a speed loop, an unused integral. A pole counts as zero where rounding may
-    have moved it that far, whatever the fastest pole (`_has_stable_poles`).
-    """
-    found = np.linalg.eigvals(closed).astype(complex) if poles is None else poles
-    growth, size = found.real.max(axis=-1, initial=-1.0), np.abs(found).max(axis=-1, initial=1.0)
-    stable = np.asarray(growth <= 0)
-    for k in np.flatnonzero(~stable & (growth <= MOST_POLE_ROUNDING * size)):
-        label = connected_components(closed[k] != 0, connection="strong")[1]
-        parts = (np.flatnonzero(label == part) for part in range(label.max() + 1))
-        stable[k] = all(_has_stable_poles(closed[k][np.ix_(part, part)]) for part in parts)
-    return stable
-
-
-def _has_stable_poles(A: Array) -> bool:
-    """Whether no pole of a matrix, none of whose parts stands alone, lies further right of zero than rounding moves it.
-
-    That is `POLE_ROUNDING` times the size of the balanced matrix times the pole's condition number: G. H. Golub & C. F.
-    Van Loan, Matrix Computations, 4th ed., Johns Hopkins 2013, section 7.2.2.
-    """
-    balanced = matrix_balance(A)[0]
-    parts: Any = eig(balanced, left=True, right=True)
-    poles, left, right = parts
-    with np.errstate(divide="ignore"):
-        condition = 1 / np.abs((left.conj() * right).sum(axis=0))
-    return bool((poles.real <= POLE_ROUNDING * np.linalg.norm(balanced) * condition).all())
 
 
 @dataclass(frozen=True)
@@ -316,17 +93,10 @@ class Margins:
 
 @dataclass(frozen=True, eq=False)
 class GridResponse:
-    """The response of an open loop on its `frequency_grid`, which margins and noise gain share: most of their time.
+    """The response of an open loop on its `frequency_grid`, which margins and noise gain share: most of their time."""
 
-    Attributes
-    ----------
-    omega : ndarray, shape (n,)
-        [rad/s]
-    L : ndarray of complex, shape (n,)
-    """
-
-    omega: Array
-    L: ComplexArray
+    omega: Array  # [rad/s], shape (n,)
+    L: ComplexArray  # shape (n,)
 
     @classmethod
     def of(cls, open_loop: Linearisation) -> "GridResponse":
@@ -383,199 +153,6 @@ def margins(open_loop: Linearisation, on_grid: GridResponse | None = None) -> Ma
     return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, stable)
 
 
-def lowest_noise_frequency(horizon: float) -> float:
-    """Frequency from which on a noise gain counts over a horizon [s]: slower noise is a drift that it does not show.
-
-    Examples
-    --------
-    >>> lowest_noise_frequency(0.5)
-    0.6
-    """
-    return NOISE_ANGLE / horizon
-
-
-def noise_gain(
-    open_loop: Linearisation,
-    controller: tuple[float, float, float, float] | Linearisation,
-    lowest_frequency: float = 0.0,
-    on_grid: GridResponse | None = None,
-) -> float:
-    """``max |C(jw)/(1 + L(jw))|``: the largest gain from measurement noise to the command.
-
-    The maximum control sensitivity of B. Kristiansson and B. Lennartson, Robust and optimal tuning of PI and PID
-    controllers, IEE Proc. Control Theory Appl. 149 (2002) 17-25; with a fast filter it is Kp + Kd/Tf.
-
-    Parameters
-    ----------
-    open_loop : Linearisation
-        ``L = C P`` (`open_loop`), strictly proper.
-    controller : (float, float, float, float) or Linearisation
-        Kp, Ki, Kd, Tf of the PID C, with Tf > 0; or C itself (`noise_path`).
-    lowest_frequency : float
-        [rad/s]; what lies below does not count. An integral answers a constant error of a measured speed without bound
-        where the plant cannot go on moving so, a piston whose chambers fill for example.
-    on_grid : GridResponse, optional
-        The loop's, where it is known.
-
-    Returns
-    -------
-    float
-        [command's unit/measured unit]
-
-    Examples
-    --------
-    A gain of 3 before ``1/(s + 1)`` follows noise at high frequencies with that gain, at rest with 3/4:
-
-    >>> L = Linearisation(*(np.array([[v]]) for v in (-1.0, 1.0, 3.0, 0.0)), ("x",), ("u",), ("y",))
-    >>> noise_gain(L, (3.0, 0.0, 0.0, 0.01))
-    3.0
-    """
-    if isinstance(controller, Linearisation):
-        at_infinity = float(controller.D[0, 0] / (1 + open_loop.D[0, 0]))
-    else:
-        Kp, _, Kd, Tf = controller
-        at_infinity = Kp + Kd / Tf
-
-    def control_response(w: Array, L: ComplexArray) -> ComplexArray:
-        if isinstance(controller, Linearisation):
-            return np.asarray(frequency_response(controller, w) / (1 + L))
-        a, b = controller_parts(controller, w)
-        return np.asarray((a + 1j * b) / (1 + L))
-
-    on_grid = on_grid or GridResponse.of(open_loop)
-    if lowest_frequency > on_grid.omega[0]:
-        counts, first = on_grid.omega > lowest_frequency, [lowest_frequency]
-        L = np.append(frequency_response(open_loop, first), on_grid.L[counts])
-        on_grid = GridResponse(np.append(first, on_grid.omega[counts]), L)
-    return _response_peak(control_response, open_loop, on_grid, at_infinity)[0]
-
-
-def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> ComplexArray:
-    """``C (jw I - A)^-1 B + D`` of a system with one input and one output.
-
-    Parameters
-    ----------
-    linearisation : Linearisation
-    omega : array_like, shape (n,)
-        [rad/s], positive.
-
-    Returns
-    -------
-    ndarray of complex, shape (n,)
-
-    Examples
-    --------
-    >>> lag = Linearisation(*(np.array([[v]]) for v in (-1.0, 1.0, 1.0, 0.0)), ("x",), ("u",), ("y",))
-    >>> complex(frequency_response(lag, [1.0])[0])
-    (0.5-0.5j)
-    """
-    single = linearisation.D.shape == (1, 1)
-    require(single, f"one input and one output expected, got D of shape {linearisation.D.shape}", ModelError)
-    w = np.asarray(omega, dtype=float)
-    require(bool(np.all(w > 0)), "frequencies must be positive [rad/s]")
-    return np.asarray(
-        batch_frequency_response(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0]
-        + linearisation.D[0, 0]
-    )
-
-
-def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
-    """Frequency grid that resolves the features of a loop, open and closed [rad/s].
-
-    Logarithmic from three decades below the slowest pole or zero to three above the fastest, denser at resonances.
-    """
-    roots = np.concatenate([eigvals(open_loop.A), eigvals(_closed_loop(open_loop)), _zeros(open_loop)])
-    size = [s for s in np.abs(roots) if s > 1e-10 * np.max(np.abs(roots))]
-    low, high = min(size, default=1.0), max(size, default=1.0)
-    decades = np.log10(high / low) + 6
-    grid = np.geomspace(1e-3 * low, 1e3 * high, int(np.ceil(decades * per_decade)) + 1)
-    ringing = roots[(roots.imag > 0) & (np.abs(roots.real) < 0.2 * roots.imag) & (roots.real != 0)]
-    around = [r.imag + abs(r.real) * np.linspace(-4, 4, 41) for r in ringing]
-    return np.unique(np.concatenate([grid, *around]))
-
-
-def sensitivity_terms(
-    loop: ClosedLoop, omega: ArrayLike, parameters: ParameterSet, x: Array | None = None
-) -> ca.Function:
-    """``|1 + L(jw)|^2`` as a smooth function of the PID's gains; ``1/Ms^2`` is its lower bound where Ms is kept.
-
-    The plant enters as numbers, its response at `parameters`, so each scenario needs its own terms.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    omega : array_like, shape (n,)
-        [rad/s], positive.
-    parameters : ParameterSet
-        The plant's values.
-    x : ndarray, shape (n_plant_states,), optional
-        The plant's operating point, as for `linear_plant`.
-
-    Returns
-    -------
-    casadi.Function
-        ``p -> terms``: p in the order of ``loop.parameters``, terms of shape (n,); depends on the gains only.
-
-    Raises
-    ------
-    ModelError
-        If a parameter of the plant is free: the terms do not depend on it; or a compensator's slope, which is no
-        smooth function of the gains, counts.
-    """
-    shaping = ", ".join(type(c).__name__ for c in loop.controller.acting_always)
-    told = "a cascade's speed loop has a response of its own; use margins(open_loop(...))"
-    require(loop.outer is None, told, ModelError)
-    told = "scheduled gains change with the operating point; use margins(open_loop(...))"
-    require(loop.schedule is None, told, ModelError)
-    message = f"{shaping}: its slope at the operating point counts in the sensitivity; use margins(open_loop(...))"
-    require(not shaping, message, ModelError)
-    free = [n for n in parameters.free_names if n in loop.plant.parameters]
-    require(
-        not free,
-        f"{', '.join(free)}: free, but the sensitivity needs a fixed plant; fix it",
-        ModelError,
-    )
-    w = np.asarray(omega, dtype=float)
-    P = frequency_response(linear_plant(loop, parameters, x), w) * pade_delay_response(w, loop.dead_time)
-    p = ca.SX.sym("p", len(loop.parameters))
-    Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
-    ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
-    a, b = controller_parts((Kp, Ki, Kd, Tf), ws)
-    terms = (1 + a * re - b * im) ** 2 + (a * im + b * re) ** 2
-    return ca.Function("sensitivity_terms", [p], [terms], ["p"], ["terms"])
-
-
-def batch_frequency_response(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
-    """``C (jw I - A)^-1 B`` of m systems, shape (m, n), at frequencies of shape (n,), the same for all, or (m, n).
-
-    At a frequency at which a system has no response, an undamped pole, it is NaN.
-    """
-    resolvent = np.broadcast_to(-A[:, None], (len(A), w.shape[-1], *A.shape[1:])).astype(complex)
-    each = np.arange(A.shape[-1])
-    resolvent[..., each, each] += 1j * w[..., None]
-    x = _solve_regular(resolvent, np.broadcast_to(B[:, None, :, None], (*resolvent.shape[:3], 1)).astype(complex))
-    return np.asarray((C[:, None, None] @ x)[..., 0, 0])
-
-
-def _solve_regular(matrices: ComplexArray, right: ComplexArray) -> ComplexArray:
-    """Solutions of linear equations, shape (m, n, k, 1); NaN of a singular matrix, for which NumPy refuses all."""
-    try:
-        return np.asarray(np.linalg.solve(matrices, right))
-    except np.linalg.LinAlgError:
-        if len(matrices) == 1 and matrices.shape[1] == 1:
-            return np.full_like(right, nan)
-    axis = 0 if len(matrices) > 1 else 1
-    halves = zip(*(np.array_split(a, 2, axis=axis) for a in (matrices, right)), strict=True)
-    return np.concatenate([_solve_regular(*half) for half in halves], axis=axis)
-
-
-def controller_parts(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:
-    """Real and imaginary part of the PID's frequency response, for gains Kp, Ki, Kd, Tf in numbers or symbols."""
-    Kp, Ki, Kd, Tf = gains
-    lag = 1 / (1 + (Tf * w) ** 2)
-    return Kp + Kd * Tf * w**2 * lag, Kd * w * lag - Ki / w
-
-
 def _crossing_frequencies(function: Callable[[float], float], omega: Array, values: Array) -> list[float]:
     """Frequencies at which a function is zero, bracketed by sign changes on the grid."""
     brackets = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
@@ -612,8 +189,126 @@ def _response_peak(
     return (largest, at) if largest > abs(limit) else (abs(limit), inf)
 
 
-def _closed_loop(open_loop: Linearisation) -> Array:
-    return np.asarray(open_loop.A - open_loop.B @ open_loop.C / (1 + open_loop.D[0, 0]))
+def noise_gain(
+    open_loop: Linearisation,
+    controller: tuple[float, float, float, float] | Linearisation,
+    lowest_frequency: float = 0.0,
+    on_grid: GridResponse | None = None,
+) -> float:
+    """``max |C(jw)/(1 + L(jw))|``: the largest gain from measurement noise to the command.
+
+    The maximum control sensitivity of B. Kristiansson and B. Lennartson, Robust and optimal tuning of PI and PID
+    controllers, IEE Proc. Control Theory Appl. 149 (2002) 17-25; with a fast filter it is Kp + Kd/Tf.
+
+    The controller is Kp, Ki, Kd, Tf of a PID with Tf > 0, or a linear system (`noise_path`). Lower frequencies than
+    `lowest_frequency` [rad/s] do not count: an integral answers a constant error of a measured speed without bound
+    where the plant cannot go on moving so, a piston whose chambers fill for example.
+
+    Examples
+    --------
+    A gain of 3 before ``1/(s + 1)`` follows noise at high frequencies with that gain, at rest with 3/4:
+
+    >>> L = Linearisation(*(np.array([[v]]) for v in (-1.0, 1.0, 3.0, 0.0)), ("x",), ("u",), ("y",))
+    >>> noise_gain(L, (3.0, 0.0, 0.0, 0.01))
+    3.0
+    """
+    if isinstance(controller, Linearisation):
+        at_infinity = float(controller.D[0, 0] / (1 + open_loop.D[0, 0]))
+    else:
+        Kp, _, Kd, Tf = controller
+        at_infinity = Kp + Kd / Tf
+
+    def control_response(w: Array, L: ComplexArray) -> ComplexArray:
+        if isinstance(controller, Linearisation):
+            return np.asarray(frequency_response(controller, w) / (1 + L))
+        a, b = controller_parts(controller, w)
+        return np.asarray((a + 1j * b) / (1 + L))
+
+    on_grid = on_grid or GridResponse.of(open_loop)
+    if lowest_frequency > on_grid.omega[0]:
+        counts, first = on_grid.omega > lowest_frequency, [lowest_frequency]
+        L = np.append(frequency_response(open_loop, first), on_grid.L[counts])
+        on_grid = GridResponse(np.append(first, on_grid.omega[counts]), L)
+    return _response_peak(control_response, open_loop, on_grid, at_infinity)[0]
+
+
+def lowest_noise_frequency(horizon: float) -> float:
+    """Frequency from which on a noise gain counts over a horizon [s]: slower noise is a drift that it does not show.
+
+    Examples
+    --------
+    >>> lowest_noise_frequency(0.5)
+    0.6
+    """
+    return NOISE_ANGLE / horizon
+
+
+def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> ComplexArray:
+    """``C (jw I - A)^-1 B + D`` of a system with one input and one output.
+
+    Parameters
+    ----------
+    linearisation : Linearisation
+    omega : array_like, shape (n,)
+        [rad/s], positive.
+
+    Returns
+    -------
+    ndarray of complex, shape (n,)
+
+    Examples
+    --------
+    >>> lag = Linearisation(*(np.array([[v]]) for v in (-1.0, 1.0, 1.0, 0.0)), ("x",), ("u",), ("y",))
+    >>> complex(frequency_response(lag, [1.0])[0])
+    (0.5-0.5j)
+    """
+    single = linearisation.D.shape == (1, 1)
+    require(single, f"one input and one output expected, got D of shape {linearisation.D.shape}", ModelError)
+    w = np.asarray(omega, dtype=float)
+    require(bool(np.all(w > 0)), "frequencies must be positive [rad/s]")
+    return np.asarray(
+        batch_frequency_response(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0]
+        + linearisation.D[0, 0]
+    )
+
+
+def batch_frequency_response(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
+    """``C (jw I - A)^-1 B`` of m systems, shape (m, n), at frequencies of shape (n,), the same for all, or (m, n).
+
+    At a frequency at which a system has no response, an undamped pole, it is NaN.
+    """
+    resolvent = np.broadcast_to(-A[:, None], (len(A), w.shape[-1], *A.shape[1:])).astype(complex)
+    each = np.arange(A.shape[-1])
+    resolvent[..., each, each] += 1j * w[..., None]
+    x = _solve_regular(resolvent, np.broadcast_to(B[:, None, :, None], (*resolvent.shape[:3], 1)).astype(complex))
+    return np.asarray((C[:, None, None] @ x)[..., 0, 0])
+
+
+def _solve_regular(matrices: ComplexArray, right: ComplexArray) -> ComplexArray:
+    """Solutions of linear equations, shape (m, n, k, 1); NaN of a singular matrix, for which NumPy refuses all."""
+    try:
+        return np.asarray(np.linalg.solve(matrices, right))
+    except np.linalg.LinAlgError:
+        if len(matrices) == 1 and matrices.shape[1] == 1:
+            return np.full_like(right, nan)
+    axis = 0 if len(matrices) > 1 else 1
+    halves = zip(*(np.array_split(a, 2, axis=axis) for a in (matrices, right)), strict=True)
+    return np.concatenate([_solve_regular(*half) for half in halves], axis=axis)
+
+
+def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
+    """Frequency grid that resolves the features of a loop, open and closed [rad/s].
+
+    Logarithmic from three decades below the slowest pole or zero to three above the fastest, denser at resonances.
+    """
+    roots = np.concatenate([eigvals(open_loop.A), eigvals(_closed_loop(open_loop)), _zeros(open_loop)])
+    size = [s for s in np.abs(roots) if s > 1e-10 * np.max(np.abs(roots))]
+    low, high = min(size, default=1.0), max(size, default=1.0)
+    decades = np.log10(high / low) + 6
+    grid = np.geomspace(1e-3 * low, 1e3 * high, int(np.ceil(decades * per_decade)) + 1)
+    ringing = roots[(roots.imag > 0) & (np.abs(roots.real) < 0.2 * roots.imag) & (roots.real != 0)]
+    around = [r.imag + abs(r.real) * np.linspace(-4, 4, 41) for r in ringing]
+    return np.unique(np.concatenate([grid, *around]))
 
 
 def _zeros(open_loop: Linearisation) -> ComplexArray:
@@ -622,3 +317,203 @@ def _zeros(open_loop: Linearisation) -> ComplexArray:
     zeros = np.asarray(eigvals(pencil, np.diag([1.0] * n + [0.0])), dtype=complex)
     fastest = np.max(np.abs(eigvals(open_loop.A)), initial=1.0)
     return np.array([z for z in zeros if np.abs(z) < 1e3 * fastest], dtype=complex)
+
+
+def _closed_loop(open_loop: Linearisation) -> Array:
+    return np.asarray(open_loop.A - open_loop.B @ open_loop.C / (1 + open_loop.D[0, 0]))
+
+
+def are_stable(closed: Array, poles: ComplexArray | None = None) -> NDArray[np.bool_]:
+    """Which closed loops are stable, by their state matrices, shape (m, n, n), and their poles where they are known.
+
+    Poles at zero are allowed, a position in a speed loop or an unused integral: a pole counts as zero where rounding
+    may have moved it that far, whatever the fastest pole (`_has_stable_poles`).
+    """
+    found = np.linalg.eigvals(closed).astype(complex) if poles is None else poles
+    growth, size = found.real.max(axis=-1, initial=-1.0), np.abs(found).max(axis=-1, initial=1.0)
+    stable = np.asarray(growth <= 0)
+    for k in np.flatnonzero(~stable & (growth <= MOST_POLE_ROUNDING * size)):
+        label = connected_components(closed[k] != 0, connection="strong")[1]
+        parts = (np.flatnonzero(label == part) for part in range(label.max() + 1))
+        stable[k] = all(_has_stable_poles(closed[k][np.ix_(part, part)]) for part in parts)
+    return stable
+
+
+def _has_stable_poles(A: Array) -> bool:
+    """Whether no pole of a matrix, none of whose parts stands alone, lies further right of zero than rounding moves it.
+
+    That is `POLE_ROUNDING` times the size of the balanced matrix times the pole's condition number: G. H. Golub & C. F.
+    Van Loan, Matrix Computations, 4th ed., Johns Hopkins 2013, section 7.2.2.
+    """
+    balanced = matrix_balance(A)[0]
+    parts: Any = eig(balanced, left=True, right=True)
+    poles, left, right = parts
+    with np.errstate(divide="ignore"):
+        condition = 1 / np.abs((left.conj() * right).sum(axis=0))
+    return bool((poles.real <= POLE_ROUNDING * np.linalg.norm(balanced) * condition).all())
+
+
+def sensitivity_terms(
+    loop: ClosedLoop, omega: ArrayLike, parameters: ParameterSet, x: Array | None = None
+) -> ca.Function:
+    """``|1 + L(jw)|^2`` as a smooth function of the PID's gains; ``1/Ms^2`` is its lower bound where Ms is kept.
+
+    A search limits the maximum sensitivity Ms by ``terms(p) >= 1 / Ms**2``, p in the order of ``loop.parameters``:
+    numbers, SX or MX. The plant enters as numbers, its response at `parameters` and, where it is nonlinear, at the
+    state x, so each scenario needs its own terms, and none of its parameters may be free. A loop with a compensator
+    that counts, a cascade or scheduled gains is refused: its sensitivity is no such function of the gains.
+    """
+    shaping = ", ".join(type(c).__name__ for c in loop.controller.acting_always)
+    told = "a cascade's speed loop has a response of its own; use margins(open_loop(...))"
+    require(loop.outer is None, told, ModelError)
+    told = "scheduled gains change with the operating point; use margins(open_loop(...))"
+    require(loop.schedule is None, told, ModelError)
+    message = f"{shaping}: its slope at the operating point counts in the sensitivity; use margins(open_loop(...))"
+    require(not shaping, message, ModelError)
+    free = [n for n in parameters.free_names if n in loop.plant.parameters]
+    require(
+        not free,
+        f"{', '.join(free)}: free, but the sensitivity needs a fixed plant; fix it",
+        ModelError,
+    )
+    w = np.asarray(omega, dtype=float)
+    P = frequency_response(linear_plant(loop, parameters, x), w) * pade_delay_response(w, loop.dead_time)
+    p = ca.SX.sym("p", len(loop.parameters))
+    Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
+    ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
+    a, b = controller_parts((Kp, Ki, Kd, Tf), ws)
+    terms = (1 + a * re - b * im) ** 2 + (a * im + b * re) ** 2
+    return ca.Function("sensitivity_terms", [p], [terms], ["p"], ["terms"])
+
+
+def controller_parts(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:
+    """Real and imaginary part of the PID's frequency response, for gains Kp, Ki, Kd, Tf in numbers or symbols."""
+    Kp, Ki, Kd, Tf = gains
+    lag = 1 / (1 + (Tf * w) ** 2)
+    return Kp + Kd * Tf * w**2 * lag, Kd * w * lag - Ki / w
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingPoint:
+    """A point at which a loop is linearised."""
+
+    name: str  # "at rest", "at the start", "sliding" or "at the end"
+    t: float  # when the response passes it [s]
+    x: Array  # the plant's states, shape (n_plant_states,)
+    inputs: Mapping[str, float]  # of the plant, the command and the disturbances; absent ones are zero
+
+
+def operating_points(
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
+) -> tuple[OperatingPoint, ...]:
+    """The operating points that a step response passes, of a loop with inputs for the reference's disturbances."""
+    disturbed = {disturbance_input(n): v for n, v in reference.disturbance.items()}
+    t, signals = response.t, response.matrix([*names(loop.plant.states), "control"]).T
+    signals = without_ripple(t, signals, loop.dither_period(parameters) or 0.0)
+
+    def point(name: str, k: int) -> OperatingPoint:
+        inputs = {loop.command.name: float(signals[-1, k]), **disturbed}
+        return OperatingPoint(name, float(t[k]), signals[:-1, k], inputs)
+
+    if is_affine(loop.plant):
+        return (point(AT_THE_END, -1),)
+    axis = loop.plant.axis
+    at_rest = set_sliding_direction(loop, parameters, reference.origin)
+    x, command = find_rest(loop, at_rest, reference.origin, reference.start)
+    v = None if axis is None else names(loop.plant.states).index(axis.speed)
+    moves = v is not None and abs(x[v]) > RESTING_SPEED * loop.plant.states[v].nominal
+    start = OperatingPoint(AT_THE_START if moves else AT_REST, float(t[0]), x, {loop.command.name: command})
+    if v is None:
+        return start, point(AT_THE_END, -1)
+    first = int(np.searchsorted(t, reference.at))
+    return start, point(SLIDING, first + int(first_largest(signals[v, None, first:])[0])), point(AT_THE_END, -1)
+
+
+def without_ripple(t: Array, y: Array, period: float) -> Array:
+    """Signals (m, n) without their dither's ripple; as they are where the record is shorter than a period."""
+    if not 0 < period <= t[-1] - t[0]:
+        return y
+    first, averaged = y[:, :1], t[t <= t[-1] - period / 2]
+    return remove_ripple(t, y, first + period_mean(t, y - first, 0.0, period, averaged), period).signal
+
+
+def first_largest(speeds: Array) -> Indices:
+    """Index of the first entry of each row that is as large as its largest magnitude, but for `SPEED_TOLERANCE`."""
+    sizes = np.abs(speeds)
+    return np.asarray(np.argmax(sizes >= (1 - SPEED_TOLERANCE) * sizes.max(axis=1, keepdims=True), axis=1))
+
+
+def margin_rows(
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
+) -> tuple[dict[str, Any], ...]:
+    """A row for each of the `operating_points`: "point", "t" [s], the linear loop's metrics of `evaluate`, "stable"."""
+    rows, lowest = list[dict[str, Any]](), lowest_noise_frequency(reference.horizon)
+    for point in operating_points(loop, parameters, reference, response):
+        at = (loop, parameters, point.x, point.inputs)
+        linear = open_loop(*at)
+        on_grid = GridResponse.of(linear)
+        robust, controller = margins(linear, on_grid), noise_path(*at) if loop.is_composed else operating_gains(*at)
+        found = {
+            "MaxSensitivity": robust.max_sensitivity,
+            "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
+            "GainMargin": robust.gain_margin,
+            "PhaseMargin": robust.phase_margin,
+            NOISE_GAIN: noise_gain(linear, controller, lowest, on_grid),
+        }
+        if not robust.stable:
+            found = {n: nan if n.endswith("Margin") else inf for n in found}
+        slope = friction_slope(loop, parameters, linear)
+        rows.append({"point": point.name, "t": point.t, **found, **slope, "stable": robust.stable})
+    return tuple(rows)
+
+
+def worst_margins(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """The worst of each metric over operating points: NaN and infinite where the loop is unstable at one of them.
+
+    Of a gain margin that is the closest to one, of a phase margin the smallest magnitude, of a friction's slope the
+    smallest value.
+    """
+    given, worst = list(rows), dict[str, float]()
+    for metric in (n for n in MARGIN_METRICS if given and n in given[0]):
+        values = [row[metric] for row in given[-counted_points(metric, len(given)) :]]
+        if any(isnan(v) for v in values):
+            worst[metric] = nan
+        elif metric == FRICTION_SLOPE:
+            worst[metric] = min(values)
+        else:
+            worst[metric] = max(values, key=lambda v: float(METRICS[metric].requirement_value(v)))
+    return worst
+
+
+def counted_points(metric: str, count: int) -> int:
+    """How many of the last of so many operating points count for a metric.
+
+    A noise gain does not count before the step: a body that sticks answers a constant error of its speed's measurement
+    by a command that grows without bound.
+    """
+    return max(1, count - 1) if metric == NOISE_GAIN else count
+
+
+def friction_slope(loop: ClosedLoop, parameters: ParameterSet, linear: Linearisation) -> dict[str, float]:
+    """FrictionSlope: derivative of the steady friction force to speed [N s/m]; for drives with a load.
+
+    This is the viscous friction of the linearised plant, or open loop, at low frequencies, where the bristles follow
+    the speed. A negative slope makes crawl likely.
+    """
+    states, axis = names(loop.plant.states), loop.plant.axis
+    if axis is None or not any(n.startswith("friction.") for n in loop.plant.parameters):
+        return {}
+    A = linear.A
+    v, z = states.index(axis.speed), [k for k, n in enumerate(states) if n.startswith("friction.")]
+    bristles = A[v, z] @ np.linalg.solve(A[np.ix_(z, z)], A[z, v]) if z else 0.0
+    return {FRICTION_SLOPE: float(-parameters.value(axis.inertia) * (A[v, v] - bristles))}
+
+
+def worst_open_loop(
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
+) -> tuple[str, Linearisation]:
+    """The open loop at the operating point where its sensitivity peak is the largest, and the point's name."""
+    points = operating_points(loop, parameters, reference, response)
+    loops = [(point.name, open_loop(loop, parameters, point.x, point.inputs)) for point in points]
+    peaks = [m.max_sensitivity if m.stable else inf for m in (margins(linear) for _, linear in loops)]
+    return loops[int(np.argmax(peaks))]

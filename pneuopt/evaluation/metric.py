@@ -1,30 +1,22 @@
 """`Metric`: a record for each figure of a loop, which requirements, searches, files and tables read; `Requirement`.
 
-`StepRecord`: responses to a step with their derivatives, and the rows of each metric, one for each instant.
+A metric is the largest of its rows, which are read off a `StepRecord`: responses to a step with their derivatives.
+`evaluate` reads that largest value. A gradient search reads every row with its derivative, because the maximum of
+several rows is not smooth where another row becomes the largest.
 
-A metric is the largest of its rows. `evaluate` reads that largest value. A gradient search reads every row with its
-derivative, because the maximum of several rows is not smooth where another row becomes the largest.
+Then what the rows are read from. First, a response without the steady ripple of its dither (`remove_ripple`). The mean
+over a dither period (`period_mean` of signals that are linear between samples, twenty samples a period;
+`DitherPeriodMean` of a simulated integral, ten) is the wrong signal where the dither is small: it smooths the response
+itself, so a loop under a dither of a picovolt seems to settle earlier than the same loop without. So the mean counts
+only as far as the ripple explains its distance from the signal: the signal is moved towards its mean by at most
+`RIPPLE_ALLOWANCE` times the ripple's amplitude. Where the ripple is steady that gives the mean; without ripple it gives
+the signal. The amplitude is read at the end of the record, off the wave that repeats with the dither: a transient does
+not repeat, and an oscillation of the loop itself repeats with another period. Where a loop hunts with a period of few
+dither periods, the last of these tell the two apart to about 1 % of the step only: the metrics of such a loop, which no
+certificate lets through, differ by that from those without dither.
 
-Mean of sampled signals over a dither period: along the record, and at its end.
-
-`period_mean` takes signals to be linear between samples and needs twenty samples a period. `DitherPeriodMean` takes
-signals with their integral, which is a state of the simulation, and is as exact as that state from ten samples on.
-
-`remove_ripple`: a response without the steady ripple of its dither, on which metrics under dither are read.
-
-The mean over a dither period is the wrong signal to read where the dither is small: it smooths the response itself, so
-a loop under a dither of a picovolt seems to settle earlier than the same loop without. So the mean counts only as far
-as the ripple explains its distance from the signal: the signal is moved towards its mean by at most `RIPPLE_ALLOWANCE`
-times the ripple's amplitude. Where the ripple is steady that gives the mean; without ripple it gives the signal.
-
-The ripple's amplitude is read at the end of the record, off the wave that repeats with the dither. A transient does not
-repeat, and an oscillation of the loop itself repeats with another period, so that neither counts as ripple. Where a
-loop hunts with a period of few dither periods, the last of these tell the two apart to about 1 % of the step only: the
-metrics of such a loop, which no certificate lets through, differ by that from those without dither.
-
-Instants at which responses cross a level.
-
-`SettlingBand`: whether a signal is in its band, and since when; `Band`: its half width as users state it.
+Last, instants at which a response crosses a level or stays in its `SettlingBand`, whose half width users state as a
+`Band`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -64,52 +56,23 @@ def without_slopes(values: Array) -> ValuesAndSlopes:
 
 @dataclass(frozen=True, eq=False)
 class StepRecord:
-    """Responses of m loops to one step on one grid, and derivatives to N unknowns; N is 0 without a gradient search.
+    """Responses of m loops to one step on one grid, and derivatives to N unknowns; N is 0 without a gradient search."""
 
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        Time since the step [s].
-    error : tuple of ndarray, shapes (m, K) and (m, K, N)
-        Distance of the signal without ripple from the reference at the K nodes, which are every `stride`-th sample, as
-        a fraction of the step; and its derivatives to the unknowns.
-    final_error : tuple of ndarray, shapes (m, 1) and (m, 1, N)
-        The same at the end of the record.
-    command : tuple of ndarray, shapes (m, n) and (m, n, C), optional
-        The command [its unit] and its derivatives to the C simulated columns, which `chain` maps to the unknowns.
-    meter : mapping of str to tuple of ndarray
-        The meter's channels by name, with derivatives as for the command.
-    chain : ndarray, shape (m, C, N)
-        Derivatives of the columns to the unknowns.
-    stride : int
-        Samples between two nodes.
-    sample_time : float, optional
-        Sample time of the controller that holds the command [s].
-    envelope : sequence of (float, float, float)
-        Instants after the step [s], each with the lower and upper bound from then on, as fractions of the step.
-    is_step : bool
-        False where the reference stays and a disturbance moves the signal.
-    size : float
-        What the errors are fractions of, with the sign of the reference's change [measured unit].
-    wanted : ndarray, shape (K,), optional
-        Distance of the reference from its end at the nodes, as a fraction of the size; without it there is none.
-    push : float
-        By how much the load's force steps [N].
-    """
-
-    t: Array
+    t: Array  # since the step, shape (n,) [s]
+    # Distance of the signal without ripple from the reference at the K nodes, which are every `stride`-th sample
+    # [steps], shape (m, K), and its derivatives to the unknowns, shape (m, K, N); the same at the end, K = 1.
     error: ValuesAndSlopes
     final_error: ValuesAndSlopes
-    chain: Array
-    command: ValuesAndSlopes | None = None
-    meter: Mapping[str, ValuesAndSlopes] = field(default_factory=dict)
-    stride: int = 1
-    sample_time: float | None = None
-    envelope: Sequence[tuple[float, float, float]] = ()
-    is_step: bool = True
-    size: float = 1.0
-    wanted: Array | None = None
-    push: float = 0.0
+    chain: Array  # derivatives of the C simulated columns to the unknowns, shape (m, C, N)
+    command: ValuesAndSlopes | None = None  # shapes (m, n) and, to the columns, (m, n, C) [its unit]
+    meter: Mapping[str, ValuesAndSlopes] = field(default_factory=dict)  # its channels by name, as the command
+    stride: int = 1  # samples between two nodes
+    sample_time: float | None = None  # of the controller that holds the command [s]
+    envelope: Sequence[tuple[float, float, float]] = ()  # instants [s] with lower and upper bound from then on [steps]
+    is_step: bool = True  # False where the reference stays and a disturbance moves the signal
+    size: float = 1.0  # of a step, with the sign of the reference's change [measured unit]
+    wanted: Array | None = None  # distance of the reference from its end at the nodes, shape (K,) [steps]
+    push: float = 0.0  # by how much the load's force steps [N]
 
     @cached_property
     def nodes(self) -> Array:
@@ -151,18 +114,12 @@ class StepRecord:
 
 
 def _integrate(weights: Array, values: Array) -> Array:
-    """Weighted sums, shape (m, 1), of values of shape (m, K), on one core.
-
-    BLAS would start a thread for a fine record, which then waits for more work for 20 ms of CPU time.
-    """
+    """Weighted sums, shape (m, 1), of values (m, K); on one core, as a thread of BLAS waits for more work for 20 ms."""
     return np.asarray(np.einsum("k,mk->m", weights, values))[:, None]
 
 
 def _sum_rows(weights: Array, slopes: Array) -> Array:
-    """Weighted sums of slopes, shape (m, 1, N), of shapes (m, K) and (m, K, N).
-
-    Without unknowns, N = 0, they are not walked through: of a fine record that took a tenth of an evaluation.
-    """
+    """Weighted sums of slopes, shape (m, 1, N), of (m, K) and (m, K, N); not walked through where N = 0."""
     m, _, count = slopes.shape
     return np.asarray(np.einsum("mk,mkn->mn", weights, slopes))[:, None] if count else np.zeros((m, 1, 0))
 
@@ -253,65 +210,28 @@ class Source(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Metric:
-    """Name, unit and source of a figure of a loop, and how a requirement on it is checked.
+    """Name, unit and source of a figure of a loop, and how a requirement on it is checked."""
 
-    Parameters
-    ----------
-    name : str
-        The row of `evaluate`, and the class of the requirement, if there is one.
-    unit : str
-        Unit of a limit on it, SI; "1" for a pure number. "{command}" and "{measured}" stand for the loop's units.
-    source : Source
-    percent : bool
-        Whether tables show the metric in percent; a limit on it is a fraction all the same.
-    sense : Sense
-    limits : (float, float)
-        A limit must lie between these, both excluded.
-    advice : str
-        Remedy that is added to the message about a limit outside them.
-    floor : float
-        Smaller values count as this one in an objective.
-    resolution : float
-        Difference on the scale of `requirement_value` below which two simulations agree, whatever the value: a share of
-        a measured signal that no instrument shows, and more than the rounding of an integration.
-    cost : callable, optional
-        Maps the metric to a value that shall be small; needed where the metric itself shall be large.
-    headline : bool
-        Whether every table of a tuning shows it, even where no requirement names it.
-    slope : callable, optional
-        Maps a `StepRecord` to rows and their derivatives, shapes (m, R) and (m, R, N); the metric is the largest row,
-        as a fraction where it is shown in percent. A gradient search cannot use a metric without one.
-    channels : tuple of str
-        Channels of the plant's meter that it needs.
-    exact : bool
-        Whether `TwoPhase` has an equation for it.
-    shown : bool
-        Whether the screen shows it and a study may ask for it.
-    positions : bool
-        Whether it says something of a loop on a position only, so that the screen shows it of no other.
-
-    Raises
-    ------
-    InputError
-        If its name or its unit is missing.
-    """
-
-    name: str
-    unit: str
+    name: str  # the row of `evaluate`, and the class of the requirement, if there is one
+    unit: str  # of a limit on it, SI; "1" for a pure number; "{command}" and "{measured}" stand for the loop's units
     source: Source
-    percent: bool = False
+    percent: bool = False  # whether tables show it in percent; a limit on it is a fraction all the same
     sense: Sense = Sense.AT_MOST
-    limits: tuple[float, float] = (0.0, inf)
-    advice: str = ""
-    floor: float = -inf
+    limits: tuple[float, float] = (0.0, inf)  # between which a limit must lie, both excluded
+    advice: str = ""  # the remedy that ends the message about a limit outside them
+    floor: float = -inf  # smaller values count as this one in an objective
+    # Difference on the scale of `requirement_value` below which two simulations agree, whatever the value: a share of a
+    # measured signal that no instrument shows, and more than the rounding of an integration.
     resolution: float = 1e-6
-    cost: Callable[[Any], Any] | None = None
-    headline: bool = False
+    cost: Callable[[Any], Any] | None = None  # to a value that shall be small, where the metric itself shall be large
+    headline: bool = False  # whether every table of a tuning shows it, even where no requirement names it
+    # Maps a `StepRecord` to rows and derivatives, shapes (m, R) and (m, R, N), as fractions where it is shown in
+    # percent; a gradient search cannot use a metric without one.
     slope: RowReader | None = None
-    channels: tuple[str, ...] = ()
-    exact: bool = False
-    shown: bool = True
-    positions: bool = False
+    channels: tuple[str, ...] = ()  # of the plant's meter that it needs
+    exact: bool = False  # whether `TwoPhase` has an equation for it
+    shown: bool = True  # whether the screen shows it and a study may ask for it
+    positions: bool = False  # whether it says something of a loop on a position only
 
     def __post_init__(self) -> None:
         require(bool(self.name), f"a metric needs a name, the one in {self.unit!r} has none")
@@ -342,12 +262,7 @@ class Metric:
             return metric / self.factor if self.cost is None else self.cost(metric)
 
     def check_limit(self, limit: float | None) -> None:
-        """Refuse a limit that no loop can keep, or that every loop keeps.
-
-        Raises
-        ------
-        InputError
-        """
+        """Refuse a limit that no loop can keep, or that every loop keeps."""
         if limit is None:
             return
         check_argument(f"{self.name}: {self.sense.value}", limit, Real, "a number, as 0.05 for 5 %")
@@ -368,47 +283,20 @@ class Requirement:
 
 @dataclass(frozen=True)
 class AtMost(Requirement):
-    """A metric that shall be small.
-
-    Parameters
-    ----------
-    max : float, optional
-        The largest allowed value, in the metric's unit, a fraction where the metric counts in percent.
-    """
+    """A metric that shall be small; `max` is in its unit, a fraction where it counts in percent."""
 
     max: float | None = None
 
 
 @dataclass(frozen=True)
 class AtLeast(Requirement):
-    """A metric that shall be large; as a term its reciprocal is minimised.
-
-    Parameters
-    ----------
-    min : float, optional
-        The smallest allowed value, in the metric's unit.
-    """
+    """A metric that shall be large; as a term its reciprocal is minimised, and `min` is in the metric's unit."""
 
     min: float | None = None
 
 
 def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
-    """Centred mean over one period of signals that are linear between samples and `initial` before the first.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-    y : ndarray, shape (m, n)
-    initial : float
-    period : float
-        [s]
-    at : ndarray, shape (k,)
-        Instants, at least half a period before the end [s].
-
-    Returns
-    -------
-    ndarray, shape (m, k)
-    """
+    """Centred means over a period at k instants, shape (m, k), of signals (m, n), linear in between, or `initial`."""
     steps = 0.5 * np.diff(t) * (y[:, 1:] + y[:, :-1])
     whole = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
     ends = (_integral(t, y, whole, initial, at + side * period / 2) for side in (1, -1))
@@ -437,18 +325,10 @@ def _cut_end(t: Array, y: Array, span: float) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class DitherPeriodMean:
-    """Centred mean over a period, from an integral that is taken as cubic between samples.
+    """Centred mean over a period, from an integral that is taken as cubic between samples."""
 
-    Parameters
-    ----------
-    period : float
-        [s]
-    spacing : float
-        Spacing of the samples [s].
-    """
-
-    period: float
-    spacing: float
+    period: float  # [s]
+    spacing: float  # of the samples [s]
 
     @property
     def half_period_samples(self) -> int:
@@ -460,17 +340,7 @@ class DitherPeriodMean:
         return max(0, n - self.half_period_samples - 1)
 
     def means(self, signal: Array, integral: Array, initial: float, stride: int = 1) -> Array:
-        """Return the means at every `stride`-th sample that has one.
-
-        Parameters
-        ----------
-        signal, integral : ndarray, shape (m, n)
-        initial : float
-            The signal before the first sample.
-
-        Returns
-        -------
-        ndarray, shape (m, ceil(mean_count(n) / stride))
+        """Means, shape (m, ceil(mean_count(n) / stride)), of signals (m, n) with their integrals, `initial` before.
 
         Examples
         --------
@@ -504,39 +374,15 @@ def _integral(t: Array, y: Array, whole: Array, initial: float, at: Array) -> Ar
 
 @dataclass(frozen=True, eq=False)
 class RippleFree:
-    """Responses without their dither's ripple.
+    """Responses without their dither's ripple."""
 
-    Attributes
-    ----------
-    signal : ndarray, shape (m, n)
-        The signal moved towards its mean over a dither period, by at most the allowance.
-    final : ndarray, shape (m,)
-        The last sample, moved likewise towards the mean over the last periods.
-    ripple : ndarray, shape (m,)
-        Peak to peak of the ripple [unit of the signal].
-    """
-
-    signal: Array
-    final: Array
-    ripple: Array
+    signal: Array  # moved towards its mean over a dither period, by at most the allowance, shape (m, n)
+    final: Array  # the last sample, moved likewise towards the mean over the last periods, shape (m,)
+    ripple: Array  # peak to peak, shape (m,) [unit of the signal]
 
 
 def remove_ripple(t: Array, y: Array, means: Array, period: float) -> RippleFree:
-    """Move signals towards their means over a dither period, as far as their ripple at the end allows.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        [s]
-    y : ndarray, shape (m, n)
-    means : ndarray, shape (m, k)
-        Centred means over the period at the first k samples; those of the last half period have none.
-    period : float
-        [s]
-
-    Returns
-    -------
-    RippleFree
+    """Move signals (m, n) towards their means over a dither period at the first k samples (m, k), as far as it may.
 
     Examples
     --------
@@ -558,15 +404,6 @@ def remove_ripple(t: Array, y: Array, means: Array, period: float) -> RippleFree
 def describe_ripple(metrics: Mapping[str, float], size: float, band: float) -> str | None:
     """Sentence for a response of which only the mean over the dither's period settles; None for others.
 
-    Parameters
-    ----------
-    metrics : mapping of str to float
-        A column of `evaluate`.
-    size : float
-        The step's size [measured unit].
-    band : float
-        Half width of the settling band, a fraction of the step.
-
     Examples
     --------
     >>> from math import nan
@@ -582,35 +419,16 @@ def describe_ripple(metrics: Mapping[str, float], size: float, band: float) -> s
 
 
 def measure_ripple(t: Array, rest: Array, period: float) -> Array:
-    """Peak to peak of what repeats with the dither in the last whole periods of signals, shape (m,).
+    """Peak to peak of what repeats with the dither in the last periods, shape (m,), of signals less their means (m, n).
 
     It is that of the mean over the periods, in which an oscillation with another period averages out, or that of the
     calmest period, which a late transient leaves alone, whichever is smaller.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        [s]
-    rest : ndarray, shape (m, n)
-        Signals less their means over the period.
-    period : float
-        [s]
     """
     return ripple_and_slopes(t, (rest, np.zeros((len(rest), 0, len(t)))), *wave_instants(t, period))[0]
 
 
 def ripple_and_slopes(t: Array, rest: ValuesAndSlopes, at: Array, weights: Array) -> ValuesAndSlopes:
-    """`measure_ripple`, shape (m,), and its derivatives, shape (m, C).
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        Instants of a record, or of its end [s].
-    rest : tuple of ndarray, shapes (m, n) and (m, C, n)
-        Signals less their means, and the derivatives.
-    at, weights : ndarray
-        As `wave_instants` gives them for the whole record.
-    """
+    """`measure_ripple`, shape (m,), and its derivatives (m, C), of a record or its end and those (m, C, n)."""
     rows, slope_rows = (_interpolate(t, a, at).reshape(*a.shape[:-1], *weights.shape) for a in rest)
     wave = np.einsum("mcp,cp->mp", rows, weights)
     by_period, of_wave = np.ptp(rows, axis=2), np.ptp(wave, axis=1)
@@ -678,12 +496,7 @@ def pick_samples(rows: Array, k: NDArray[np.intp]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SettlingBand:
-    """The one answer to "is it in the band": a signal is, up to and on the edge; NaN is not.
-
-    Parameters
-    ----------
-    centre, half_width : float or ndarray, shape (m,)
-        [unit of the signal]
+    """The one answer to "is it in the band": a signal is, up to and on the edge; NaN is not. Both may be (m,).
 
     Examples
     --------
@@ -700,10 +513,9 @@ class SettlingBand:
         return np.asarray(np.abs(y - centre) <= (1 + EDGE_ROUNDING) * reach)
 
     def settling_times(self, t: Array, y: Array) -> Array:
-        """Instants from which responses stay in the band, linear between samples, shape (m,) [s].
+        """Instants from which responses (m, n) stay in the band, linear between samples, shape (m,) [s since the step].
 
         NaN where one ends outside, or comes in for good only in the record's last share, where it may just pass.
-        The instants t, shape (n,), begin at the step; y has the shape (m, n).
         """
         outside = ~self.contains(y)
         k = len(t) - 1 - np.argmax(outside[:, ::-1], axis=1)
@@ -717,10 +529,7 @@ class SettlingBand:
 
 
 def entry_for_good(t: Array, inside: Mask) -> float:
-    """Last instant outside the band of a response that was continued [s]; inf where it may leave the band again.
-
-    It may where it came in at the record's very end, or has been inside for hardly longer than ever before.
-    """
+    """Last instant outside the band of a continued response [s]; inf where it came in so late that it may leave."""
     outside, end = np.flatnonzero(~inside), float(t[-1])
     last = float(t[outside[-1]]) if len(outside) else 0.0
     late = last > end / 2 and end - last < MIN_STAY_RATIO * longest_stay(t, inside)
@@ -773,12 +582,7 @@ def band_number(band: Band) -> float:
 
 
 def band_share(band: Band, reference: Reference) -> float:
-    """Half width of a band as a fraction of the reference's size.
-
-    Raises
-    ------
-    InputError
-        If it is no fraction between 0 and 1, so that the response would begin settled or never settle.
+    """Half width of a band as a fraction of the reference's size; refused where the response would begin settled.
 
     Examples
     --------
@@ -796,13 +600,7 @@ def band_share(band: Band, reference: Reference) -> float:
 
 
 def describe_band(band: Band, unit: str) -> str:
-    """Write a band with its unit.
-
-    Parameters
-    ----------
-    band : Band
-    unit : str
-        The measured one.
+    """Write a band with its unit, given the measured one.
 
     Examples
     --------

@@ -1,12 +1,9 @@
 """Metrics of a step response, with python-control's keys, relative to the step's size.
 
-Metrics that are read off a plant's meter: air consumption, valve travel, energy.
-
-Instants at which a response is read, so close that its settling time, peaks and integrals are right.
-
-A horizon may be hundreds of times as long as the response: then readings at even distances miss what happens. From a
-first reading, `refine_instants` finds where the signal bends between readings, or where an integral of the error is not
-exact, and adds instants there.
+Then those that are read off a plant's meter, and the instants at which a response is read, so close that its settling
+time, peaks and integrals are right: a horizon may be hundreds of times as long as the response, and readings at even
+distances miss what happens. From a first reading, `refine_instants` finds where the signal bends between readings, or
+where an integral of the error is not exact, and adds instants there.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -41,7 +38,7 @@ from pneuopt.evaluation.tolerances import (
     PARTS_AT_A_TIME,
     SPREAD,
 )
-from pneuopt.quantities.arrays import Array, Indices, Mask
+from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -217,28 +214,17 @@ def batch_metrics(
     target: Array | None = None,
     push: float = 0.0,
 ) -> dict[str, Array]:
-    """Compute the metrics of many step responses on one grid at once; see `step_metrics`.
+    """Metrics (m,) of many step responses (m, n) on one grid at once; see `step_metrics`.
 
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-    y, control : ndarray, shape (m, n)
-        A row a response.
-    only : collection of str, optional
-        Metrics that are needed; others are left out where they cost time.
-    averaged : ndarray, shape (m, k), optional
-        Means over the dither's period at the first k samples from the step on, where they are known already.
-    meter : mapping of str to ndarray, shape (m, n), optional
-        Channels of the plant's meter.
-    wider : sequence of float, optional
-        Further settling bands, whose times are "SettlingTimes", shape (m, len(wider)).
-
-    Returns
-    -------
-    dict of str to ndarray, shape (m,)
+    `only` names the metrics that are needed, others are left out where they cost time. `averaged`, shape (m, k), are
+    means over the dither's period at the first k samples from the step on, where they are known. `meter` has the
+    channels of the plant's meter (m, n). `wider` are further settling bands, "SettlingTimes" of shape (m, len(wider)).
     """
     require(scale is not None or reference_final != initial, f"no step: the reference stays at {initial:g}")
+    shape = t.shape if control is None else control.shape[-1:]
+    require(shape == t.shape, f"t and control differ in shape: {t.shape} and {shape}")
     raw, size = _cut_record(t, y, start, band), reference_final - initial if scale is None else scale
+    first = len(t) - len(raw.t)
     smooth, last, ripple = _remove_ripple(raw, initial, dither_period, averaged)
     steady = last if final is None else np.full(len(raw.y), final)
     centre, width = steady, band * np.abs(steady - initial)
@@ -247,17 +233,18 @@ def batch_metrics(
     settled, settled_raw = (SettlingBand(centre, width).settling_times(part.t, part.y) for part in (smooth, raw))
     times = [SettlingBand(centre, other / band * width).settling_times(smooth.t, smooth.y) for other in wider]
     only_mean = np.isnan(settled_raw) & (settled > raw.t[-1] - MIN_SETTLED_PERIODS * (dither_period or 0.0))
-    record = _to_step_record(
-        raw,
-        (smooth.y - reference_final) / size,
-        (steady - reference_final) / size,
-        _samples_since(t, control, start),
-        {n: values[:, _first_index_since(t, start) :] for n, values in (meter or {}).items()},
-        sample_time,
-        envelope,
+    record = StepRecord(
+        raw.t,
+        without_slopes((smooth.y - reference_final) / size),
+        without_slopes(((steady - reference_final) / size)[:, None]),
+        np.zeros((len(y), 0, 0)),
+        None if control is None else without_slopes(control[:, first:]),
+        {n: without_slopes(values[:, first:]) for n, values in (meter or {}).items()},
+        sample_time=sample_time,
+        envelope=envelope,
         is_step=scale is None,
         size=size,
-        wanted=None if target is None else (target[_first_index_since(t, start) :] - reference_final) / size,
+        wanted=None if target is None else (target[first:] - reference_final) / size,
         push=push,
     )
     return {
@@ -269,66 +256,28 @@ def batch_metrics(
         "SteadyStateValue": steady,
         **({"Ripple": np.maximum(ripple, np.ptp(tail(raw.t, raw.y), axis=1))} if _wants(only, "Ripple") else {}),
         **({"SettlingTimes": np.transpose(times)} if wider else {}),
-        **{name: _largest(name, record) for name in ROW_METRICS if _wants(only, name) and _is_shown(name, record)},
+        **_row_metrics(record, only),
     }
 
 
-def _to_step_record(
-    raw: "Samples",
-    error: Array,
-    final_error: Array,
-    command: Array | None,
-    meter: Mapping[str, Array],
-    sample_time: float | None,
-    envelope: Envelope,
-    *,
-    is_step: bool,
-    size: float,
-    wanted: Array | None,
-    push: float,
-) -> StepRecord:
-    """Record of the responses from which the metrics with rows are computed."""
-    return StepRecord(
-        raw.t,
-        without_slopes(error),
-        without_slopes(final_error[:, None]),
-        np.zeros((len(error), 0, 0)),
-        None if command is None else without_slopes(command),
-        {n: without_slopes(values) for n, values in meter.items()},
-        sample_time=sample_time,
-        envelope=envelope,
-        is_step=is_step,
-        size=size,
-        wanted=wanted,
-        push=push,
-    )
-
-
-def _samples_since(t: Array, control: Array | None, start: float) -> Array | None:
-    if control is None:
-        return None
-    require(control.shape[-1:] == t.shape, f"t and control differ in shape: {t.shape} and {control.shape[-1:]}")
-    return control[:, _first_index_since(t, start) :]
-
-
-def _is_shown(name: str, record: StepRecord) -> bool:
-    return set(METRICS[name].channels) <= set(record.meter) and (
-        name != StepEnvelope.metric.name or bool(record.envelope)
-    )
-
-
-def _largest(name: str, record: StepRecord) -> Array:
-    metric = METRICS[name]
-    if metric.source is Source.COMMAND and record.command is None:
-        return np.full(len(record.error[0]), nan)
-    return metric.largest(record)
+def _row_metrics(record: StepRecord, only: Collection[str] | None) -> dict[str, Array]:
+    """Metrics that are the largest of their rows; none whose channels or envelope the record has not."""
+    found = {}
+    for name, metric in ((n, METRICS[n]) for n in ROW_METRICS if _wants(only, n)):
+        if name == StepEnvelope.metric.name and not record.envelope:
+            continue
+        if metric.source is Source.COMMAND and record.command is None:
+            found[name] = np.full(len(record.error[0]), nan)
+        elif set(metric.channels) <= set(record.meter):
+            found[name] = metric.largest(record)
+    return found
 
 
 def _cut_record(t: Array, y: Array, start: float, band: float) -> Samples:
     require(bool(np.all(np.diff(t) > 0)), "time must increase strictly")
     require(bool(np.all(np.isfinite(y))), "the response holds NaN or infinite values; a simulation that fails has none")
     require(0 < band < 1, f"band is a fraction between 0 and 1, got {band:g}; 2 % is 0.02")
-    first = _first_index_since(t, start)
+    first = int(np.searchsorted(t, start - 1e-12 * max(1.0, abs(start))))
     require(len(t) - first >= 3, f"fewer than three samples after the step at {start:g} s")
     return Samples(t[first:] - start, y[:, first:])
 
@@ -337,28 +286,19 @@ def _wants(only: Collection[str] | None, *metrics: str) -> bool:
     return only is None or any(n in only for n in metrics)
 
 
-def _first_index_since(t: Array, start: float) -> int:
-    return int(np.searchsorted(t, start - 1e-12 * max(1.0, abs(start))))
-
-
 def _remove_ripple(
     raw: Samples, initial: float, period: float | None, averaged: Array | None
 ) -> tuple[Samples, Array, Array]:
     """The response without its dither's ripple, its final values, and the ripple from peak to peak."""
     if period is None:
         return raw, raw.y[:, -1], np.zeros(len(raw.y))
-    means = _period_averages(raw, initial, period) if averaged is None else averaged
-    found = remove_ripple(raw.t, raw.y, means, period)
+    if averaged is None:
+        last = raw.t[-1] - period / 2
+        told = f"the record of {raw.t[-1]:g} s is too short to average over {period:g} s; simulate longer"
+        require(period > 0 and last > raw.t[0] + period, told)
+        averaged = period_mean(raw.t, raw.y, initial, period, raw.t[raw.t <= last])
+    found = remove_ripple(raw.t, raw.y, averaged, period)
     return Samples(raw.t, found.signal), found.final, found.ripple
-
-
-def _period_averages(record: Samples, initial: float, period: float) -> Array:
-    last = record.t[-1] - period / 2
-    require(
-        period > 0 and last > record.t[0] + period,
-        f"the record of {record.t[-1]:g} s is too short to average over {period:g} s; simulate longer",
-    )
-    return period_mean(record.t, record.y, initial, period, record.t[record.t <= last])
 
 
 def _rise_metrics(
@@ -420,13 +360,7 @@ def needed_channels(metrics: Collection[str]) -> tuple[str, ...]:
 
 
 def check_channels(plant: System, metrics: Collection[str]) -> None:
-    """Refuse a metric whose channel the plant's meter lacks.
-
-    Raises
-    ------
-    InputError
-        It names the metric and the channel.
-    """
+    """Refuse a metric whose channel the plant's meter lacks."""
     shown = meter_channels(plant)
     for name in metrics:
         for channel in needed_channels([name]):
@@ -451,16 +385,7 @@ def meter_outputs(
 
 
 def meter_record(t: Array, channels: Mapping[str, Array], start: float) -> StepRecord:
-    """Record of the meter's channels alone, for many responses on one grid, from `start` on.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        [s]
-    channels : mapping of str to ndarray, shape (m, n)
-    start : float
-        [s]
-    """
+    """Record of the meter's channels (m, n) alone, for many responses on one grid, from `start` on."""
     kept = t >= start
     shown = {n: without_slopes(np.asarray(values)[:, kept]) for n, values in channels.items()}
     m = len(next(iter(channels.values())))
@@ -469,17 +394,7 @@ def meter_record(t: Array, channels: Mapping[str, Array], start: float) -> StepR
 
 
 def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory, start: float) -> dict[str, float]:
-    """Metrics of one response that the plant's meter shows, AirUse [l(ANR)] for example; none without a meter.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    parameters : ParameterSet
-    response : Trajectory
-        The plant's states, "control", and the loop's inputs where the plant has more than the command.
-    start : float
-        The instant from which the metrics count [s].
-    """
+    """Metrics of one response from `start` on that the plant's meter shows, AirUse [l(ANR)] for example."""
     plant, shown = loop.plant, meter_channels(loop.plant)
     if plant.meter is None:
         return {}
@@ -495,22 +410,7 @@ def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajecto
 def refine_instants(
     t: Array, signal: Array, target: float, size: float, start: float, tolerance: float = 1.0
 ) -> Array | None:
-    """Instants with others added where readings are too far apart; None where they are close enough.
-
-    Parameters
-    ----------
-    t, signal : ndarray, shape (n,)
-        Readings of the signal [s, its unit].
-    target, size : float
-        The reference and the step's size [the signal's unit].
-    start : float
-        When the step begins [s].
-    tolerance : float
-        Multiple of `LINE_TOLERANCE` and `INTEGRAL_TOLERANCE` that counts as close enough.
-
-    Returns
-    -------
-    ndarray or None
+    """Instants with others added where readings are too far apart, by a multiple of the tolerances; None where nowhere.
 
     Examples
     --------
@@ -524,7 +424,10 @@ def refine_instants(
     after, error = np.maximum(t - start, 0.0), np.where(t < start - 1e-12, 0.0, signal - target) / abs(size)
     coarse = np.diff(t) ** 2 / 8 * _curvatures(t, signal / abs(size)) > tolerance * LINE_TOLERANCE
     for integrand in (error, error**2, after * error):
-        coarse |= _is_inexact(t, integrand, tolerance)
+        # all intervals together may contribute this share of the integral of the integrand's size; a corner of that
+        # size, where the integrand changes its sign, is a small part of it all
+        most = tolerance * INTEGRAL_TOLERANCE * float(np.trapezoid(np.abs(integrand), t)) / (len(t) - 1)
+        coarse |= np.diff(t) ** 3 / 12 * _curvatures(t, integrand) > most
     fine = np.diff(t) > 8 * np.spacing(t[-1])
     chosen = np.flatnonzero(coarse & fine)
     if not len(chosen) or len(t) + (PARTS_AT_A_TIME - 1) * len(chosen) > MAX_INSTANTS:
@@ -535,16 +438,7 @@ def refine_instants(
 def spread_instants(even: Array, needed: Array, start: float) -> Array:
     """Instants for the responses of other gains, which are as fast as one's, but not at the same instants.
 
-    They are as close as those needed at a third to three times their time after the step.
-
-    Parameters
-    ----------
-    even : ndarray, shape (n,)
-        Readings before any were added [s].
-    needed : ndarray, shape (m,)
-        Instants of `refine_instants`, of one response or of several together [s].
-    start : float
-        When the step begins [s].
+    From the even ones on they come as close as those needed, at a third to three times their time after the step.
     """
     t, begin, width = even, needed[:-1], np.diff(needed)
     closest = width.min()
@@ -562,16 +456,6 @@ def _divide(t: Array, chosen: Indices) -> Array:
     """Instants with those added that divide the chosen intervals."""
     added = t[chosen, None] + np.diff(t)[chosen, None] * np.arange(1, PARTS_AT_A_TIME) / PARTS_AT_A_TIME
     return np.sort(np.concatenate([t, added.ravel()]))
-
-
-def _is_inexact(t: Array, integrand: Array, tolerance: float) -> Mask:
-    """Intervals whose share of the trapezoidal rule's error is too large, shape (n - 1,).
-
-    All intervals together may contribute `INTEGRAL_TOLERANCE` of the integral of its size, times `tolerance`. Where the
-    integrand changes its sign, its size has a corner, which is a small part of it all.
-    """
-    most = tolerance * INTEGRAL_TOLERANCE * float(np.trapezoid(np.abs(integrand), t)) / (len(t) - 1)
-    return np.asarray(np.diff(t) ** 3 / 12 * _curvatures(t, integrand) > most)
 
 
 def _curvatures(t: Array, y: Array) -> Array:

@@ -1,20 +1,17 @@
-"""`check_move`: refuse a move that no controller can make, with what can be made; `shortest_move`: the fastest left.
+"""`check_move`: refuse a move that no controller can make; `excitation_run`: moves whose log shows friction and valve.
 
-Two bounds that hold whatever the controller does. In steady motion at the move's largest speed the command must lie
-within its limits: what the valve lets through at the supply's pressure. And at full command, from rest, the body must
-have come half way, and have accelerated as much, as the first half of the move asks for: what supply, valve, friction
-and load leave of the force. A move that passes may still be followed badly.
+Two bounds hold whatever the controller does. In steady motion at the move's largest speed the command must lie within
+its limits: what the valve lets through at the supply's pressure. And at full command, from rest, the body must have
+come half way, and have accelerated as much, as the first half of the move asks for: what supply, valve, friction and
+load leave of the force. A move that passes may still be followed badly. `shortest_move` is the fastest that passes.
 
-`excitation_run`: moves that a plain position controller can play, and whose log shows friction, valve and mass.
-
-What each part of the run is for: fast and medium moves over most of the stroke, both ways, show the valve's
-conductance, viscous friction and the mass; slow ones stick and slip, or creep along the falling branch of a Stribeck
-curve; the shortest ones, each from a dwell, break away from rest and cross the valve's dead zone.
+An excitation run is one that a plain position controller can play. Its fast and medium moves over most of the stroke,
+both ways, show the valve's conductance, viscous friction and the mass; slow ones stick and slip, or creep along the
+falling branch of a Stribeck curve; the shortest ones, each from a dwell, break away and cross the valve's dead zone.
 """
 
 import warnings
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import ceil, copysign, inf, log
 
 import numpy as np
@@ -32,13 +29,10 @@ from pneuopt.evaluation.margins import margins
 from pneuopt.evaluation.response import TuningCase, check_travel, command_range
 from pneuopt.evaluation.tolerances import (
     ALLOWED_SHARE,
-    CALM,
-    CALM_WAY,
-    DWELL_DIGITS,
-    FAST_SHARE,
     FIRST_GAIN,
     FIRST_PUSH,
     GAIN_STEP,
+    GUESS_SHARE,
     GUESSED_SENSITIVITY,
     LEAST_DWELL,
     LEAST_FAST_SPEED,
@@ -49,18 +43,13 @@ from pneuopt.evaluation.tolerances import (
     MARGIN_SHARE,
     MEDIUM,
     MOST_FACTOR,
-    MOST_OVERSHOOT,
     MOST_TRIES,
     MOVE_BISECTIONS,
-    PLACE_DIGITS,
     PUSH_FACTOR,
     PUSH_SAMPLES,
     PUSH_TOLERANCE,
     REST_BEFORE,
     SETTLED_SHARE,
-    SHORT_WAY,
-    SLOW,
-    SLOW_WAY,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning, require
@@ -149,29 +138,14 @@ def scale_move(move: Move, factor: float) -> Move:
 
 @dataclass(frozen=True, eq=False)
 class _Abilities:
-    """What a plant can at most, forwards along a move.
-
-    Attributes
-    ----------
-    loop : ClosedLoop
-    parameters : ParameterSet
-        Of the case.
-    limits : tuple of (float, float, str)
-        Of the command, and whose they are.
-    position : float
-        At the start [its unit].
-    side : float
-        The direction of the move, 1 or -1.
-    push : Trajectory
-        From rest at full command: "way", "speed" and "acceleration" along the move.
-    """
+    """What a plant can at most, forwards along a move."""
 
     loop: ClosedLoop
-    parameters: ParameterSet
-    limits: tuple[float, float, str]
-    position: float
-    side: float
-    push: Trajectory
+    parameters: ParameterSet  # of the case
+    limits: tuple[float, float, str]  # of the command, and whose they are
+    position: float  # at the start [its unit]
+    side: float  # the direction of the move, 1 or -1
+    push: Trajectory  # from rest at full command: "way", "speed" and "acceleration" along the move
 
     def find_obstacle(self, move: Move) -> str:
         """The reason why a move cannot be made, with what can; empty where none is found."""
@@ -206,7 +180,8 @@ class _Abilities:
     def _force_obstacle(self, move: Move, acceleration: float, half: float) -> str:
         """Where full command from rest does not come so far, or not accelerate so much."""
         way, reached = abs(move.distance) / 2, float(self.push["acceleration"].max())
-        told = f"full command ({self._full_command}) from rest"
+        full = f"{self.limits[1 if self.side > 0 else 0]:.3g} {self.loop.command.unit}"
+        told = f"full command ({full}) from rest"
         if acceleration > reached:
             wanted, most = (self._write(v, "/s^2") for v in (acceleration, ALLOWED_SHARE * reached))
             return f"it accelerates with {wanted}, {told} with {most}; lower its acceleration"
@@ -217,10 +192,6 @@ class _Abilities:
             least = f", so that the move takes {2 * time:.3g} s at least" if time < inf else ""
             return f"its first half takes {half:.3g} s, {told} {best}{least}; lower its acceleration and speed"
         return ""
-
-    @cached_property
-    def _full_command(self) -> str:
-        return f"{self.limits[1 if self.side > 0 else 0]:.3g} {self.loop.command.unit}"
 
     def _write(self, value: float, per: str) -> str:
         return write_value(value, f"{self.loop.feedback.unit}{per}", 3)
@@ -236,19 +207,19 @@ def _abilities(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> 
     side = copysign(1.0, move.distance)
     x = case.initial(loop, parameters)[: len(loop.plant.states)]
     forwards = limits[1] if side > 0 else limits[0]
-    push = _push_half_way(loop, own, x, forwards, move)
+    push = _push_half_way(loop, axis, own, x, forwards, move)
     if push["way"].max() <= 0:  # the actuator is turned
-        push = _push_half_way(loop, own, x, limits[0] if side > 0 else limits[1], move)
+        push = _push_half_way(loop, axis, own, x, limits[0] if side > 0 else limits[1], move)
     return _Abilities(loop, own, limits, move.initial, side, push)
 
 
-def _push_half_way(loop: ClosedLoop, own: ParameterSet, x: Array, command: float, move: Move) -> Trajectory:
+def _push_half_way(loop: ClosedLoop, axis: Axis, own: ParameterSet, x: Array, command: float, move: Move) -> Trajectory:
     """The plant from rest at a constant command, along the move, until it has come half way or hardly moves."""
     duration, half = FIRST_PUSH * move.duration, abs(move.distance) / 2
     while True:
         run = _push(loop, own, x, command, duration)
-        side, position = copysign(1.0, move.distance), run[_axis(loop).position]
-        way, speed = side * (position - position[0]), side * run[_axis(loop).speed]
+        side, position = copysign(1.0, move.distance), run[axis.position]
+        way, speed = side * (position - position[0]), side * run[axis.speed]
         if way.max() >= half or duration >= LONGEST_PUSH or run.t[-1] < duration:
             return Trajectory(run.t, {"way": way, "speed": speed, "acceleration": np.gradient(speed, run.t)})
         duration *= PUSH_FACTOR
@@ -268,12 +239,6 @@ def _push(loop: ClosedLoop, own: ParameterSet, x: Array, command: float, duratio
             if isinstance(error.solution, Trajectory) and len(error.solution) > 2:
                 return error.solution
             raise
-
-
-def _axis(loop: ClosedLoop) -> Axis:
-    axis = loop.plant.axis
-    assert axis is not None
-    return axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,7 +328,8 @@ def excitation_run(
     p = loop.complete(known).with_values({"pid.lower": low, "pid.upper": high})
     fast = _fast_move(loop, p, ends, speed)
     p = p.with_values({"pid.Kp": _plain_gain(loop, p, ends, fast.speed)})
-    moves = _sequence(ends, fast, _speed_gain(loop, p, fast.speed))
+    command = _sliding(loop, p, sum(_end_stops(plant, p)) / 2, fast.speed)[1][loop.command.name]
+    moves = _sequence(ends, fast, p.value("pid.Kp") * fast.speed / abs(command))
     for move in {(abs(m.distance), m.speed): m for m in moves.chain}.values():
         check_move(loop, replace(move, at=0.0), p)
     run = ExcitationRun(loop, p, moves, ends, _simulate(loop, p, moves, sample_time), command_centre(plant, known))
@@ -373,14 +339,10 @@ def excitation_run(
 
 def _position_loop(plant: System, sample_time: float) -> ClosedLoop:
     axis, stops = plant.axis, [g for g in plant.validity_limits if g.state == "position"]
-    told = 'an excitation run needs a drive whose valve moves an axis between two end stops, kind = "pneumatic"'
-    fits = axis is not None and axis.final_element is not None and len(stops) == 2 and plant.rest_hook is not None
-    require(fits, f"{told}; for another drive plan one with pneuopt next-experiment", ModelError)
-    return ClosedLoop(plant, PID(sample_time), measured=_excited_axis(plant).position)
-
-
-def _excited_axis(plant: System) -> Axis:
-    return plant.axis or Axis()
+    if axis is None or axis.final_element is None or len(stops) != 2 or plant.rest_hook is None:
+        told = 'an excitation run needs a drive whose valve moves an axis between two end stops, kind = "pneumatic"'
+        raise ModelError(f"{told}; for another drive plan one with pneuopt next-experiment")
+    return ClosedLoop(plant, PID(sample_time), measured=axis.position)
 
 
 def _room(plant: System, p: ParameterSet, between: tuple[float, float] | None) -> tuple[float, float]:
@@ -388,7 +350,7 @@ def _room(plant: System, p: ParameterSet, between: tuple[float, float] | None) -
     rear, front = _end_stops(plant, p)
     margin = max(MARGIN_SHARE * (front - rear), LEAST_MARGIN)
     low, high = (rear + margin, front - margin) if between is None else between
-    low, high = (round(x, PLACE_DIGITS) for x in (low, high))
+    low, high = map(_place, (low, high))
     shown = [write_value(x, "m", 3) for x in (low, high, rear, front)]
     inside = rear < low and high < front
     told = f"the run would go from {shown[0]} to {shown[1]}, and the end stops are at {shown[2]} and {shown[3]}"
@@ -405,11 +367,11 @@ def _fast_move(loop: ClosedLoop, p: ParameterSet, ends: tuple[float, float], spe
     shape = Move(high - low, speed=1.0, acceleration=10.0 / (high - low), initial=low)
     both = (shape, replace(shape, distance=low - high, initial=high))
     fastest = [shortest_move(loop, move, p) for move in both]
-    own = FAST_SHARE * min(move.speed for move in fastest)
-    least, most = (write_value(v / FAST_SHARE, "m/s", 3) for v in (LEAST_FAST_SPEED, own))
+    own = GUESS_SHARE * min(move.speed for move in fastest)
+    least, most = (write_value(v / GUESS_SHARE, "m/s", 3) for v in (LEAST_FAST_SPEED, own))
     told = f"the drive moves at {most} at most, by its file, and an excitation run needs {least}"
     require(own >= LEAST_FAST_SPEED, f"{told}; correct valve, supply and load in the drive's file")
-    acceleration = FAST_SHARE**2 * min(move.acceleration for move in fastest)
+    acceleration = GUESS_SHARE**2 * min(move.acceleration for move in fastest)
     return replace(shape, speed=_round(min(own, speed)), acceleration=_round(acceleration))
 
 
@@ -430,37 +392,39 @@ def _plain_gain(loop: ClosedLoop, p: ParameterSet, ends: tuple[float, float], sp
 
 def _sliding(loop: ClosedLoop, p: ParameterSet, position: float, speed: float) -> tuple[Array, dict[str, float]]:
     """The plant's state and inputs in steady motion."""
-    hook, axis = loop.plant.rest_hook, _excited_axis(loop.plant)
+    hook, axis = loop.plant.rest_hook, loop.plant.axis
     assert hook is not None
+    assert axis is not None
     rest = hook(p, {axis.position: position, axis.speed: speed})
     return np.array([rest.states[n] for n in names(loop.plant.states)]), dict(rest.inputs)
 
 
-def _speed_gain(loop: ClosedLoop, p: ParameterSet, speed: float) -> float:
-    """Speed of the axis over its following error in steady motion [1/s]."""
-    middle = sum(_end_stops(loop.plant, p)) / 2
-    return p.value("pid.Kp") * speed / abs(_sliding(loop, p, middle, speed)[1][loop.command.name])
+# The stops of a run: an end or the middle, the way from it [share of the span], the speed [share of the fast moves'].
+STOPS = (
+    *(("high", 0.0, 1.0), ("low", 0.0, 1.0), ("middle", 0.0, MEDIUM), ("high", 0.0, MEDIUM), ("low", 0.0, MEDIUM)),
+    *(("low", 0.4, 0.15), ("low", 0.0, 0.15), ("low", 0.08, 0.03), ("low", 0.0, 0.03), ("middle", 0.0, 1.0)),
+    *(("middle", 0.01, 0.15), ("middle", 0.0, 0.15), ("middle", -0.01, 0.15), ("middle", 0.0, 0.15)),
+    *(("high", 0.0, 1.0), ("high", -0.08, 0.03), ("high", 0.0, 0.03), ("middle", 0.0, MEDIUM)),
+)
 
 
 def _sequence(ends: tuple[float, float], fast: Move, gain: float) -> MoveSequence:
     """The moves, which begin and end in the middle, under a loop with a gain of speed over error [1/s]."""
-    (low, high), v = ends, fast.speed
-    span, middle = high - low, round((low + high) / 2, PLACE_DIGITS)
-    calm, slow, short = CALM_WAY * span, SLOW_WAY * span, SHORT_WAY * span
-    stops = [
-        *((high, v), (low, v), (middle, MEDIUM * v), (high, MEDIUM * v), (low, MEDIUM * v)),
-        *((low + calm, CALM * v), (low, CALM * v), (low + slow, SLOW * v), (low, SLOW * v), (middle, v)),
-        *((middle + short, CALM * v), (middle, CALM * v), (middle - short, CALM * v), (middle, CALM * v)),
-        *((high, v), (high - slow, SLOW * v), (high, SLOW * v), (middle, MEDIUM * v)),
-    ]
-    at, moves = middle, []
-    for place, speed in stops:
+    (low, high), moves = ends, list[Move]()
+    span, middle = high - low, _place((low + high) / 2)
+    at, places = middle, {"low": low, "middle": middle, "high": high}
+    for place, way, share in STOPS:
+        stop, speed = _place(places[place] + way * span), share * fast.speed
         dwell = max(LEAST_DWELL, log(speed / (gain * SETTLED_SHARE * span)) / gain)
-        stop = round(place, PLACE_DIGITS)
-        way, pause = round(stop - at, PLACE_DIGITS), round(dwell, DWELL_DIGITS)
-        moves.append(Move(way, speed=_round(speed), acceleration=fast.acceleration, dwell=pause))
+        pause = round(dwell, 2)  # as a file shows it whole
+        moves.append(Move(_place(stop - at), speed=_round(speed), acceleration=fast.acceleration, dwell=pause))
         at = stop
     return MoveSequence([replace(moves[0], at=REST_BEFORE, initial=middle), *moves[1:]])
+
+
+def _place(x: float) -> float:
+    """A position [m] as a file shows it whole."""
+    return round(x, 5)
 
 
 def _simulate(loop: ClosedLoop, p: ParameterSet, moves: MoveSequence, sample_time: float) -> Trajectory:
@@ -481,7 +445,7 @@ def _check_response(run: ExcitationRun) -> None:
     rear, front = _end_stops(run.loop.plant, run.parameters)
     beyond = max(low - float(position.min()), float(position.max()) - high)
     told = f"the plain controller overshoots the run by {write_value(beyond, 'm', 3)}"
-    spare = MOST_OVERSHOOT * min(low - rear, front - high)
+    spare = GUESS_SHARE * min(low - rear, front - high)
     require(beyond < spare, f"{told}; allow a lower speed, or correct mass and valve in the drive's file")
 
 

@@ -1,10 +1,9 @@
-"""`monte_carlo`: plants within what a fit leaves open and what is stated of the other parameters, in one draw.
-
-`expected_plants`: the plants that a model may stand for, within what a fit leaves open and what hardware varies by.
+"""`monte_carlo` and `expected_plants`: plants within what a fit leaves open and what hardware varies by.
 
 A parameter that a fit has estimated is drawn from the fit's covariance, by Student's t where few degrees of freedom
-tell it; one that the fit gave a range in place of an interval is drawn from anywhere in that range. Of the others,
-those named in `TOLERANCES` vary by the usual tolerance of such hardware, and each tuned gain by `GAIN_TOLERANCE`.
+tell it; one that the fit gave a range in place of an interval is drawn from anywhere in that range. `monte_carlo` draws
+the others as stated. Of `expected_plants`, which a design has not seen, those named in `TOLERANCES` vary by the usual
+tolerance of such hardware, and each tuned gain by `GAIN_TOLERANCE`.
 """
 
 import math
@@ -30,7 +29,7 @@ from pneuopt.evaluation.scenarios import (
     samples,
     tolerances,
 )
-from pneuopt.evaluation.tolerances import FIT_SHARE, GAIN_TOLERANCE, PLANT_COUNT
+from pneuopt.evaluation.tolerances import GAIN_TOLERANCE, PLANT_COUNT
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
@@ -321,7 +320,7 @@ def _estimate_axis(parameters: ParameterSet, name: str, deviation: float, dof: f
     """An estimate with the interval that its standard deviation leaves, within its bounds."""
     from scipy.stats import t
 
-    p, width = parameters[name], float(t.ppf((1 + FIT_SHARE) / 2, dof)) * deviation
+    p, width = parameters[name], float(t.ppf(0.975, dof)) * deviation  # half an interval of 95 %
     ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
     low, high = (float(min(max(end, p.lower), p.upper)) for end in ends)
     return CorrelatedParameters((name,), width / abs(p.value) if p.value else 0.0, {name: low}, {name: high})

@@ -3,18 +3,10 @@
 Values are fractions of the step's size, seconds, or the command's unit: `Overshoot(max=0.05)` is 5 %. Margins,
 sensitivities and the noise gain are those of the loop linearised about the state in which the response ends; in a speed
 loop that state moves, and friction counts with its slope at that speed. A gain or phase margin has a `min`; as a term
-its reciprocal is minimised.
+its reciprocal is minimised. Distances on a positioning axis are in the measured unit, whatever the step.
 
-A new requirement is a class with its `Metric`, in a file of its own or here, and a row of `REQUIREMENT_KINDS`.
-
-Requirements on a positioning axis in the units of its user: how far beyond the end, off the path, and under a load.
-
-Each is a length where a position is controlled. With `SettlingTime` of a `Tolerance`, `AirUse` and `EnergyUse` they say
-what a move takes.
-
-`EnergyUse`: the energy that a drive draws from its supply or motor while it follows a step.
-
-Air consumption of a response, in normal litres.
+A new requirement is a class with its `Metric`, and a row of `REQUIREMENT_KINDS`. The rows that it reads off a response
+stand first, the scales of values and limits last.
 """
 
 from collections.abc import Mapping
@@ -48,13 +40,11 @@ from pneuopt.evaluation.metric import (
     without_slopes,
 )
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
-from pneuopt.evaluation.tolerances import ANR_DENSITY, LEAST_ROOT, LITRES_PER_CUBIC_METRE
 from pneuopt.quantities.errors import require
 
-PUSH = "load.force"
-"""The disturbance against which a loop is stiff."""
-FOLLOWING_METRICS = frozenset({"FollowingError", "FollowingErrorRMS"})
-"""What needs the reference at every instant."""
+PUSH = "load.force"  # the disturbance against which a loop is stiff
+AIR_CHANNEL, POWER_CHANNEL = "air", "power"  # of a meter: mass flow from the supply [kg/s], power from the source [W]
+FOLLOWING_METRICS = frozenset({"FollowingError", "FollowingErrorRMS"})  # they need the reference at every instant
 
 
 def overshoot_distance_rows(record: StepRecord) -> ValuesAndSlopes:
@@ -74,7 +64,7 @@ def following_rms_rows(record: StepRecord) -> ValuesAndSlopes:
     (error, slopes), weights = _following_error(record), trapezoidal_weights(record.nodes)
     weights = weights / weights.sum()
     root = np.sqrt(np.einsum("k,mk->m", weights, error**2))
-    by_unknown = np.einsum("mk,mkn->mn", weights * error, slopes) / np.maximum(root, LEAST_ROOT)[:, None]
+    by_unknown = np.einsum("mk,mkn->mn", weights * error, slopes) / np.maximum(root, 1e-300)[:, None]
     return root[:, None], by_unknown[:, None]
 
 
@@ -90,6 +80,35 @@ def _following_error(record: StepRecord) -> ValuesAndSlopes:
     error, slopes = record.error
     wanted = 0.0 if record.wanted is None else record.wanted
     return record.size * (error - wanted), record.size * slopes
+
+
+def energy_rows(record: StepRecord) -> ValuesAndSlopes:
+    """Integral of the power from the step to the end of the record [J]."""
+    return record.integrate_meter(POWER_CHANNEL)
+
+
+def air_rows(record: StepRecord) -> ValuesAndSlopes:
+    """Volume of the air that is drawn from the step to the end of the record [l(ANR)].
+
+    Examples
+    --------
+    A gram a second for two seconds:
+
+    >>> import numpy as np
+    >>> from pneuopt.evaluation.metrics import meter_record
+    >>> run = meter_record(np.array([0.0, 1.0, 2.0]), {"air": np.full((1, 3), 1e-3)}, 0.0)
+    >>> round(air_rows(run)[0].item(), 4)
+    1.6878
+    """
+    mass, slopes = record.integrate_meter(AIR_CHANNEL)
+    factor = 1e3 / 1.185  # [l/kg]: air of ISO 8778 (ANR: 100 kPa, 20 degC, 65 % humidity) has 1.185 kg/m^3
+    return factor * mass, factor * slopes
+
+
+def travel_rows(record: StepRecord) -> ValuesAndSlopes:
+    """Distance that the spool travels in both directions together."""
+    spool, _ = record.meter["spool"]
+    return without_slopes(np.abs(np.diff(spool, axis=1)).sum(axis=1)[:, None])
 
 
 @final
@@ -165,14 +184,6 @@ class Compliance(AtMost):
     )
 
 
-POWER_CHANNEL = "power"  # the meter's channel with the power drawn from the plant's source [W]
-
-
-def energy_rows(record: StepRecord) -> ValuesAndSlopes:
-    """Integral of the power from the step to the end of the record [J]."""
-    return record.integrate_meter(POWER_CHANNEL)
-
-
 @final
 class EnergyUse(AtMost):
     """Energy that the plant draws from its source, from the step to the end of the horizon [J].
@@ -197,27 +208,6 @@ class EnergyUse(AtMost):
     """
 
     metric = Metric("EnergyUse", "J", Source.METER, slope=energy_rows, channels=(POWER_CHANNEL,))
-
-
-AIR_CHANNEL = "air"  # the meter's channel with the mass flow drawn from the supply [kg/s]
-
-
-def air_rows(record: StepRecord) -> ValuesAndSlopes:
-    """Volume of the air that is drawn from the step to the end of the record [l(ANR)].
-
-    Examples
-    --------
-    A gram a second for two seconds:
-
-    >>> import numpy as np
-    >>> from pneuopt.evaluation.metrics import meter_record
-    >>> run = meter_record(np.array([0.0, 1.0, 2.0]), {"air": np.full((1, 3), 1e-3)}, 0.0)
-    >>> round(air_rows(run)[0].item(), 4)
-    1.6878
-    """
-    mass, slopes = record.integrate_meter(AIR_CHANNEL)
-    factor = LITRES_PER_CUBIC_METRE / ANR_DENSITY
-    return factor * mass, factor * slopes
 
 
 Value = TypeVar("Value", float, NDArray[np.float64])
@@ -456,18 +446,12 @@ REQUIREMENT_KINDS: tuple[type[Requirement], ...] = (
 ROBUSTNESS_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.source is Source.LINEAR_LOOP)
 
 
-def _travel_rows(record: StepRecord) -> ValuesAndSlopes:
-    """Distance that the spool travels in both directions together."""
-    spool, _ = record.meter["spool"]
-    return without_slopes(np.abs(np.diff(spool, axis=1)).sum(axis=1)[:, None])
-
-
 _RAW = Metric("SettlingTimeRaw", "s", Source.RESPONSE)
 _REPORTED_METRICS = (
     Metric("LimitCycleAmplitude", "{measured}", Source.RESPONSE),
     Metric("LimitCycleFrequency", "Hz", Source.RESPONSE),
     Metric("StickShare", "1", Source.RESPONSE),
-    Metric("ValveTravel", "half travels", Source.METER, slope=_travel_rows, channels=("spool",)),
+    Metric("ValveTravel", "half travels", Source.METER, slope=travel_rows, channels=("spool",)),
     Metric("FrictionSlope", "N*s/m", Source.LINEAR_LOOP),
     Metric("SettlingMin", "{measured}", Source.RESPONSE, shown=False),
     Metric("SettlingMax", "{measured}", Source.RESPONSE, shown=False),
@@ -537,10 +521,7 @@ def metric_name(requirement: Requirement) -> str:
 
 
 def requirement_values(metrics: Mapping[str, Value]) -> dict[str, Value]:
-    """Values of the requirements, from metrics or arrays of them, all on scales where small is good.
-
-    A metric in percent becomes a fraction, a margin its reciprocal; a gain margin below one stays as it is.
-    """
+    """Values of the requirements, from metrics or arrays of them: small is good, percent as a fraction, 1/margin."""
     limited = (kind.metric for kind in REQUIREMENT_KINDS if kind.metric.name in metrics)
     return {metric.name: metric.requirement_value(metrics[metric.name]) for metric in limited}
 

@@ -1,10 +1,7 @@
 """A loop's response to a reference: its inputs, its sampling and its metrics.
 
-Cases of a tuning: every reference on every plant that the design must suit, the nominal plant first.
-
-`check_steps`: refuse simulations that take more steps than a budget, before they begin, and name the key.
-
-`check_travel`: refuse a reference that leads a piston into its end stops, before anything is simulated.
+`TuningCase` is one reference on one plant that a design must suit. `check_steps` and `check_travel` refuse, before
+anything is simulated, what takes more steps than a budget and what leads a piston into its end stops.
 """
 
 import math
@@ -47,15 +44,7 @@ def measure(
     band: Band,
     envelope: Envelope = (),
 ) -> dict[str, float]:
-    """Metrics of a simulated response, with the settling band around the reference.
-
-    They are read off the plant's true signal, not off a sensor's reading of it.
-
-    Parameters
-    ----------
-    response : Trajectory
-        The loop's outputs.
-    """
+    """Metrics of a simulated response off the plant's true signal, with the settling band around the reference."""
     return step_metrics(
         response.t,
         response[loop.feedback.name],
@@ -128,20 +117,11 @@ def command_range(loop: ClosedLoop, p: ParameterSet) -> tuple[float, float, str]
 
 @dataclass(frozen=True, eq=False)
 class TuningCase:
-    """One reference on one plant.
-
-    Parameters
-    ----------
-    reference : Reference
-    scenario : str
-        Its name; empty for the nominal plant.
-    values : mapping of str to float or Factor
-        The parameter values that differ from the nominal plant.
-    """
+    """One reference on one plant."""
 
     reference: Reference
-    scenario: str = ""
-    values: Mapping[str, float | Factor] = field(default_factory=dict)
+    scenario: str = ""  # its name; empty for the nominal plant
+    values: Mapping[str, float | Factor] = field(default_factory=dict)  # that differ from the nominal plant
 
     @property
     def label(self) -> str:
@@ -166,13 +146,7 @@ class TuningCase:
         return np.array([v.share if isinstance(v, Factor) else 0.0 for v in values])
 
     def initial(self, loop: ClosedLoop, parameters: ParameterSet) -> Array:
-        """State in which the loop waits for the step.
-
-        Raises
-        ------
-        InputError, ConvergenceError
-            As from `ClosedLoop.initial`; the message names the scenario.
-        """
+        """State in which the loop waits for the step; an error of `ClosedLoop.initial` names the scenario."""
         values, step = self.case_parameters(parameters), self.reference
         try:
             return loop.initial(values, reference=step.origin, start=step.start)
@@ -191,42 +165,18 @@ class TuningCase:
 def cases(
     references: Sequence[Reference], scenarios: Scenarios, parameters: ParameterSet, tuned: Collection[str] = ()
 ) -> tuple[TuningCase, ...]:
-    """Cases of every reference on the nominal plant, then on each scenario's plant.
-
-    Parameters
-    ----------
-    references : sequence of Reference
-    scenarios : mapping of str to mapping
-    parameters : ParameterSet
-        The parameters that a scenario may change.
-    tuned : collection of str
-        Names of tuned parameters, which a scenario may change by a `Factor` only.
-
-    Raises
-    ------
-    InputError
-        If two references have one label, or a scenario names an unknown parameter, or gives a tuned one a value.
-    """
+    """Cases of every reference on the nominal plant, then on each scenario's, which changes `tuned` ones by factors."""
     labels = [r.label for r in references]
     twice = next((n for n in labels if labels.count(n) > 1), "")
     require(not twice, f"two references are {twice!r}, and tables name them by that label; leave one out")
     for name, values in scenarios.items():
         require(bool(name), "a scenario needs a name: {'heavy load': {'load.mass': 8.0}}")
-        _check_scenario(name, values, parameters, tuned)
+        check_names("parameter", values, parameters, f"scenario {name!r}")
+        for n in (n for n, value in values.items() if n in tuned and not isinstance(value, Factor)):
+            told = f"scenario {name!r}: {n} is tuned, so no scenario can fix its value; for a tolerance around it write"
+            raise InputError(f"{told} tolerances(parameters, {{{n!r}: 0.01}})")
     nominal = [TuningCase(r) for r in references]
     return (*nominal, *(TuningCase(r, name, values) for name, values in scenarios.items() for r in references))
-
-
-def _check_scenario(
-    name: str, values: Mapping[str, float | Factor], parameters: ParameterSet, tuned: Collection[str]
-) -> None:
-    check_names("parameter", values, parameters, f"scenario {name!r}")
-    for n, value in values.items():
-        require(
-            isinstance(value, Factor) or n not in tuned,
-            f"scenario {name!r}: {n} is tuned, so no scenario can fix its value; for a tolerance around it write "
-            f"tolerances(parameters, {{{n!r}: 0.01}})",
-        )
 
 
 def check_steps(
@@ -237,37 +187,20 @@ def check_steps(
     plants: int = 1,
     max_steps: float = MAX_STEPS,
 ) -> None:
-    """Refuse references whose responses take more steps than a budget.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : sequence of Reference
-    parameters : ParameterSet
-        Every parameter of the loop.
-    plants : int
-        On how many plants each reference is followed.
-    max_steps : float
-        The budget, for all responses together.
-
-    Raises
-    ------
-    InputError
-        With the steps, the minutes that they take, what makes them so many, and how to raise the budget.
-    """
+    """Refuse references whose responses, each on so many plants, take more steps together than a budget."""
     needed = [plants * simulation_steps(loop, reference, parameters) for reference in references]
     if sum(needed) <= max_steps:
         return
     longest = references[needed.index(max(needed))]
     on_plants = f" on {plants} plants" if plants > 1 else ""
     many = f" (one of {len(references)} references)" if len(references) > 1 else ""
-    key = _finest_key(loop, longest, parameters)
-    require(
-        False,
+    key, digit = _finest_key(loop, longest, parameters), 10.0 ** math.floor(math.log10(sum(needed)))
+    budget = math.ceil(sum(needed) / digit) * digit  # rounded up to one digit
+    raise InputError(
         f"reference {longest.label}{many}{on_plants} takes {max(needed):.2g} steps, about "
         f"{_duration(max(needed) * SECONDS_A_STEP)}: {key} over a horizon of {write_value(longest.horizon, 's', 7)}; "
         f"change that, shorten the horizon, or raise the budget of {max_steps:.2g} steps: "
-        f"max_steps={_round_up(sum(needed)):.0e}, in a tuning's file steps under [budget]",
+        f"max_steps={budget:.0e}, in a tuning's file steps under [budget]",
     )
 
 
@@ -294,12 +227,6 @@ def _finest_key(loop: ClosedLoop, reference: Reference, parameters: ParameterSet
     return f"the step is at {write_value(reference.at, 's', 4)}"
 
 
-def _round_up(value: float) -> float:
-    """A number rounded up to one digit."""
-    digit = 10.0 ** math.floor(math.log10(value))
-    return math.ceil(value / digit) * digit
-
-
 def _duration(seconds: float) -> str:
     """Minutes, or hours, in words."""
     if not math.isfinite(seconds) or seconds > 72 * 3600:
@@ -308,20 +235,7 @@ def _duration(seconds: float) -> str:
 
 
 def check_travel(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> None:
-    """Refuse a reference that a piston cannot follow over its horizon without reaching an end stop.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    case : TuningCase
-    parameters : ParameterSet
-        Every parameter of the loop, without this case's values.
-
-    Raises
-    ------
-    InputError
-        With the way that the reference leads, the way that there is, and what to change.
-    """
+    """Refuse a reference that a piston cannot follow over its horizon without reaching an end stop."""
     stops = [g for g in loop.plant.validity_limits if g.state == "position"]
     states = [q.name for q in loop.plant.states]
     if not stops or "position" not in states or loop.feedback.name not in ("position", "speed"):

@@ -1,7 +1,7 @@
 """`check_rest`: whether a loop truly comes to rest on a plant that sticks, or hunts, over a minute and more.
 
 A smooth friction has no rest: a body on it creeps under any force, and what its integral will do an hour from now looks
-like standing. So this check asks for Karnopp's friction, whose break-aways and standstills are located, and reads
+like standing. So this check needs Karnopp's friction, whose break-aways and standstills are located, and reads
 how the loop ends off these events: not off a band, which a slow hunting keeps for most of the time.
 """
 
@@ -26,9 +26,8 @@ from pneuopt.evaluation.tolerances import (
     MIN_PUSH,
     MIN_STANDSTILLS,
     READINGS_A_SECOND,
+    SIMULATION_TOLERANCE,
     STILL_SHARE,
-    TOLERANCE,
-    USUAL_DURATION,
 )
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ModelError, require
@@ -56,7 +55,7 @@ class NoHunting:
         Largest range of the errors at rest over the references, such as moves from several starts [measured unit].
     """
 
-    duration: float = USUAL_DURATION
+    duration: float = 60.0  # hunting of a servo axis has periods of seconds
     repeatability: float = inf
 
     def __post_init__(self) -> None:
@@ -172,7 +171,7 @@ def check_rest(
     parameters: ParameterSet,
     *,
     scenarios: Scenarios = NO_SCENARIOS,
-    duration: float = USUAL_DURATION,
+    duration: float = NoHunting.duration,
 ) -> RestCheck:
     """Watch a loop on a plant that sticks, event by event, long after its reference has come to its end.
 
@@ -246,7 +245,8 @@ def _watch(loop: ClosedLoop, rig: Rig | None, case: TuningCase, parameters: Para
         if loop.pid.sample_time is None:
             count = min(MAX_READINGS, int(READINGS_A_SECOND * inputs.t[-1]))
             t_out = np.union1d(inputs.t, np.linspace(0.0, inputs.t[-1], count + 1))
-        found = simulate_stick_slip(loop, inputs, p, initial=start, t_out=t_out, rtol=TOLERANCE, atol=TOLERANCE / 100)
+        rtol, atol = SIMULATION_TOLERANCE, SIMULATION_TOLERANCE / 100
+        found = simulate_stick_slip(loop, inputs, p, initial=start, t_out=t_out, rtol=rtol, atol=atol)
         run, events = found.trajectory, found.events
     return _read_rest(loop, case, run, [e for e in events if e.t >= reference.at], p)
 

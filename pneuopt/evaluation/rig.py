@@ -1,10 +1,9 @@
-"""`Rig`: a plant or a loop with real hardware around it, `Sensor`s and an `Actuator`; `record` gives its log.
+"""`record`: the log that a real rig would give, with the effects that models for identification and tuning leave out.
 
-`record`: the log that a real rig would give, with the effects that models for identification and tuning leave out.
-
-Between two samples the plant is integrated as in `simulate`, event by event with Karnopp's friction. Beyond that a rig
-has a valve that lags behind its command in position (hysteresis) and ignores small ones, sensors with lag, noise and
-finite resolution, and a controller that sees only those sensors, and differentiates an encoder to get a speed.
+A `Rig` is a plant or a loop with `Sensor`s and an `Actuator`. Between two samples the plant is integrated as in
+`simulate`, event by event with Karnopp's friction. Beyond that a rig has a valve that lags behind its command in
+position (hysteresis) and ignores small ones, sensors with lag, noise and finite resolution, and a controller that sees
+only those sensors, and differentiates an encoder to get a speed.
 """
 
 from collections.abc import Mapping
@@ -145,7 +144,9 @@ class Rig:
         check_names("output", self.sensors, names(self.plant.outputs), "Rig: sensors")
         _ = self.command
         if self.loop is not None:
-            _check_loop(self.loop)
+            analogue, h = self.loop.dither is not None and self.loop.dither.analogue, self.loop.pid.sample_time
+            require(h is not None, "a rig's controller is sampled: PID(sample_time=1e-3)", ModelError)
+            require(not analogue, "a rig's dither comes from its controller: Dither(analogue=False)", ModelError)
             message = f"the controller needs {self.feedback!r}, which no sensor measures; add it to sensors"
             require(self.feedback in self.sensors, message, ModelError)
             read = dict.fromkeys(replace(self.loop, sensor=None).readings)
@@ -205,12 +206,6 @@ class Rig:
         lagging = (q for n, q in sensors.items() if lags[n] > 0)
         states, outputs = (*plant.states, *lagging), (*plant.outputs, *sensors.values())
         return define(states, plant.inputs, outputs, plant.parameters, rhs)
-
-
-def _check_loop(loop: ClosedLoop) -> None:
-    analogue = loop.dither is not None and loop.dither.analogue
-    require(loop.pid.sample_time is not None, "a rig's controller is sampled: PID(sample_time=1e-3)", ModelError)
-    require(not analogue, "a rig's dither comes from its controller: Dither(analogue=False)", ModelError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,7 +335,7 @@ class _SampledController:
         others = [q for q in loop.plant.outputs if q.name in read and q != signal]
         shown, self._others = [signal, *others], names(others)
         echo_plant = define(
-            shown, [loop.command], shown, loop.plant.parameters, lambda _t, y, _u, _p: (_zero_rates(y), y)
+            shown, [loop.command], shown, loop.plant.parameters, lambda _t, y, _u, _p: ({n: ca.SX(0) for n in y}, y)
         )
         echo_loop = replace(loop, plant=replace(echo_plant, axis=loop.plant.axis), sensor=None)
         self._update, self._p = compile_function(echo_loop.update), echo_loop.parameter_vector(parameters)
@@ -407,7 +402,8 @@ def _run_samples(
     spool, sensors = source.initial_command, [rig.sensors[n] for n in rig.channels]
     noise, readings = random.standard_normal((len(log_inputs), len(sensors))), np.zeros((len(log_inputs), len(sensors)))
     u[0, column] = rig.actuator.apply_dead_zone(spool)
-    run.restart(log_inputs.t[0], _append_sensor_states(rig, log_inputs.t[0], x, u[0], p), u[0])
+    rest = _plant_outputs(rig, log_inputs.t[0], x, u[0], p)  # of the sensors too
+    run.restart(log_inputs.t[0], np.append(x, [rest[n] for n in rig.channels if rig.sensors[n].lag > 0]), u[0])
     for k, t in enumerate(log_inputs.t):
         x, shown = run.advance(t), run.outputs()[len(rig.plant.outputs) :]
         readings[k] = [s.reading(y, z) for s, y, z in zip(sensors, shown, noise[k], strict=True)]
@@ -417,12 +413,6 @@ def _run_samples(
         run.restart(t, x, u[k])
         run.record()
     return readings, u[:, column]
-
-
-def _append_sensor_states(rig: Rig, t: float, x: Array, u: Array, p: Array) -> Array:
-    """State of the plant, followed by the sensors' states at rest with it."""
-    y = _plant_outputs(rig, t, x, u, p)
-    return np.append(x, [y[n] for n in rig.channels if rig.sensors[n].lag > 0])
 
 
 def _plant_outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str, float]:
@@ -439,7 +429,3 @@ def _resample_inputs(rig: Rig, inputs: Trajectory) -> Trajectory:
         t = t[0] + h * np.arange(int((t[-1] - t[0] + slack) / h) + 1)
     rows = rows[np.searchsorted(inputs.t, t + slack, side="right") - 1]
     return Trajectory(t, dict(zip(names(rig.model.inputs), rows.T, strict=True)))
-
-
-def _zero_rates(x: Symbols) -> Symbols:
-    return {n: ca.SX(0) for n in x}

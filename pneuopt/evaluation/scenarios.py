@@ -3,15 +3,12 @@
 Scenarios are a mapping from a name to the parameter values that differ from the nominal plant, as `sweep` and `tune`
 take it. `tolerances` varies parameters that are still to be tuned, by factors.
 
-`Sampling`: how the points of a sample fill the unit cube; `generator`: random numbers that no two draws share.
-
 Random numbers are a function of a seed and of the name of what is drawn: the kind of the draw, and each axis of it. So
 two kinds, two axes, and a search and the plants on which its result is tried never see the same numbers, whatever seeds
 a user gives them, equal ones included; and an axis more leaves the numbers of the others as they were.
 
-Distributions of a parameter from plant to plant, by which `samples` draws; the parameter's bounds cut them off.
-
-A newcomer adds a class like these, and a row of `DISTRIBUTIONS`, whose word study.toml and tuning.toml take:
+A newcomer adds a way to fill a box to `Sampling` and `_POINTS`; or a distribution, a class like these, to
+`DISTRIBUTIONS`, whose word study.toml and tuning.toml take:
 ``"load.mass" = { distribution = "normal", spread = "5 %" }``.
 """
 
@@ -19,7 +16,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from math import ceil, inf, isfinite, log1p, log2
@@ -29,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from pneuopt.evaluation.tolerances import EDGE, MAX_CORNERS, MAX_DRAWS_PER_SAMPLE, MIN_PROBABILITY
+from pneuopt.evaluation.tolerances import MAX_CORNERS, MAX_DRAWS_PER_SAMPLE, MIN_PROBABILITY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -65,19 +62,7 @@ def further(seed: Seed, *words: str) -> Seed:
 
 
 def generator(seed: Seed, *stream: str) -> np.random.Generator:
-    """Random numbers of a stream, the same on every machine; those of two streams are independent.
-
-    Parameters
-    ----------
-    seed : int or tuple
-        Whole numbers, not below 0, and words.
-    *stream : str
-        What is drawn: its kind, and the names of what varies.
-
-    Raises
-    ------
-    InputError
-        If a number of the seed is no whole one, or is below 0.
+    """Random numbers of a stream, the same on every machine; those of two streams, of two names, are independent.
 
     Examples
     --------
@@ -97,21 +82,7 @@ def generator(seed: Seed, *stream: str) -> np.random.Generator:
 
 
 def unit_points(sampling: Sampling, count: int, axes: Sequence[str], seed: Seed, kind: str) -> Array:
-    """Points of the unit cube, the same for the same seed wherever they are computed.
-
-    Parameters
-    ----------
-    sampling : Sampling
-    count : int
-    axes : sequence of str
-        The name of each axis: together with `kind` it says which random numbers the axis has.
-    seed : int or tuple
-    kind : str
-        What is drawn.
-
-    Returns
-    -------
-    ndarray, shape (count, n_axes)
+    """Points of the unit cube, shape (count, n_axes); `kind` and each axis's name say which random numbers it has.
 
     Examples
     --------
@@ -282,27 +253,7 @@ DISTRIBUTIONS: Mapping[str, type[Distribution]] = {
 
 
 def quantiles(distribution: Distribution, name: str, parameter: Parameter, shares: Array) -> Array:
-    """Values below which the given shares of a distribution lie, the part of it within a parameter's bounds.
-
-    Parameters
-    ----------
-    distribution : Distribution
-    name : str
-        The parameter's, for messages.
-    parameter : Parameter
-        Its value is the middle of a distribution that is given by a fraction; its bounds cut the distribution off.
-    shares : array_like
-        From 0 to 1 [1].
-
-    Returns
-    -------
-    ndarray
-        [SI]
-
-    Raises
-    ------
-    InputError
-        If next to nothing of the distribution lies within the bounds.
+    """Values below which the given shares of a distribution lie [SI], the part of it within a parameter's bounds.
 
     Examples
     --------
@@ -316,7 +267,8 @@ def quantiles(distribution: Distribution, name: str, parameter: Parameter, share
     inside = 1.0 - below - above
     message = f"{name}: {distribution} leaves its bounds, {p.lower:g} to {p.upper:g} {p.unit}; move one of them"
     require(inside > MIN_PROBABILITY, message)
-    probability = np.clip(below + np.asarray(shares) * inside, EDGE, 1 - EDGE)
+    least = float(np.finfo(float).epsneg)  # at 0 and 1 themselves a quantile is infinite
+    probability = np.clip(below + np.asarray(shares) * inside, least, 1 - least)
     return np.asarray(np.clip(frozen.ppf(probability), lower, p.upper))
 
 
@@ -398,12 +350,14 @@ def corners(parameters: ParameterSet, spreads: Spreads) -> ScenarioValues:
     >>> corners(rig, {"load.mass": 0.2, "friction.*": (30.0, 60.0)})["load.mass low, friction.* high"]
     {'load.mass': 4.0, 'friction.coulomb': 60.0}
     """
-    ends = _axis_ends(parameters, spreads)
-    count = 2 ** len(ends)
-    require(count <= MAX_CORNERS, f"{len(ends)} axes have {count} corners, more than {MAX_CORNERS}; draw samples")
-    sides = {axis: [(f"{axis} low", low), (f"{axis} high", high)] for axis, (low, high) in ends.items()}
+    sides = {}
+    for axis, (names, spread) in _axis_names(parameters, spreads).items():
+        ends = {n: _spread_ends(parameters, n, spread) for n in names}
+        sides[axis] = [(f"{axis} {side}", {n: e[k] for n, e in ends.items()}) for k, side in enumerate(("low", "high"))]
+    count = 2 ** len(sides)
+    require(count <= MAX_CORNERS, f"{len(sides)} axes have {count} corners, more than {MAX_CORNERS}; draw samples")
     return {
-        ", ".join(label for label, _ in corner): _merge_values(values for _, values in corner)
+        ", ".join(label for label, _ in corner): {n: v for _, values in corner for n, v in values.items()}
         for corner in itertools.product(*sides.values())
     }
 
@@ -513,37 +467,12 @@ def samples(
 
 
 def axis_labels(parameters: ParameterSet, spreads: SampleSpreads) -> tuple[str, ...]:
-    """The axes of a box of spreads, in order: "load.mass", or "friction.coulomb + friction.static" that vary together.
-
-    Raises
-    ------
-    InputError
-        As for `samples`.
-    """
+    """The axes of a box of spreads: "load.mass", or "friction.coulomb + friction.static" where these vary together."""
     return tuple(_axis_names(parameters, spreads))
 
 
 def values_at(parameters: ParameterSet, spreads: SampleSpreads, shares: Array) -> list[dict[str, float]]:
-    """Parameter values at points of a box of spreads.
-
-    Parameters
-    ----------
-    parameters : ParameterSet
-    spreads : mapping
-        As for `samples`.
-    shares : ndarray, shape (n, axes)
-        Of each axis, from 0 to 1: of its width, or of its distribution's probability.
-
-    Returns
-    -------
-    list of dict of str to float
-        A point each [SI].
-
-    Raises
-    ------
-    InputError
-        As for `samples`.
-    """
+    """Parameter values [SI] at points of a box of spreads, `shares` of its width or probability, shape (n, n_axes)."""
     columns = {
         n: _sample_values(parameters, n, spread, shares[:, k]).tolist()
         for k, (names, spread) in enumerate(_axis_names(parameters, spreads).values())
@@ -597,7 +526,10 @@ def draws(
     log = np.array([parameters[n].log for n in names])
     scale = np.where(log, centre, 1.0)
     mean = np.where(log, np.log(np.where(log, centre, 1.0)), centre)
-    rng, factor = generator(seed, "draws", *names), _square_root(matrix / np.outer(scale, scale))
+    scaled = matrix / np.outer(scale, scale)
+    variances, axes = np.linalg.eigh((scaled + scaled.T) / 2)
+    factor = np.asarray(axes * np.sqrt(np.maximum(variances, 0.0)))  # rounding makes some variances negative
+    rng = generator(seed, "draws", *names)
     freedom = np.array([dof.get(n, math.inf) for n in names])
 
     def draw() -> Array:
@@ -635,18 +567,6 @@ def _axis_names(
     return out
 
 
-def _axis_ends(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
-    """Parameter values of each axis at its low and its high end."""
-    out: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
-    for axis, (names, spread) in _axis_names(parameters, spreads).items():
-        ends = [_spread_ends(parameters, name, spread) for name in names]
-        out[axis] = (
-            {n: e[0] for n, e in zip(names, ends, strict=True)},
-            {n: e[1] for n, e in zip(names, ends, strict=True)},
-        )
-    return out
-
-
 def _sample_values(parameters: ParameterSet, name: str, spread: Spread | Distribution, shares: Array) -> Array:
     """The values of a parameter at these shares of its axis."""
     if isinstance(spread, float | int | tuple):
@@ -668,16 +588,6 @@ def _spread_ends(parameters: ParameterSet, name: str, spread: Spread | Distribut
     inside = p.lower <= low and high <= p.upper
     require(inside, f"{name}: {low:g} to {high:g} {p.unit} leaves its bounds, {p.lower:g} to {p.upper:g} {p.unit}")
     return low, high
-
-
-def _merge_values(parts: Iterator[dict[str, float]]) -> dict[str, float]:
-    return {name: value for part in parts for name, value in part.items()}
-
-
-def _square_root(matrix: Array) -> Array:
-    """Factor F with F F' equal to the matrix; eigenvalues that rounding made negative count as zero."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _draw_within_bounds(parameters: ParameterSet, names: list[str], draw: Callable[[], Array]) -> dict[str, float]:

@@ -32,25 +32,12 @@ NO_WEIGHTS: Mapping[Requirement, float] = MappingProxyType({})
 
 @dataclass(frozen=True, eq=False)
 class Specification:
-    """Objective and limits of a tuning, checked by `specify`.
+    """Objective and limits of a tuning, checked by `specify`."""
 
-    Attributes
-    ----------
-    weights : mapping of Requirement to float
-        The terms of the objective with their weights; empty where a file only describes a loop.
-    limits : tuple of Requirement
-        At most one of a kind, the tightest.
-    band : float or Tolerance
-        Half width of the settling band, a fraction of the step or in the measured unit; 2 % unless a requirement
-        names another.
-    rest : NoHunting or None
-        How a loop shall end on its rig; None where that is not asked.
-    """
-
-    weights: Mapping[Requirement, float]
-    limits: tuple[Requirement, ...]
-    band: Band
-    rest: NoHunting | None = None
+    weights: Mapping[Requirement, float]  # of the terms of the objective; empty where a file only describes a loop
+    limits: tuple[Requirement, ...]  # at most one of a kind, the tightest
+    band: Band  # half width of the settling band; 2 % unless a requirement names another
+    rest: NoHunting | None = None  # how a loop shall end on its rig; None where that is not asked
 
     @property
     def envelope(self) -> EnvelopeBounds:
@@ -86,10 +73,7 @@ class Specification:
         return replace(self, limits=limits, band=self.band * (1 - margin))
 
     def with_stability(self) -> "Specification":
-        """Copy for a search, which may return stable loops only: with a limit on the sensitivity where there is none.
-
-        The sensitivity of an unstable loop is infinite, and a loop with a finite one is stable.
-        """
+        """Copy for a search, which may return stable loops only: with a limit on the sensitivity, infinite without."""
         if self.limit(MaxSensitivity) < inf:
             return self
         return replace(self, limits=(*self.limits, MaxSensitivity(STABILITY_SENSITIVITY)))
@@ -119,10 +103,7 @@ class Specification:
         return sum(weight * q.metric.resolution for q, weight in self.weights.items())
 
     def excess(self, values: Mapping[str, Any]) -> dict[Requirement, Any]:
-        """The one answer to which limit is broken, by how much: the share by which values exceed each limit.
-
-        The values are those of `requirement_values`, numbers or arrays. A share is negative where a limit leaves room,
-        and NaN without a figure, which breaks the limit too.
+        """Shares by which values of `requirement_values` exceed each limit: negative is room, NaN breaks it too.
 
         Examples
         --------
@@ -141,19 +122,7 @@ Objective = Requirement | Mapping[Requirement, float] | Specification
 
 
 def specify(minimise: Objective, subject_to: Sequence[Requirement | NoHunting] = ()) -> Specification:
-    """Check an objective and its limits.
-
-    Parameters
-    ----------
-    minimise : Requirement, mapping of Requirement to weight, or Specification
-        The objective; a term with a bound is a limit as well. A Specification, which is checked already, comes alone.
-    subject_to : sequence of Requirement
-
-    Raises
-    ------
-    InputError
-        If there is nothing to minimise, a limit has no bound, a weight is not positive, a kind is weighted twice, or
-        bands or envelopes differ.
+    """Check an objective and its limits: a term with a bound is a limit as well, a Specification comes alone.
 
     Examples
     --------
@@ -174,10 +143,7 @@ def specify(minimise: Objective, subject_to: Sequence[Requirement | NoHunting] =
 def specify_limits(
     subject_to: Sequence[Requirement | NoHunting], weights: Mapping[Requirement, float] = NO_WEIGHTS
 ) -> Specification:
-    """Check limits that may stand without an objective, as a file that only describes a loop has them.
-
-    Errors are as for `specify`.
-    """
+    """Check limits that may stand without an objective, as a file that only describes a loop has them."""
     asked = [q for q in subject_to if isinstance(q, NoHunting)]
     rest = NoHunting(max(q.duration for q in asked), min(q.repeatability for q in asked)) if asked else None
     found = _specify_requirements([q for q in subject_to if not isinstance(q, NoHunting)], weights)

@@ -20,7 +20,6 @@ from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.simulate import continue_simulation, simulate
 from pneuopt.dynamics.system import System, define
-from pneuopt.evaluation import certificate as continuation
 from pneuopt.evaluation.certificate import (
     Certificate,
     ContinuedResponse,
@@ -29,7 +28,6 @@ from pneuopt.evaluation.certificate import (
     certificate,
     continue_response,
     describe_counts,
-    find_defects,
 )
 from pneuopt.evaluation.evaluate import evaluate_cases
 from pneuopt.evaluation.metric import Tolerance, longest_stay
@@ -160,7 +158,7 @@ def test_an_overshoot_beyond_the_horizon_counts() -> None:
 
 
 def test_an_undecided_response_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(continuation, "MAX_CONTINUATION_INSTANTS", 1500)
+    monkeypatch.setattr("pneuopt.evaluation.certificate.MAX_CONTINUATION_INSTANTS", 1500)
     found = certificate(*_at(Step(0.05), position_loop(2000.0, 20000.0, 100.0)))
     assert defects(found) == [Defect.UNDECIDED]
     assert "budget" in found.findings[0].sentence
@@ -176,9 +174,9 @@ def test_a_response_that_settles_later_says_so() -> None:
 
 def test_a_settled_linear_loop_is_not_simulated_any_longer() -> None:
     loop, step, values = _at(Step(1.0), first_order(2.0, 20.0))
-    course = continue_response(next(evaluate_cases(loop, step, values)), 0.02)
-    assert course.t[-1] == pytest.approx(1.0)
-    assert course.is_decided(0.02)
+    continued = continue_response(next(evaluate_cases(loop, step, values)), 0.02)
+    assert continued.t[-1] == pytest.approx(1.0)
+    assert continued.is_decided(0.02)
 
 
 @pytest.mark.parametrize(("rate", "is_decided"), [(0.0, True), (5e-4, True), (1e-3, False)])
@@ -186,9 +184,11 @@ def test_a_command_that_drifts_under_a_standing_signal_is_followed(rate: float, 
     """An integral that winds up behind static friction: over the 15 horizons to come it would change by 15 rates."""
     t = np.linspace(0.0, 1.0, 101)
     stuck = np.where(t < 0.2, t / 0.2, 1.0)
-    course = ContinuedResponse(first_order(5.0, 20.0)[0], Step(1.0, horizon=1.0), None, t, stuck, 1.0 - rate + rate * t)
-    assert course.stands(0.02)
-    assert course.is_decided(0.02) is is_decided
+    continued = ContinuedResponse(
+        first_order(5.0, 20.0)[0], Step(1.0, horizon=1.0), None, t, stuck, 1.0 - rate + rate * t
+    )
+    assert continued.stands(0.02)
+    assert continued.is_decided(0.02) is is_decided
 
 
 def test_the_stroke_may_end_first() -> None:
@@ -273,7 +273,7 @@ def test_a_response_that_leaves_the_band_for_a_moment_has_settled(dip: float, se
     found = ending(t, decay(t, dip))
     assert found.is_settled
     assert found.settling_time == pytest.approx(settled, abs=5e-3)
-    assert list(find_defects(found)) == []
+    assert list(found.findings()) == []
 
 
 def test_a_response_that_is_inside_as_long_as_ever_hunts_on() -> None:
@@ -283,7 +283,7 @@ def test_a_response_that_is_inside_as_long_as_ever_hunts_on() -> None:
     found = ending(t, np.asarray(error))
     assert longest_stay(t, found.is_inside(error)) == pytest.approx(0.3, abs=2e-3)
     assert not found.is_settled
-    assert [f.defect for f in find_defects(found)] != []
+    assert [f.defect for f in found.findings()] != []
     assert found.returns(0.0) == 1
 
 
@@ -293,7 +293,7 @@ def test_a_response_that_rests_beyond_the_band_is_outside(share: float, inside: 
     t = np.linspace(0.0, 1.5, 3001)
     found = ending(t, -np.maximum(np.exp(-t / 0.1), share * BAND))
     assert found.is_settled == inside
-    assert ([f.defect for f in find_defects(found)] == []) == inside
+    assert ([f.defect for f in found.findings()] == []) == inside
     late = ending(t, np.where(t > 1.2, share * BAND, 0.0))  # the horizon is 1 s
     assert late.refutes(0.5) != inside
 
@@ -304,7 +304,7 @@ def test_a_response_must_be_in_its_band_for_good_within_a_few_horizons(horizons:
     t = np.linspace(0.0, 30.0, 30001)
     found = ending(t, np.where(t < horizons * STEP.horizon, -0.05, -0.5 * BAND))
     assert found.is_settled
-    assert [f.defect for f in find_defects(found)] == [Defect.CREEPS] * refused
+    assert [f.defect for f in found.findings()] == [Defect.CREEPS] * refused
 
 
 def test_a_response_that_never_was_in_the_band_has_no_stay() -> None:
@@ -312,7 +312,7 @@ def test_a_response_that_never_was_in_the_band_has_no_stay() -> None:
     error = -0.5 * np.exp(-t / 5.0)
     found = ending(t, error)
     assert longest_stay(t, found.is_inside(error)) == 0.0
-    assert [f.defect for f in find_defects(found)] == [Defect.CREEPS]
+    assert [f.defect for f in found.findings()] == [Defect.CREEPS]
 
 
 @pytest.mark.parametrize(("settled", "defects"), [(3.9, []), (4.1, [Defect.CREEPS])])
@@ -321,7 +321,7 @@ def test_who_needs_more_than_four_horizons_creeps(settled: float, defects: list[
     t = np.linspace(0.0, 16.0, 8001)
     found = ending(t, np.where(t < settled, -0.05, 0.0))
     assert found.settling_time == pytest.approx(settled, abs=5e-3)
-    assert [f.defect for f in find_defects(found)] == defects
+    assert [f.defect for f in found.findings()] == defects
 
 
 @pytest.mark.parametrize(("ratio", "settles"), [(1.8, False), (2.2, True)])

@@ -30,14 +30,16 @@ def test_what_the_signal_does_shortly_before_a_contact_is_not_judged() -> None:
     loop = ClosedLoop(PneumaticDrive(friction=Viscous()).system(), PID())
     t = np.linspace(0.0, 10.0, 1001)
     signal = np.where(t < 9.5, 0.1, 0.6)
-    course = ContinuedResponse(loop, Step(0.1, horizon=1.0), None, t, signal, np.zeros_like(t), contact="the end stop")
-    assert course.signal[course.before_contact].max() == pytest.approx(0.1)
-    assert np.abs(course.error).max() == pytest.approx(0.0, abs=1e-12)
-    free = replace(course, contact="")
+    continued = ContinuedResponse(
+        loop, Step(0.1, horizon=1.0), None, t, signal, np.zeros_like(t), contact="the end stop"
+    )
+    assert continued.signal[continued.before_contact].max() == pytest.approx(0.1)
+    assert np.abs(continued.error).max() == pytest.approx(0.0, abs=1e-12)
+    free = replace(continued, contact="")
     assert free.signal[free.before_contact].max() == pytest.approx(0.6)
     assert free.error.max() == pytest.approx(5.0)
-    averaged = replace(course, period=4.0)
-    assert averaged.at[-1] == pytest.approx(8.0), "half a period before the end, where that lies before the contact"
+    averaged = replace(continued, period=4.0)
+    assert averaged.times[-1] == pytest.approx(8.0), "half a period before the end, where that lies before the contact"
 
 
 @pytest.mark.slow  # 6 s

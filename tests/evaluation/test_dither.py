@@ -256,11 +256,11 @@ def test_a_hunting_loop_is_judged_by_its_largest_error_in_the_last_cycles() -> N
 def test_cycles_shorter_than_the_dithers_period_have_an_end_too(frequency: float) -> None:
     """Means end half a period before the record; three cycles at 400 Hz fit into that half period."""
     t = np.linspace(0.0, 2.0, 2001)
-    course = SimpleNamespace(t=t, at=t[t <= 1.9875], period=0.025)
+    response = SimpleNamespace(t=t, times=t[t <= 1.9875], period=0.025)
     hunting: Any = SimpleNamespace(
-        course=course, cycle=SimpleNamespace(frequency=frequency), stands=False, drifts=False
+        response=response, cycle=SimpleNamespace(frequency=frequency), stands=False, drifts=False
     )
-    assert begin_of_end(hunting) <= course.at[-1] - min(2.0, 3 / frequency) + 1e-3
+    assert begin_of_end(hunting) <= response.times[-1] - min(2.0, 3 / frequency) + 1e-3
 
 
 @pytest.mark.parametrize("name", CASES)

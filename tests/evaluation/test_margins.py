@@ -6,6 +6,7 @@ from dataclasses import replace
 import casadi as ca
 import control
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,9 +26,9 @@ from pneuopt.evaluation.margins import (
     batch_frequency_response,
     frequency_grid,
     frequency_response,
+    margin_rows,
     margins,
     noise_gain,
-    operating_point_margins,
     operating_points,
     sensitivity_terms,
     worst_margins,
@@ -397,7 +398,7 @@ def test_the_margins_of_a_position_loop_are_those_of_its_sliding_body() -> None:
     """At its end, where it sticks, nothing seems wrong; sliding it has the phase margin of P = 1/(5 s^2 + 80 s)."""
     loop, p, step = positioner()
     response = respond(loop, step, p)
-    table = operating_point_margins(loop, p, step, response).set_index("point")
+    table = pd.DataFrame(margin_rows(loop, p, step, response)).set_index("point")
     assert list(table.index) == ["at rest", "sliding", "at the end"]
     assert table["FrictionSlope"]["at rest"] > 1e4
     assert 70 < table["FrictionSlope"]["sliding"] < 90
@@ -453,7 +454,7 @@ def test_margins_do_not_jump_where_a_dither_begins(light_cylinder: tuple[ClosedL
     loop, p, step = light_cylinder
     step = replace(step, horizon=0.2)
     found = [
-        operating_point_margins(loop, q, step, respond(loop, step, q)).set_index("point")[["t", *MARGINS]]
+        pd.DataFrame(margin_rows(loop, q, step, respond(loop, step, q))).set_index("point")[["t", *MARGINS]]
         for q in (p.with_values({"dither.amplitude": a}) for a in (0.0, 1e-12, 1e-3))
     ]
     assert 3 < found[0]["MaxSensitivity"]["sliding"] < 5
@@ -497,7 +498,7 @@ def test_margins_are_those_of_the_disturbed_plant() -> None:
     assert evaluate(loop, step, p).iloc[:, 0]["MaxSensitivity"] == pytest.approx(after, rel=1e-6)
     whole = add_disturbances(loop, [step])
     response = respond(loop, step, p)
-    table = operating_point_margins(whole, whole.complete(p), step, response).set_index("point")
+    table = pd.DataFrame(margin_rows(whole, whole.complete(p), step, response)).set_index("point")
     assert table["MaxSensitivity"].tolist() == pytest.approx([before, after], rel=1e-6)
 
 
@@ -506,7 +507,7 @@ def test_the_friction_slope_is_that_of_bristles_that_follow() -> None:
     loop = ClosedLoop(ForceDrive(LuGre()).system(), PID())
     p = loop.parameters.with_values({"pid.Kp": 3000.0, "pid.Ki": 10000.0})
     step = Step(0.01, initial=0.01, horizon=0.2)
-    start = operating_point_margins(loop, p, step, respond(loop, step, p)).iloc[0]
+    start = margin_rows(loop, p, step, respond(loop, step, p))[0]
     coulomb, static, v_s, viscous = (
         p.value(f"friction.{n}") for n in ("coulomb", "static", "stribeck_velocity", "viscous")
     )

@@ -20,13 +20,12 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation import dither as dithered_ending
+from pneuopt.evaluation import dither, response
 from pneuopt.evaluation.certificate import (
     ContinuedResponse,
     Defect,
     Ending,
     certificate,
-    correct_metrics,
     judge_evaluations,
 )
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate, respond
@@ -34,7 +33,6 @@ from pneuopt.evaluation.metric import Source, band_share, describe_ripple
 from pneuopt.evaluation.metrics import BandCentre, step_metrics
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.response import TuningCase
-from pneuopt.evaluation.response import measure as measure_of_band
 from pneuopt.models.catalog import t32
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
@@ -235,23 +233,23 @@ def by_certificate(y: Array, period: float | None, band: float) -> float:
     """The figure that it shows, of a response that it calls settled."""
     ending = Ending(continued(y, period), band_share(band, STEP), "a")
     known = {"SettlingTime": by_metrics(y, period, band), "Overshoot": 1e3} if np.isfinite(y).all() else {}
-    return correct_metrics(ending, known)["SettlingTime"] if known and ending.is_settled else ending.settling_time
+    return ending.correct(known)["SettlingTime"] if known and ending.is_settled else ending.settling_time
 
 
 def by_rig(y: Array, period: float | None, band: float) -> float:
     """As `evaluate` reads a rig's truth."""
     run = Trajectory(T_BAND, {LOOP.feedback.name: y, "control": np.zeros_like(T_BAND)})
-    return measure_of_band(LOOP, parameters(period), STEP, run, band)["SettlingTime"]
+    return response.measure(LOOP, parameters(period), STEP, run, band)["SettlingTime"]
 
 
 def by_verdict(y: Array, period: float | None, band: float) -> float:
     """With a response that is continued already."""
     run = Trajectory(T_BAND, {LOOP.feedback.name: y, "control": np.zeros_like(T_BAND)})
-    metrics = measure_of_band(LOOP, parameters(period), STEP, run, band)
+    metrics = response.measure(LOOP, parameters(period), STEP, run, band)
     found = CaseEvaluation(LOOP, TuningCase(STEP), parameters(period), metrics, run)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dithered_ending, "continue_response", lambda *_: continued(y, period))
-        return dithered_ending.read_ending(found, band).metrics["SettlingTime"]
+        patch.setattr(dither, "continue_response", lambda *_: continued(y, period))
+        return dither.read_ending(found, band).metrics["SettlingTime"]
 
 
 def by_search(y: Array, period: float | None, band: float) -> float:
@@ -350,11 +348,11 @@ def test_certificate_and_verdict_say_how_it_ends_alike(shares: Array, defect: De
     """A swing inside the band is no hunting: the verdict called it that, and judged such a loop by other criteria."""
     y = SIZE * shares
     run = Trajectory(T_BAND, {LOOP.feedback.name: y, "control": np.zeros_like(T_BAND)})
-    metrics = measure_of_band(LOOP, parameters(None), STEP, run, BAND)
+    metrics = response.measure(LOOP, parameters(None), STEP, run, BAND)
     found = CaseEvaluation(LOOP, TuningCase(STEP), parameters(None), metrics, run)
     for module in ("dither", "certificate"):
         monkeypatch.setattr(f"pneuopt.evaluation.{module}.continue_response", lambda *_: continued(y, None))
-    (proof, verdict) = judge_evaluations([found], BAND), dithered_ending.read_ending(found, BAND)
+    (proof, verdict) = judge_evaluations([found], BAND), dither.read_ending(found, BAND)
     assert [f.defect for f in proof.findings] == ([] if defect is None else [defect])
     assert verdict.ending.defect is defect
     assert verdict.ending.hunts == (defect is Defect.HUNTS)
