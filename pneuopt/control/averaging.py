@@ -144,10 +144,12 @@ def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Arra
     swing : mapping of state to complex
         As `ripple` gives it.
     x : array_like, shape (n_states,)
+        The state when the dither is switched on.
 
     Returns
     -------
     ndarray, shape (n_states,)
+        The means at that instant.
 
     Examples
     --------

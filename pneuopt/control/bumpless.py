@@ -31,6 +31,7 @@ def bumpless_transfer(
     Parameters
     ----------
     loop : ClosedLoop
+        Whose gains change while it runs.
     x : array_like, shape (n_states,)
         The running loop's state: a sampled one's between two samples, as at the end of a simulation.
     old, new : ParameterSet
@@ -41,6 +42,7 @@ def bumpless_transfer(
     Returns
     -------
     ndarray, shape (n_states,)
+        The state with which the new gains begin.
 
     Raises
     ------

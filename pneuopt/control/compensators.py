@@ -239,6 +239,7 @@ class FrictionFeedforward:
     Parameters
     ----------
     direction : Direction
+        Whose sign counts: that of the reference's motion, or of the measured speed.
     """
 
     direction: Direction = Direction.REFERENCE

@@ -52,6 +52,7 @@ class Dither:
         With a sampled controller: a generator behind the controller adds the wave at all times, and the actuator
         clips the sum; the controller knows only the offset. Otherwise the wave is sampled and held with the command.
     waveform : Waveform
+        A sine or a triangle of the same peak.
     """
 
     frequency: float = 160.0

@@ -42,7 +42,9 @@ def linear_plant(
     Parameters
     ----------
     loop : ClosedLoop
+        Whose plant it is.
     parameters : ParameterSet
+        A missing one has the loop's default.
     x : ndarray, shape (n_plant_states,), optional
         The plant's operating point, an equilibrium or not, under dither its means; by default the closed loop's rest.
         Dry friction makes a resting plant look stiff: linearise such a plant in motion.
@@ -52,6 +54,7 @@ def linear_plant(
     Returns
     -------
     Linearisation
+        With one input, the command, and one output; a sensor's lag adds the state "sensor.reading".
     """
     loop.check(parameters)
     x, u = operating_point(loop, parameters, x, u)

@@ -52,7 +52,9 @@ class ClosedLoop:
     plant : drive or System
         Held as its system, whose command, and so the loop's, is the deviation from the valve's centre.
     pid : PID
+        Its law, gains and limits; whether it is sampled.
     dither : Dither, optional
+        An oscillation that is added to the command.
     actuated : str, optional
         The plant's input that the controller drives; by default its only one. Others stay inputs of the loop.
     measured : str, optional
@@ -324,6 +326,7 @@ class ClosedLoop:
         Parameters
         ----------
         parameters : ParameterSet
+            A missing one has the loop's default.
         x_plant : array_like, shape (n_plant_states,), optional
             The plant's state. Without it the closed loop is solved for its equilibrium at `reference`, other inputs 0;
             a plant that knows its rest stands there, or moves steadily, and the controller takes over the command that
@@ -338,6 +341,7 @@ class ClosedLoop:
         Returns
         -------
         ndarray, shape (n_states,)
+            In the order of `states`.
 
         Raises
         ------

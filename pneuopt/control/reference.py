@@ -182,6 +182,7 @@ class Step:
         Returns
         -------
         Trajectory
+            From 0 to the horizon, or to the first instant of the grid behind it.
 
         Raises
         ------

@@ -55,7 +55,9 @@ def export_settings(
     loop : ClosedLoop
         With a sample time.
     parameters : ParameterSet
+        A missing one has the loop's default.
     block : Block
+        Whose block is set.
     references : Reference or sequence of Reference
         On which the two are compared.
     name : str

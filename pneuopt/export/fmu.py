@@ -36,6 +36,7 @@ def export_fmu(system: System, parameters: ParameterSet, x: Array | None = None,
     x : ndarray, shape (n_states,), optional
         The state at the start; by default the plant's rest.
     name : str
+        Of the model: letters, digits and single underscores.
 
     Returns
     -------
