@@ -84,7 +84,16 @@ def from_control(
     >>> round(to_control(found).dcgain().item(), 9)
     3.0
     """
-    A, B, C, D = _matrices(model)
+    control, remedy = _import_control(), "give the continuous model, and let PID(sample_time=...) sample the controller"
+    kinds = (control.TransferFunction, control.StateSpace)
+    require(isinstance(model, kinds), f"a TransferFunction or StateSpace is wanted, got {type(model).__name__}")
+    require(model.isctime(), f"the model is sampled every {model.dt} s; {remedy}")
+    try:
+        found = control.ss(model)
+    except (ValueError, control.ControlMIMONotImplemented) as error:
+        raise InputError(f"the model has no state-space form ({error}); give a proper one") from None
+    A, B, C, D = (np.atleast_2d(np.asarray(M, dtype=float)) for M in (found.A, found.B, found.C, found.D))
+    require(all(np.isfinite(M).all() for M in (A, B, C, D)), "the model has coefficients that are not finite")
     for kind, named, count in (("inputs", inputs, B.shape[1]), ("outputs", outputs, C.shape[0])):
         require(len(named) == count, f"the model has {count} {kind}, {len(named)} are named")
     states = [Quantity(f"plant.x{k + 1}", "1") for k in range(len(A))]
@@ -100,22 +109,6 @@ def from_control(
 def _multiply(matrix: Array, x: ca.SX) -> ca.SX:
     """The product without the terms that are zero, so that the model is as sparse as the matrix."""
     return ca.mtimes(ca.sparsify(ca.DM(matrix)), x) if x.numel() else ca.SX.zeros(matrix.shape[0])
-
-
-def _matrices(model: Any) -> tuple[Array, Array, Array, Array]:
-    """The matrices of a continuous, proper model."""
-    control = _import_control()
-    kinds = (control.TransferFunction, control.StateSpace)
-    require(isinstance(model, kinds), f"a TransferFunction or StateSpace is wanted, got {type(model).__name__}")
-    remedy = "give the continuous model, and let PID(sample_time=...) sample the controller"
-    require(model.isctime(), f"the model is sampled every {model.dt} s; {remedy}")
-    try:
-        found = control.ss(model)
-    except (ValueError, control.ControlMIMONotImplemented) as error:
-        raise InputError(f"the model has no state-space form ({error}); give a proper one") from None
-    A, B, C, D = (np.atleast_2d(np.asarray(M, dtype=float)) for M in (found.A, found.B, found.C, found.D))
-    require(all(np.isfinite(M).all() for M in (A, B, C, D)), "the model has coefficients that are not finite")
-    return A, B, C, D
 
 
 def _import_control() -> Any:

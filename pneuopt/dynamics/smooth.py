@@ -114,9 +114,9 @@ class LimitMonitor:
         x = run.advance_along(t) if isinstance(run, SmoothIntegration) else None
         if not isinstance(run, SmoothIntegration) or x is None:
             return self._follow_stepwise(run, instants, recorded, stops=stops)
-        kept, met = places[:recorded], self._first_crossing(x) if stops else None
-        if met is not None:
-            kept = kept[kept < met]
+        kept = places[:recorded]
+        if stops and ((crossed := self._crossings(x)[1].any(axis=1)).any() or self._contacts):
+            kept = kept[kept < (0 if self._contacts else crossed.argmax())]
             places = places[: len(kept) + 1]
         self._observe_along(t[: places[-1] + 1], x[: places[-1] + 1])
         run.record_along(t[kept], x[kept])
@@ -144,13 +144,6 @@ class LimitMonitor:
         t = begins.repeat(more + 1) + (more.repeat(more + 1) + 1 - back) * LIMIT_CHECK_PERIOD
         t[places] = instants
         return t, places
-
-    def _first_crossing(self, x: Array) -> int | None:
-        """The first of the next states, shape (n, n_states), by which a limit was met, now or before."""
-        if self._contacts:
-            return 0
-        crossed = self._crossings(x)[1].any(axis=1)
-        return int(crossed.argmax()) if crossed.any() else None
 
     def _observe_along(self, t: Array, x: Array) -> None:
         """`observe` for each of the next states, shape (n, n_states)."""

@@ -86,10 +86,16 @@ class StickSlipIntegration:
         """See `Integration`."""
         until, self._steps = t - self._origin, 0
         while self._event_time <= until or self._solver.t < until:
-            if self._event_time <= until:
-                self._switch_mode()
-            else:
+            if self._event_time > until:
                 self._step()
+                continue
+            at, x = self._event_time, self._state_at(self._event_time)
+            if self._mode:
+                x = self._with_zero_speed(x)
+                self._begin_mode(at, x, self._breakaway_direction(at, x))
+            else:
+                forward, backward = self._breakaway_accelerations(at, x)
+                self._begin_mode(at, x, 1 if forward > -backward else -1)
         self._now, self._x = until, self._state_at(until)
         return self._x
 
@@ -164,16 +170,6 @@ class StickSlipIntegration:
             return float(-self._mode * x[self._speed] - self._standstill_speed)
         forward, backward = self._breakaway_accelerations(t, x)
         return max(forward, -backward)
-
-    def _switch_mode(self) -> None:
-        t = self._event_time
-        x = self._state_at(t)
-        if self._mode:
-            x = self._with_zero_speed(x)
-            self._begin_mode(t, x, self._breakaway_direction(t, x))
-        else:
-            forward, backward = self._breakaway_accelerations(t, x)
-            self._begin_mode(t, x, 1 if forward > -backward else -1)
 
     def _breakaway_direction(self, t: float, x: Array) -> int:
         """The direction in which a mass at rest breaks away; 0 if it sticks."""

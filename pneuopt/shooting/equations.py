@@ -117,8 +117,18 @@ class NormalEquations:
             return None
         bread = positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])
         out = np.full((len(keep), len(keep)), np.nan)
-        spread = bread if noisy_gaps else bread @ self._sandwich_meat(reduced)[np.ix_(keep, keep)] @ bread
-        out[np.ix_(keep, keep)] = spread
+        out[np.ix_(keep, keep)] = bread
+        if not noisy_gaps:
+            n, meat = (
+                self.gaps.shape[1],
+                np.zeros_like(reduced.schur),
+            )  # the data's own Gram matrix, nodes following
+            for rows, columns, unknowns in self.segments.blocks:
+                E = np.zeros((rows.stop - rows.start, self.linearisation.end_sensitivities.shape[2], len(meat)))
+                E[:, :n] = -reduced.node_sensitivity[rows]
+                E[:, n + columns, unknowns] = self.linearisation.chain[unknowns]
+                meat += np.tensordot(E, self.linearisation.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
+            out[np.ix_(keep, keep)] = bread @ meat[np.ix_(keep, keep)] @ bread
         return np.asarray(out * np.outer(self.linearisation.chain, self.linearisation.chain))
 
     def prior_covariance(self, keep: Mask, fixed: Mask, prior: Array) -> Array | None:
@@ -137,16 +147,6 @@ class NormalEquations:
         moved = self.linearisation.chain[keep, None] * (bread @ reduced.schur[np.ix_(keep, fixed)]) * spread
         out[np.ix_(keep, keep)] = moved @ moved.T
         return out
-
-    def _sandwich_meat(self, reduced: ReducedEquations) -> Array:
-        """The data's own Gram matrix of the parameters, with the nodes following them. Shape (k, k)."""
-        n, meat = self.gaps.shape[1], np.zeros_like(reduced.schur)
-        for rows, columns, unknowns in self.segments.blocks:
-            E = np.zeros((rows.stop - rows.start, self.linearisation.end_sensitivities.shape[2], len(meat)))
-            E[:, :n] = -reduced.node_sensitivity[rows]
-            E[:, n + columns, unknowns] = self.linearisation.chain[unknowns]
-            meat += np.tensordot(E, self.linearisation.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
-        return meat
 
 
 def normal_equations(

@@ -184,21 +184,16 @@ def follow_path(problem: FullSpaceProblem, start: ParameterSet, path: Sequence[M
             w = np.clip(np.concatenate([to_unknowns(transcription, q), *node_guesses(transcription, q, ())]), low, up)
             solution, raw = _run_solver(problem, w, q)
         else:
-            last = done[-1][1]
-            w = np.clip(_extrapolate(done[-2:], q), low, up)
+            # extrapolated from the last two solutions along the difference of their parameters
+            (before, earlier), (there, last) = done[-2:][0], done[-1]
+            way = there - before
+            length = float(way @ way)
+            share = min(max(float(way @ (q - there)) / length, 0.0), MAX_EXTRAPOLATION) if length else 0.0
+            w = np.clip(last["x"] + share * (last["x"] - earlier["x"]), low, up)
             solution, raw = _run_solver(warm, w, q, {"lam_x0": last["lam_x"], "lam_g0": last["lam_g"]})
         done += [(q, raw)] if solution.status.converged else []
         found.append(solution)
     return found
-
-
-def _extrapolate(done: Sequence[tuple[Array, Mapping[str, Array]]], q: Array) -> Array:
-    """The unknowns at q, extrapolated from the last two solutions along the difference of their parameters."""
-    (before, x), (last, y) = ((known, raw["x"]) for known, raw in (done[0], done[-1]))
-    step = last - before
-    length = float(step @ step)
-    share = min(max(float(step @ (q - last)) / length, 0.0), MAX_EXTRAPOLATION) if length else 0.0
-    return np.asarray(y + share * (y - x))
 
 
 def _run_solver(

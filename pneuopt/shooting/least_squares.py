@@ -36,6 +36,7 @@ steps of one stage, changes itself. The moves, in the order of the search and of
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import wraps
@@ -1076,19 +1077,15 @@ class LevenbergMarquardt:
             misses_by_gaps = math.isfinite(trial.cost) and trial.cost - current.cost > 2 * by_data
             if current.cost - trial.cost >= MIN_GAIN_RATIO * promised or not misses_by_gaps:
                 break
-            settled = self._settle_nodes(trial, current.cost)
-            if settled is None or not settled.cost < trial.cost:
+            arrow = trial.equations.arrow
+            own = arrow.node_step(self.damping + self.node_damping)
+            if own is None or trial.cost - 0.5 * arrow.descent_rate(GaussNewtonStep(own, 0.0 * z)) >= current.cost:
+                break
+            settled = self.objective.evaluate(trial.nodes + own * self.objective.segments.nominal, z)
+            if not settled.cost < trial.cost:
                 break
             trial = settled
         return trial
-
-    def _settle_nodes(self, trial: Iterate, cost: float) -> Iterate | None:
-        """A trial after a step of its nodes alone; None where that does not promise less than a cost."""
-        arrow = trial.equations.arrow
-        shift = arrow.node_step(self.damping + self.node_damping)
-        if shift is None or trial.cost - 0.5 * arrow.descent_rate(GaussNewtonStep(shift, 0.0 * trial.z)) >= cost:
-            return None
-        return self.objective.evaluate(trial.nodes + shift * self.objective.segments.nominal, trial.z)
 
     def _missed_curvature(self, current: Iterate, trial: Iterate) -> Array:
         """The curvature that a trial shows and the model has missed, by node; none of a trial that is not finite."""
@@ -1248,6 +1245,15 @@ def _final_run(state: SearchState) -> RolloutResult:
 
 
 def _stats(state: SearchState, run: RolloutResult, seconds: float) -> dict[str, float]:
+    """The figures of a search; the integration error is the largest change of an output by halved steps [deviations].
+
+    It is NaN without an optimum, and where the budget ends before it is measured: the answer is known by then.
+    """
+    error = state.integration_change
+    if not math.isfinite(error) and state.end is SearchEnd.OPTIMUM and state.method.checks_steps:
+        error = math.nan
+        with suppress(BudgetSpentError), check_during_runs(state.method.budget.check):
+            error = state.largest_change(state.run(2 * state.output_substeps).y - run.y)
     return {
         "iterations": float(state.iterations),
         "seconds": seconds,
@@ -1256,22 +1262,8 @@ def _stats(state: SearchState, run: RolloutResult, seconds: float) -> dict[str, 
         "largest_gap": state.iterate.equations.largest_gap,
         "gap_share": state.iterate.equations.gap_share,
         "gap_deviation": state.stage.gap,
-        "integration_error": _integration_error(state, run),
+        "integration_error": error,
     }
-
-
-def _integration_error(state: SearchState, run: RolloutResult) -> float:
-    """Largest change of an output when the steps are halved [noise standard deviations].
-
-    NaN without an optimum, and where the budget ends before it is measured: the answer is known by then.
-    """
-    if math.isfinite(state.integration_change) or not (state.end is SearchEnd.OPTIMUM and state.method.checks_steps):
-        return state.integration_change
-    try:
-        with check_during_runs(state.method.budget.check):
-            return state.largest_change(state.run(2 * state.output_substeps).y - run.y)
-    except BudgetSpentError:
-        return math.nan
 
 
 def close_gaps(optimum: Optimum) -> Array | None:

@@ -31,7 +31,7 @@ from pneuopt.shooting.tolerances import (
     STABILITY_RESERVE,
     SUBSTEPS_CAP,
 )
-from pneuopt.shooting.transcription import Phase, Residuals, Transcription
+from pneuopt.shooting.transcription import Phase, Transcription
 
 
 class SegmentBlock(NamedTuple):
@@ -182,7 +182,14 @@ def segment(transcription: Transcription) -> Segments:
     """Cut a transcription into its segments; `ModelError` for a free duration, which compiled segments do not take."""
     system = transcription.system
     length = max(int(np.diff(np.append(p.nodes, p.n)).max()) for p in transcription.phases)
-    measured = {r.phase: _measurements(r, system, transcription.phases[r.phase]) for r in transcription.residuals}
+    position, measured = {n: i for i, n in enumerate(names(system.outputs))}, dict[int, tuple[Array, Array]]()
+    for residual in transcription.residuals:
+        values = np.full((transcription.phases[residual.phase].n, len(position)), np.nan)
+        deviations = np.ones_like(values)
+        for column, output in enumerate(residual.outputs):
+            values[:, position[output]] = residual.measured[:, column]
+            deviations[:, position[output]] = residual.noise[column]
+        measured[residual.phase] = values, deviations
     parts = []
     for i, phase in enumerate(transcription.phases):
         require(phase.duration is None, f"{phase.name}: a free duration needs another method", ModelError)
@@ -201,16 +208,6 @@ def segment(transcription: Transcription) -> Segments:
         idle = ~_observable_states(system, outputs) & np.isnan(start[head])
         start[head, idle] = 0.0 if guess is None else guess[nodes[head], idle]
     return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
-
-
-def _measurements(residuals: Residuals, system: DiscreteSystem, phase: Phase) -> tuple[Array, Array]:
-    measured = np.full((phase.n, len(system.outputs)), np.nan)
-    noise = np.ones_like(measured)
-    position = {n: i for i, n in enumerate(names(system.outputs))}
-    for column, output in enumerate(residuals.outputs):
-        measured[:, position[output]] = residuals.measured[:, column]
-        noise[:, position[output]] = residuals.noise[column]
-    return measured, noise
 
 
 def _cut_phase(

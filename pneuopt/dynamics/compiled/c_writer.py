@@ -97,7 +97,8 @@ class _CWriter:
             name = self.c_function.inputs[i.sources[0]]
             value = CValue(self.rates[name], f"s->{name}[{i.sources[1]}]")
         elif i.operation == ca.OP_CONST:
-            value = CValue(0, f"ALL({_literal(i.constant)})")
+            infinite = "NAN" if math.isnan(i.constant) else "INFINITY" if i.constant > 0 else "-INFINITY"
+            value = CValue(0, f"ALL({repr(i.constant) if math.isfinite(i.constant) else infinite})")
         else:
             values, operation = [self.values[k] for k in i.sources], i.operation
             if operation in DIVISIONS:
@@ -137,9 +138,3 @@ def read_instructions(function: ca.Function) -> Iterator[Instruction]:
         operation = f.instruction_id(k)
         constant = f.instruction_constant(k) if operation == ca.OP_CONST else math.nan
         yield Instruction(operation, f.instruction_input(k), f.instruction_output(k), constant)
-
-
-def _literal(constant: float) -> str:
-    if math.isnan(constant):
-        return "NAN"
-    return repr(constant) if math.isfinite(constant) else "INFINITY" if constant > 0 else "-INFINITY"

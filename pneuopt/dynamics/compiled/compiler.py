@@ -245,7 +245,10 @@ def cache_directory() -> Path:
     Where that cannot be written to, or anybody may exchange files in it: a temporary folder, removed at the end.
     """
     try:
-        folder = _usual_folder()
+        base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
+        home = "AppData/Local" if os.name == "nt" else ".cache"
+        chosen = os.environ.get("PNEUOPT_CACHE")
+        folder = Path(chosen) if chosen else (Path(base) if base else Path.home() / home) / "pneuopt"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if _is_open_to_all(folder):
             return _temporary_folder(f"{folder}: other users may exchange files in it", os.getpid())
@@ -307,15 +310,6 @@ def discard_library(path: Path) -> None:
     """Delete a library that cannot be used, if we may."""
     with contextlib.suppress(OSError):
         path.unlink()
-
-
-def _usual_folder() -> Path:
-    chosen = os.environ.get("PNEUOPT_CACHE")
-    if chosen:
-        return Path(chosen)
-    base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
-    home = "AppData/Local" if os.name == "nt" else ".cache"
-    return (Path(base) if base else Path.home() / home) / "pneuopt"
 
 
 @functools.cache

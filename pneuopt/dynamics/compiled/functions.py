@@ -106,7 +106,15 @@ def compile_rows(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
             if rows.shape[rows.ndim == 2 :] != buffer.shape:
                 raise ModelError(f"argument {i} has shape {rows.shape}, expected rows of {buffer.size} numbers")
         results = tuple(np.empty((count, result.size)) for result in code.results)
-        (_evaluate_rows if code.library is None else _run_rows)(code, given, results, count)
+        if code.library is not None:
+            _run_rows(code, given, results, count)
+            return results
+        for k in range(count):
+            for buffer, rows in zip(code.buffers, given, strict=True):
+                buffer[:] = rows[k] if rows.ndim == 2 else rows
+            code.call(*code.pointers)
+            for target, result in zip(results, code.results, strict=True):
+                target[k] = result
         return results
 
     return call_rows
@@ -125,16 +133,6 @@ def _run_rows(code: "_BoundCode", given: Sequence[Array], results: Sequence[Arra
     library.system_rows(
         sources, targets, *(ctypes.c_void_p(a.ctypes.data) for a in (*steps, sizes)), ctypes.c_void_p(work.ctypes.data)
     )
-
-
-def _evaluate_rows(code: "_BoundCode", given: Sequence[Array], results: Sequence[Array], count: int) -> None:
-    """Evaluate every row in CasADi's VM."""
-    for k in range(count):
-        for buffer, rows in zip(code.buffers, given, strict=True):
-            buffer[:] = rows[k] if rows.ndim == 2 else rows
-        code.call(*code.pointers)
-        for target, result in zip(results, code.results, strict=True):
-            target[k] = result
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,11 +21,6 @@ from pneuopt.quantities.arrays import Array
 Operation = Callable[..., Any]
 
 
-def _if_else_zero(condition: Array, value: Array, out: Array) -> None:
-    """The value where the condition holds, 0 elsewhere, even where the value is not a number."""
-    out[...] = np.where(condition != 0, value, 0.0)
-
-
 def _erf(value: Array, out: Array) -> None:
     from scipy.special import erf
 
@@ -72,7 +67,8 @@ OPERATIONS: dict[int, Operation] = {
     ca.OP_COPYSIGN: np.copysign,
     ca.OP_FMIN: np.fmin,
     ca.OP_FMAX: np.fmax,
-    ca.OP_IF_ELSE_ZERO: _if_else_zero,
+    # 0 where the condition does not hold, even where the value is not a number
+    ca.OP_IF_ELSE_ZERO: lambda condition, value, out: np.copyto(out, np.where(condition != 0, value, 0.0)),
     ca.OP_LT: np.less,
     ca.OP_LE: np.less_equal,
     ca.OP_EQ: np.equal,

@@ -1,8 +1,13 @@
+"""Rollouts: machine code and the VM against the equations, shapes that are refused, and runs that Ctrl-C ends."""
+
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Any
+from unittest.mock import Mock
 
 import casadi as ca
 import numpy as np
@@ -15,7 +20,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.compiled import compiler, vm
 from pneuopt.dynamics.compiled import rollout as codegen
 from pneuopt.dynamics.compiled.compiler import find_compiler
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, check_during_runs
 from pneuopt.dynamics.system import DiscreteSystem, discretise, parameter_vector
 from pneuopt.dynamics.tolerances import ARRAY_SEGMENTS
 from pneuopt.models.drives import ForceDrive, MotionDrive
@@ -398,3 +403,49 @@ def test_residuals_of_another_shape_are_refused() -> None:
     wrong = np.zeros((5, 6, 1))
     with pytest.raises(ModelError, match=r"measured: \(5, 6, 1\), expected \(5, 6, 2\)"):
         case.rollout((0,)).gram(case.x0, case.u, case.p, case.t, case.h, wrong, wrong)
+
+
+ENDLESS = 2**31 - 1  # steps a sample, as many as a C int counts
+
+
+class StopRunError(Exception):
+    """What a check raises."""
+
+
+@needs_compiler
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ctrl_c_ends_machine_code_that_would_run_for_minutes(threads: int) -> None:
+    """2e9 steps of 0.1 us; without the flag that the loop reads, this test takes minutes."""
+    case = Case("stribeck")
+    rollout, main = case.rollout(threads=threads), threading.main_thread().ident
+    assert main is not None
+    alarm = threading.Timer(0.3, signal.pthread_kill, (main, signal.SIGINT))
+    alarm.start()
+    begun = time.process_time()
+    with pytest.raises(KeyboardInterrupt):
+        rollout.run(case.x0, case.u, case.p, case.t, case.h, substeps=ENDLESS)
+    assert time.process_time() - begun < 10 * threads  # CPU time: .3 s on an idle machine
+    alarm.join()
+    assert_array_equal(case.run(rollout).y, case.run(case.rollout(threads=threads)).y)
+
+
+@needs_compiler
+def test_a_check_ends_machine_code_that_would_run_for_minutes() -> None:
+    case, checks = Case("stribeck"), list[int]()
+
+    def check() -> None:
+        checks.append(1)
+        if len(checks) == 3:
+            raise StopRunError
+
+    with pytest.raises(StopRunError), check_during_runs(check):
+        case.rollout(threads=2).run(case.x0, case.u, case.p, case.t, case.h, substeps=ENDLESS)
+    case.run(case.rollout(threads=2))
+    assert len(checks) == 3  # before the run, twice during it, and none of the run outside
+
+
+@pytest.mark.parametrize("lanes", [pytest.param(None, marks=needs_compiler), 0])
+def test_a_check_ends_what_has_not_begun(lanes: int | None) -> None:
+    case = Case("stribeck")
+    with pytest.raises(StopRunError), check_during_runs(Mock(side_effect=StopRunError)):
+        case.run(Rollout(case.system.pieces, lanes=lanes))
