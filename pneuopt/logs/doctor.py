@@ -896,22 +896,16 @@ def _is_motionless(y: Array, noise: float, is_position: bool) -> bool:
 
     Or its samples are uncorrelated, which the position of a moving mass never is.
     """
-    correlation = float(np.max(np.abs(_autocorrelation(y))))
+    e = y - y.mean()
+    power = float(e @ e)
+    lags = range(1, min(WHITE_LAGS, y.size - 1) + 1) if power > 0 else ()
+    correlation = max((abs(float(e[k:] @ e[:-k]) / power) for k in lags), default=0.0)
     if is_position and correlation < 4 / math.sqrt(y.size):
         return True
     size = y.size // MEAN_BLOCKS
     means = y[: MEAN_BLOCKS * size].reshape(MEAN_BLOCKS, size).mean(axis=1)
     is_small = float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
     return is_small and (float(np.ptp(y)) <= STILL_STEPS * find_resolution(y) or correlation < MIN_SPEED_CORRELATION)
-
-
-def _autocorrelation(y: Array) -> Array:
-    """The correlation of samples at each lag up to `WHITE_LAGS`."""
-    e = y - y.mean()
-    power = float(e @ e)
-    if power == 0:
-        return np.zeros(1)
-    return np.array([float(e[k:] @ e[:-k]) / power for k in range(1, min(WHITE_LAGS, y.size - 1) + 1)])
 
 
 CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {
