@@ -22,6 +22,7 @@ from pneuopt.logs.tolerances import (
     LAG_STEPS,
     LARGE_SHARE,
     LEAST_SPEED,
+    LEAST_WAY_SHARE,
     MAX_ATMOSPHERE_ERROR,
     MAX_COMMAND_LAG,
     MAX_HATS,
@@ -57,7 +58,6 @@ from pneuopt.logs.tolerances import (
     SHORTEST_REST,
     SPEED_SLOPE_RATIOS,
     STATED_STOP_SHARE,
-    STILL_SHARE,
     STILL_STEPS,
     STOP_WIDTH,
     WHITE_LAGS,
@@ -481,7 +481,7 @@ def _find_moves(t: Array, size: Array) -> list[tuple[int, int]]:
     spans = list(zip(moving[np.r_[0, breaks + 1]], moving[np.r_[breaks, moving.size - 1]] + 1, strict=True))
     travelled = size * np.gradient(t)  # in the time of each sample
     ways = [float(travelled[first:last].sum()) for first, last in spans]
-    return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > STILL_SHARE * max(ways)]
+    return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > LEAST_WAY_SHARE * max(ways)]
 
 
 def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -492,7 +492,7 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
     x, push, unit = log[axis.position], axis.net_force({n: log[n] for n in axis.forces}), experiment.unit(axis.position)
     way = float(np.nanmax(x) - np.nanmin(x))
     noise = experiment.noise[axis.position] if axis.position in experiment.noise else noise_level(x, log.t)
-    width = max(STOP_WIDTH * noise, STILL_SHARE * way)
+    width = max(STOP_WIDTH * noise, LEAST_WAY_SHARE * way)
     inside = (x > np.nanmin(x) + width) & (x < np.nanmax(x) - width)
     middle, level = _usual_push(inside, motion, push)
     for side, end in ((1, float(np.nanmax(x))), (-1, float(np.nanmin(x)))):
