@@ -16,9 +16,9 @@ import numpy as np
 from pneuopt.logs.table import EMPTY_CELL, LogTable, list_rows
 from pneuopt.logs.tolerances import (
     CENTRES,
+    COMMAND_RANGE,
     MAX_MAGNITUDE,
     MIN_SAMPLES,
-    RANGE,
     SHOWN_CENTRES,
     VACUUM_LIMIT,
 )
@@ -445,7 +445,9 @@ def _guess_column(
     if not unit:
         return []
     low, high, middle = (float(f(values)) for f in (np.nanmin, np.nanmax, np.nanmedian))
-    is_offset = channel == "valve_voltage" and unit == "V" and RANGE[0] <= low and high <= RANGE[1] and high > 1
+    is_offset = (
+        channel == "valve_voltage" and unit == "V" and COMMAND_RANGE[0] <= low and high <= COMMAND_RANGE[1] and high > 1
+    )
     if not is_offset:
         return [ColumnGuess(channel, name, unit)]
     if has_centre and SHOWN_CENTRES[0] < middle < SHOWN_CENTRES[1]:

@@ -22,6 +22,7 @@ from pneuopt.logs.tolerances import (
     LAG_STEPS,
     LARGE_SHARE,
     LEAST_SPEED,
+    LEAST_WAY_SHARE,
     MAX_ATMOSPHERE_ERROR,
     MAX_COMMAND_LAG,
     MAX_HATS,
@@ -57,7 +58,6 @@ from pneuopt.logs.tolerances import (
     SHORTEST_REST,
     SPEED_SLOPE_RATIOS,
     STATED_STOP_SHARE,
-    STILL_SHARE,
     STILL_STEPS,
     STOP_WIDTH,
     WHITE_LAGS,
@@ -481,7 +481,7 @@ def _find_moves(t: Array, size: Array) -> list[tuple[int, int]]:
     spans = list(zip(moving[np.r_[0, breaks + 1]], moving[np.r_[breaks, moving.size - 1]] + 1, strict=True))
     travelled = size * np.gradient(t)  # in the time of each sample
     ways = [float(travelled[first:last].sum()) for first, last in spans]
-    return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > STILL_SHARE * max(ways)]
+    return [(int(a), int(b)) for (a, b), way in zip(spans, ways, strict=True) if way > LEAST_WAY_SHARE * max(ways)]
 
 
 def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -492,7 +492,7 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
     x, push, unit = log[axis.position], axis.net_force({n: log[n] for n in axis.forces}), experiment.unit(axis.position)
     way = float(np.nanmax(x) - np.nanmin(x))
     noise = experiment.noise[axis.position] if axis.position in experiment.noise else noise_level(x, log.t)
-    width = max(STOP_WIDTH * noise, STILL_SHARE * way)
+    width = max(STOP_WIDTH * noise, LEAST_WAY_SHARE * way)
     inside = (x > np.nanmin(x) + width) & (x < np.nanmax(x) - width)
     middle, level = _usual_push(inside, motion, push)
     for side, end in ((1, float(np.nanmax(x))), (-1, float(np.nanmin(x)))):
@@ -896,22 +896,16 @@ def _is_motionless(y: Array, noise: float, is_position: bool) -> bool:
 
     Or its samples are uncorrelated, which the position of a moving mass never is.
     """
-    correlation = float(np.max(np.abs(_autocorrelation(y))))
+    e = y - y.mean()
+    power = float(e @ e)
+    lags = range(1, min(WHITE_LAGS, y.size - 1) + 1) if power > 0 else ()
+    correlation = max((abs(float(e[k:] @ e[:-k]) / power) for k in lags), default=0.0)
     if is_position and correlation < 4 / math.sqrt(y.size):
         return True
     size = y.size // MEAN_BLOCKS
     means = y[: MEAN_BLOCKS * size].reshape(MEAN_BLOCKS, size).mean(axis=1)
     is_small = float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
     return is_small and (float(np.ptp(y)) <= STILL_STEPS * find_resolution(y) or correlation < MIN_SPEED_CORRELATION)
-
-
-def _autocorrelation(y: Array) -> Array:
-    """The correlation of samples at each lag up to `WHITE_LAGS`."""
-    e = y - y.mean()
-    power = float(e @ e)
-    if power == 0:
-        return np.zeros(1)
-    return np.array([float(e[k:] @ e[:-k]) / power for k in range(1, min(WHITE_LAGS, y.size - 1) + 1)])
 
 
 CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {

@@ -430,9 +430,6 @@ def _parquet_numbers(path: Path, name: str, column: "pa.ChunkedArray") -> Array:
     return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=float)
 
 
-_Grid = tuple[str, float, float]  # when the first sample was taken, its time and the step [s]
-
-
 def read_tdms(path: Path, raw: bytes) -> LogTable:
     """Read a TDMS file; its first sample is row 1.
 
@@ -448,7 +445,12 @@ def read_tdms(path: Path, raw: bytes) -> LogTable:
         uses = Counter(channel.name for _, channel in pairs)
         channels = {c.name if uses[c.name] == 1 else f"{group}/{c.name}": c for group, c in pairs}
         columns = {name: channel[:] for name, channel in channels.items()}
-        grids = {name: grid for name, channel in channels.items() if (grid := _tdms_grid(channel)) is not None}
+        grids = {}  # by channel when the first sample was taken, its time and the step [s]
+        for name, channel in channels.items():
+            said = channel.properties
+            if "wf_increment" in said:
+                start = str(said.get("wf_start_time", "")), float(said.get("wf_start_offset", 0.0))
+                grids[name] = (*start, float(said["wf_increment"]))
     units = {name: unit for name, channel in channels.items() if (unit := _unit(channel.properties))}
     if not grids or any(name.casefold() == "time" for name in columns):
         return array_table(path, columns, units)
@@ -456,15 +458,9 @@ def read_tdms(path: Path, raw: bytes) -> LogTable:
     return LogTable(path, table.names, 1, partial(_read_waveforms, table, grids), table.units, table.stamps)
 
 
-def _tdms_grid(channel: Any) -> _Grid | None:
-    properties = channel.properties
-    if "wf_increment" not in properties:
-        return None
-    start = float(properties.get("wf_start_offset", 0.0))
-    return str(properties.get("wf_start_time", "")), start, float(properties["wf_increment"])
-
-
-def _read_waveforms(table: LogTable, grids: dict[str, _Grid], names: Sequence[str]) -> dict[str, Array]:
+def _read_waveforms(
+    table: LogTable, grids: dict[str, tuple[str, float, float]], names: Sequence[str]
+) -> dict[str, Array]:
     channels = [name for name in names if name != "time"]
     columns = dict(table.read(channels))
     rates = {grids.get(name) for name in channels}
@@ -560,18 +556,16 @@ def _xlsx_columns(sheet: _Sheet, names: Sequence[str]) -> dict[str, Array]:
         if name in sheet.stamps and not isinstance(cells[0], _Date):
             columns[name] = seconds_from_first([_show(cell) for cell in cells], sheet.path, name, sheet.first_row)
             continue
-        numbers = np.array([_number(sheet, name, k, cell) for k, cell in enumerate(cells)])
+        numbers = np.full(len(cells), np.nan)
+        for k, cell in enumerate(cells):
+            if cell is None or (isinstance(cell, str) and cell.strip() in MISSING):
+                continue
+            is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
+            place = f"{sheet.path}: row {k + sheet.first_row}, column {name!r}"
+            require(is_number, f"{place}: {str(cell)[:40]!r} is not a number; {EMPTY_CELL}", LogError)
+            numbers[k] = float(cell) if not abs(cell) > MAX_MAGNITUDE else np.inf  # which is refused
         columns[name] = _seconds(sheet, name, numbers) if name in sheet.stamps else numbers
     return columns
-
-
-def _number(sheet: _Sheet, name: str, index: int, cell: Any) -> float:
-    if cell is None or (isinstance(cell, str) and cell.strip() in MISSING):
-        return np.nan
-    is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
-    place = f"{sheet.path}: row {index + sheet.first_row}, column {name!r}"
-    require(is_number, f"{place}: {str(cell)[:40]!r} is not a number; {EMPTY_CELL}", LogError)
-    return float(cell) if not abs(cell) > MAX_MAGNITUDE else np.inf  # which is refused
 
 
 def _seconds(sheet: _Sheet, name: str, days: Array) -> Array:

@@ -24,7 +24,7 @@ MAX_ROWS_LISTED = 8  # runs of rows that a message lists: more fill the screen, 
 VACUUM_LIMIT = 0.9e5  # [Pa]: a chamber between supply and surroundings is never below; what is, counts from ambient
 CENTRES = (3.0, 7.0)  # [V]: a command of 0 to 10 V that rests between these is counted from its centre, 5 V
 SHOWN_CENTRES = (4.0, 6.0)  # [V]: if it rests between these, its centre is estimated (`identify` takes no other)
-RANGE = (-0.3, 10.5)  # [V] of such a command, with the error of its converter
+COMMAND_RANGE = (-0.3, 10.5)  # [V] of such a command, with the error of its converter
 
 # Noise of a channel.
 ORDERS = (1, 2, 3, 4, 6, 8, 10)  # of differences: without high ones motion at a tenth of the rate counts as noise
@@ -43,7 +43,7 @@ MIN_VIEW_SAMPLES = 25  # to either side of an instant that its figure shows: few
 MAX_STEPS_BETWEEN = 5.0  # usual steps between two samples of a channel that are a hole: nobody knows what was there
 FAST_QUANTILE = 0.98  # of the speeds that is fast motion: higher counts jumps of a sensor as such
 SHORTEST_REST = 0.05  # [s]: shorter counts a move that sticks as two, and reversals as stops; longer misses a bounce
-STILL_SHARE = 2e-3  # of a way that counts as none: lower misses soft stops, higher loses slow, short moves
+LEAST_WAY_SHARE = 2e-3  # of a way that counts as none: lower misses soft stops, higher loses slow, short moves
 STILL_STEPS = 2.0  # of the resolution, the range at rest: more takes small motion for rest, fewer flicker for motion
 MIN_SPEED_CORRELATION = 0.7  # of speed and slope, to compare them: lower compares noise, higher misses short motion
 

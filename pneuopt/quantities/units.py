@@ -249,7 +249,10 @@ def _parse_unit(unit_text: str, where: str = "") -> _UnitScale:
         return _parse_with_pint(functools.reduce(lambda text, s: text.replace(s, _SYMBOLS[s]), _SYMBOLS, unit_text))
     except Exception:  # whatever pint raises on a text, the text is not a unit
         shown = unit_text[:40]
-        raise UnitError(f"{_place_prefix(where)}unknown unit {shown!r}; {_suggest_unit(shown)}") from None
+        known = {key.casefold(): unit for unit in COMMON_UNITS.split() for key in (unit, re.sub(r"[()]", "", unit))}
+        near = difflib.get_close_matches(shown.casefold(), known, n=1, cutoff=0.6)
+        hint = f"did you mean {known[near[0]]!r}?" if near else "write for instance mm, m/s, N, bar(g), V, ms or %"
+        raise UnitError(f"{_place_prefix(where)}unknown unit {shown!r}; {hint}") from None
 
 
 @cache
@@ -277,12 +280,6 @@ def _registry() -> Any:
 
 def _example_unit(unit: str) -> str:
     return {"Pa(a)": "bar(a)", "Pa(g)": "bar(g)", "1": "%"}.get(unit, unit)
-
-
-def _suggest_unit(unit_text: str) -> str:
-    known = {key.casefold(): unit for unit in COMMON_UNITS.split() for key in (unit, re.sub(r"[()]", "", unit))}
-    near = difflib.get_close_matches(unit_text.casefold(), known, n=1, cutoff=0.6)
-    return f"did you mean {known[near[0]]!r}?" if near else "write for instance mm, m/s, N, bar(g), V, ms or %"
 
 
 def _place_prefix(where: str) -> str:

@@ -1,6 +1,7 @@
 """The words of every refusal of a log, beside what triggers it; other tests assert its type and its place."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -197,17 +198,33 @@ def write_bytes(folder: Path, name: str, raw: bytes) -> Path:
     return folder / name
 
 
-DATES = "yyyy-mm-dd hh:mm:ss.000"
+def read_written(text: str | bytes, side: str, folder: Path) -> object:
+    return read_log(written(folder, text, side))
+
+
+def read_stamps(cells: list[str], _: Path) -> object:
+    return seconds_from_first(cells, "run.csv", "time", 2)
+
+
+def read_variables(variables: dict[str, object], folder: Path) -> object:
+    return read_log(write_variables(folder, variables))
+
+
+def read_cell(place: str, value: object, folder: Path) -> object:
+    return read_log(write_workbook(folder, {place: value}, "yyyy-mm-dd hh:mm:ss.000"))
+
+
+def call(make: Callable[[], object], _: Path) -> object:
+    return make()
+
+
 REFUSALS = [
+    *(Refusal(partial(read_written, t, ""), LogError, ("run_01.csv: ", said)) for t, said in (*LOGS, *MORE_LOGS)),
     *(
-        Refusal(lambda d, t=t: read_log(written(d, t)), LogError, ("run_01.csv: ", said))
-        for t, said in (*LOGS, *MORE_LOGS)
-    ),
-    *(
-        Refusal(lambda d, s=s: read_log(written(d, HEADER + BODY, s)), InputError, ("run_01.toml: ", said))
+        Refusal(partial(read_written, HEADER + BODY, s), InputError, ("run_01.toml: ", said))
         for s, said in MORE_SIDECARS
     ),
-    *(Refusal(lambda _, make=make: make(), InputError, (said,)) for make, said in EXPERIMENTS),
+    *(Refusal(partial(call, make), InputError, (said,)) for make, said in EXPERIMENTS),
     Refusal(lambda d: read_log(d / "none.csv"), LogError, ("none.csv: cannot be read (No such file",)),
     Refusal(read_log, LogError, ("cannot be read",)),
     Refusal(lambda _: read_log("/dev/zero"), LogError, ("/dev/zero: is a pipe or a device; give the name of a file",)),
@@ -233,25 +250,19 @@ REFUSALS = [
     ),
     *(
         Refusal(
-            lambda d, h=h: read_log(written(d, f"{h}\n{BODY}")),
+            partial(read_written, f"{h}\n{BODY}", ""),
             UnitError,
             (f"column {h.split(',')[1]!r}", said, "list the columns to use in a sidecar"),
         )
         for h, said in UNITS
     ),
     *(
-        Refusal(lambda d, a=a, b=b: read_log(written(d, RENAMED, sidecar(a, b))), InputError, ("run_01.toml: ", said))
+        Refusal(partial(read_written, RENAMED, sidecar(a, b)), InputError, ("run_01.toml: ", said))
         for a, b, said in SIDECARS
     ),
-    *(Refusal(lambda _, c=c: seconds_from_first(c, "run.csv", "time", 2), LogError, (said,)) for c, said in STAMPS),
-    *(
-        Refusal(lambda d, v=v: read_log(write_variables(d, v)), LogError, (f"run.mat: {said}",))
-        for v, said in VARIABLES
-    ),
-    *(
-        Refusal(lambda d, p=p, v=v: read_log(write_workbook(d, {p: v}, DATES)), LogError, ("run.xlsx: ", said))
-        for p, v, said in CELLS
-    ),
+    *(Refusal(partial(read_stamps, c), LogError, (said,)) for c, said in STAMPS),
+    *(Refusal(partial(read_variables, v), LogError, (f"run.mat: {said}",)) for v, said in VARIABLES),
+    *(Refusal(partial(read_cell, p, v), LogError, ("run.xlsx: ", said)) for p, v, said in CELLS),
 ]
 
 
