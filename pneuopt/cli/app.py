@@ -105,9 +105,9 @@ COMMAND_HELP = {
 
 def epilog(name: str) -> str:
     r"""The lines below a command's help; \b keeps click from filling them into one paragraph."""
-    said = COMMAND_HELP[name]
-    lines = ["\b", "Examples:" if said.examples[1:] else "Example:", *(f"  {line}" for line in said.examples)]
-    return "\n".join([*lines, *([said.pointer] if said.pointer else [])])
+    text = COMMAND_HELP[name]
+    lines = ["\b", "Examples:" if text.examples[1:] else "Example:", *(f"  {line}" for line in text.examples)]
+    return "\n".join([*lines, *([text.pointer] if text.pointer else [])])
 
 
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write all figures as JSON.")]

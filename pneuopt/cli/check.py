@@ -22,7 +22,7 @@ from pneuopt.plotting import plot_finding, plot_logs
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
-from pneuopt.report.fit_page import Source
+from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Page, Picture
 from pneuopt.report.tuning_page import summary_page, title_of
 
@@ -82,8 +82,12 @@ def _fix(places: Mapping[Path, Path], system: System, parameters: ParameterSet, 
     for problem in errors:
         show_sentence(make_console(error=True), f"error: not mended: {problem}")
     changes = ((p.name, change) for p, log in mended.items() for change in log.changes or ("nothing to mend",))
-    said = [Line(""), Line("mended", Tone.HEADING), *(Line(f"{name}: {change}", indent=2) for name, change in changes)]
-    show_report(make_console(), Report(tuple(said)))
+    lines = [
+        Line(""),
+        Line("mended", Tone.HEADING),
+        *(Line(f"{name}: {change}", indent=2) for name, change in changes),
+    ]
+    show_report(make_console(), Report(tuple(lines)))
     show_output_files(make_console(), list(files))
     if not mended:
         return ExitStatus.BAD_INPUT
@@ -110,8 +114,8 @@ def _read_all(
             found.append(log)
         except InputError as error:
             unread = ", ".join(log.source.unread) if log.source else ""  # the missing channel may be one of them
-            told = f"; columns that are not read: {unread}; a sidecar's [columns] says which channel a column is"
-            errors.append(f"{error}{told if unread else ''}")
+            message = f"; columns that are not read: {unread}; a sidecar's [columns] says which channel a column is"
+            errors.append(f"{error}{message if unread else ''}")
     return found, errors
 
 
@@ -121,8 +125,8 @@ def _page(drive: Path, logs: Sequence[Path], found: Checkup, errors: Sequence[st
     pictures = [Picture(partial(plot_finding, f), f"What shows it: {f.message}", f.message) for f in shown]
     alt = "Every channel that was read, over time."
     pictures += [Picture(partial(plot_logs, found.logs), alt, "The logs as they were read.")]
-    source = Source(title_of("Check", drive, logs), file_hashes(drive), tuple(f"not read: {text}" for text in errors))
-    return summary_page(source, found.summary(), pictures, found.logs)
+    head = PageHead(title_of("Check", drive, logs), file_hashes(drive), tuple(f"not read: {text}" for text in errors))
+    return summary_page(head, found.summary(), pictures, found.logs)
 
 
 def _figures(found: Checkup) -> dict[str, "Figure"]:

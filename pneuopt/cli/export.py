@@ -47,8 +47,8 @@ def run_export(
     files: Mapping[str, str | bytes]
     if to == FMU:
         place = folder / f"{name}.fmu"
-        told = "is there already, and stays as it is; --force replaces it, -o names another folder"
-        require(force or not place.exists(), f"{place}: {told}")  # not even by the same one
+        message = "is there already, and stays as it is; --force replaces it, -o names another folder"
+        require(force or not place.exists(), f"{place}: {message}")  # not even by the same one
         files = {place.name: export_fmu(task.loop.plant, parameters, name=name)}
     elif to in languages:
         files = export_controller(*given, languages[to], name=name, centre=task.centre, origin=origin)
@@ -70,8 +70,8 @@ def _check_form(to: str, forms: Sequence[str]) -> None:
     word = to.casefold()
     lead = f"export --to: unknown form {to!r}"
     blocks = ", ".join(kind.value for kind in Block)
-    told = f"a PLC runs the controller as structured text, --to st; settings for its own PID block: {blocks}"
-    require(to in forms or word not in PLC_WORDS, f"{lead}; {told}")
+    message = f"a PLC runs the controller as structured text, --to st; settings for its own PID block: {blocks}"
+    require(to in forms or word not in PLC_WORDS, f"{lead}; {message}")
     meant = word if word in forms else MAKERS.get(word, to)
     require(to in forms or meant == to, f"{lead}; it is called {meant!r} here")
     check_names("form", [to], forms, "export --to")
@@ -82,8 +82,8 @@ def _certificate_lines(fit: StoredFit, tuned: Path, uncertified: bool) -> list[s
     found = check_certificate(fit, tuned) or NO_CERTIFICATE
     if found.holds:
         return [f"Certified: {line}" for line in _metric_lines(read_toml(tuned).unwrap().get("certified", {}))]
-    told = "pneuopt certify gives gains a certificate, or says what breaks; --uncertified exports them all the same"
-    require(uncertified, f"{tuned}: NOT CERTIFIED: {'; '.join(found.reasons)}. {told}")
+    message = "pneuopt certify gives gains a certificate, or says what breaks; --uncertified exports them all the same"
+    require(uncertified, f"{tuned}: NOT CERTIFIED: {'; '.join(found.reasons)}. {message}")
     for reason in found.reasons:
         warn(f"{tuned}: {reason}; what is written says NOT CERTIFIED")
     return list(found.lines)

@@ -47,7 +47,7 @@ from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.report.fit_page import Source, fit_page, prediction_page, refusal_page
+from pneuopt.report.fit_page import PageHead, fit_page, prediction_page, refusal_page
 from pneuopt.report.tuning_page import summary_page, title_of
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.studies.bootstrap import bootstrap
@@ -83,8 +83,8 @@ def run_identify(
     for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
     warnings.filterwarnings("ignore", message="before the search")  # the check has said it
-    source = _page_source(drive, logs, found.warnings)
-    with _report_refusal(outputs, source, experiments), progress("identifying", quiet=quiet) as report_progress:
+    head = _page_head(drive, logs, found.warnings)
+    with _report_refusal(outputs, head, experiments), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
         result = identify(
             system, experiments, parameters, method=method, window=window, cpu_seconds=budget, throw=False
@@ -107,9 +107,7 @@ def run_identify(
         result.status,
         figures=partial(_fit_figures, system, result, experiments, found.findings),
         report=report,
-        page=lambda: fit_page(
-            source, result, experiments, system, held_out=others, findings=found.findings, trial=trial
-        ),
+        page=lambda: fit_page(head, result, experiments, system, held_out=others, findings=found.findings, trial=trial),
         hints=_hints(outputs),
     )
 
@@ -117,8 +115,8 @@ def run_identify(
 def _hints(outputs: Outputs) -> list[str]:
     """What to do with a fit: tune its drive, and show it."""
     kept = "with -o fit.toml: keeps the fit, for pneuopt tune"
-    told = [kept if outputs.output is None else f"pneuopt tune {outputs.output} tuning.toml -o tuned.toml"]
-    return told if outputs.report is not None else [*told, "with --report FILE.html: a page to hand on"]
+    hints = [kept if outputs.output is None else f"pneuopt tune {outputs.output} tuning.toml -o tuned.toml"]
+    return hints if outputs.report is not None else [*hints, "with --report FILE.html: a page to hand on"]
 
 
 def _fit_tables(result: IdentificationResult) -> dict[str, Any]:
@@ -133,11 +131,11 @@ def _fit_tables(result: IdentificationResult) -> dict[str, Any]:
     }
 
 
-def _page_source(drive: Path, logs: Sequence[Path], warned: Sequence[str]) -> Source:
+def _page_head(drive: Path, logs: Sequence[Path], warned: Sequence[str]) -> PageHead:
     """The title of a fit's page, the drive's hash, and what was said before the fit."""
     names = ", ".join(log.name for log in logs[:3]) + (f" and {len(logs) - 3} more" if len(logs) > 3 else "")
     title = f"Identification of {drive.name} from {names}"
-    return Source(title, file_hashes(drive), tuple(f"before the fit: {sentence}" for sentence in warned))
+    return PageHead(title, file_hashes(drive), tuple(f"before the fit: {sentence}" for sentence in warned))
 
 
 def run_select(
@@ -168,8 +166,8 @@ def run_select(
         )
     tables = {"recommended": chosen.recommended, "reason": chosen.reason, "candidates": records(chosen.table)}
     status = chosen.fits[chosen.recommended].status
-    source = Source(title_of("Choice of a friction model", drive, logs), file_hashes(drive))
-    page = partial(summary_page, source, chosen.summary(), (), experiments)
+    head = PageHead(title_of("Choice of a friction model", drive, logs), file_hashes(drive))
+    page = partial(summary_page, head, chosen.summary(), (), experiments)
     return finish(outputs, {}, tables, status, report=chosen.summary(), page=page)
 
 
@@ -193,8 +191,8 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
         writers[outputs.output] = partial(write_csv, run=runs[0].with_columns(given), columns=columns)
     hashes = file_hashes(fit) | {f"sha256[{log.name}]": experiment.sha256}
     tables = {"fit": records(table), "provenance": hashes}
-    source = Source(f"Prediction of {log.name} by {fit.name}", file_hashes(fit), describe_status(stored))
-    page = partial(prediction_page, source, table, runs, [experiment])
+    head = PageHead(f"Prediction of {log.name} by {fit.name}", file_hashes(fit), describe_status(stored))
+    page = partial(prediction_page, head, table, runs, [experiment])
     return finish(
         outputs,
         writers,
@@ -207,12 +205,12 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
 
 
 @contextmanager
-def _report_refusal(outputs: Outputs, source: Source, experiments: Sequence[Experiment]) -> Iterator[None]:
+def _report_refusal(outputs: Outputs, head: PageHead, experiments: Sequence[Experiment]) -> Iterator[None]:
     """Draw what a log is refused for, where figures are wanted; otherwise the message says how to have it drawn."""
     try:
         yield
     except LogError as error:
-        page = partial(refusal_page, source, str(error), experiments, error.finding)
+        page = partial(refusal_page, head, str(error), experiments, error.finding)
         finish(Outputs(None, None, None, outputs.report), {}, {}, None, page=page)
         if error.finding is None or error.finding.evidence is None:
             raise

@@ -151,13 +151,13 @@ def describe_status(file: StoredFit | Path) -> tuple[str, ...]:
     if isinstance(file, Path):
         status = read_status(file)
         return () if status is None or status.code is Code.CONVERGED else (f"{file}: its tuning is {status}",)
-    status, said = file.status, list[str]()
+    status, sentences = file.status, list[str]()
     if status is not None and status.code is not Code.CONVERGED:
-        said.append(f"{file.path}: its fit is {status}")
+        sentences.append(f"{file.path}: its fit is {status}")
     biased = [n for n, mark in file.marks.items() if mark is Mark.BIAS_POSSIBLE]
     if biased and (status is None or status.converged):
-        said.append(f"{file.path}: estimates that may be biased by a model error: {', '.join(biased)}")
-    return tuple(said)
+        sentences.append(f"{file.path}: estimates that may be biased by a model error: {', '.join(biased)}")
+    return tuple(sentences)
 
 
 def warn(message: str) -> None:

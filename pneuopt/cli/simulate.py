@@ -22,7 +22,7 @@ from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.report.fit_page import Source
+from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Page, simulate_responses
 from pneuopt.report.tuning_page import LoopView, simulation_page
 
@@ -92,7 +92,7 @@ def _simulation_page(
         band=task.specification.band,
         envelope=task.specification.envelope,
     )
-    source = Source(
+    head = PageHead(
         f"Simulation of {fit.path.name} with {tuning.name}", file_hashes(fit.path, tuning), describe_status(fit)
     )
-    return simulation_page(source, found, view, metric_limits(task.specification.limits), standing=standing)
+    return simulation_page(head, found, view, metric_limits(task.specification.limits), standing=standing)

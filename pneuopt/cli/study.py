@@ -64,7 +64,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Column, Line, Report, Table, Tone, format_number
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
-from pneuopt.report.fit_page import Source
+from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Page
 from pneuopt.report.tuning_page import study_page
 from pneuopt.studies.batch import LANE_METRICS, evaluate_batch
@@ -154,9 +154,9 @@ class _Job:
 
         def make_page() -> Page:
             warnings = (*describe_status(self.fit), *describe_status(study.tuning))
-            source = Source(f"Study of {study.drive.name} with {study.tuning.name}", hashes, warnings)
+            head = PageHead(f"Study of {study.drive.name} with {study.tuning.name}", hashes, warnings)
             design = (self.task.loop, self.parameters) if has_design else None
-            return study_page(source, report, draw if is_drawn else None, what=page[0], alt=page[1], design=design)
+            return study_page(head, report, draw if is_drawn else None, what=page[0], alt=page[1], design=design)
 
         finish(
             self.outputs,
@@ -364,8 +364,10 @@ def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
 def _batch_verdict(checks: "pd.DataFrame", verdict: str, status: int) -> tuple[str, int]:
     """The verdict on a grid with how many of its cases are certified; where lanes are refuted, that is a failure."""
     differ, certified = checks["case"][~checks["agrees"]].nunique(), checks["case"].nunique()
-    said = f"{differ} of {certified} certified differ from the lanes" if differ else f"{certified} certified, all agree"
-    return f"{verdict}; {said}", max(status, ExitStatus.FAILURE) if differ else status
+    lanes = (
+        f"{differ} of {certified} certified differ from the lanes" if differ else f"{certified} certified, all agree"
+    )
+    return f"{verdict}; {lanes}", max(status, ExitStatus.FAILURE) if differ else status
 
 
 def _worst_of_references(

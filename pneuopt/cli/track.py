@@ -39,7 +39,7 @@ from pneuopt.quantities.output import format_table, records, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.quantities.units import read_value
-from pneuopt.report.fit_page import Source
+from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Picture
 from pneuopt.report.tuning_page import summary_page, title_of, tracking_picture
 from pneuopt.shooting.least_squares import LeastSquares
@@ -89,8 +89,8 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     if outlook is not None:
         tables["design"] = records(outlook.table)
         shown += outlook.summary()
-    source = Source(title_of("Tracking", drive, logs), file_hashes(*inputs[:1], *inputs[1 + len(logs) :]))
-    page = partial(summary_page, source, shown, [tracking_picture(found)], experiments)
+    head = PageHead(title_of("Tracking", drive, logs), file_hashes(*inputs[:1], *inputs[1 + len(logs) :]))
+    page = partial(summary_page, head, shown, [tracking_picture(found)], experiments)
     finish(outputs, writers, tables, None, figures=lambda: {"": plot_tracking(found)}, report=shown, page=page)
     return ExitStatus.FAILURE if found.drifting or (outlook is not None and outlook.fails is not None) else 0
 
@@ -158,8 +158,8 @@ def run_next_experiment(
             progress=report_progress,
         )
     tables = {"design": records(design.table), "provenance": file_hashes(*files), "stats": dict(design.stats)}
-    draw, source = partial(plot_experiment, design), Source(title_of("Next experiment", fit, ()), file_hashes(*files))
-    page = partial(summary_page, source, design.summary(), (Picture(draw, _ALT, _ALT),))
+    draw, head = partial(plot_experiment, design), PageHead(title_of("Next experiment", fit, ()), file_hashes(*files))
+    page = partial(summary_page, head, design.summary(), (Picture(draw, _ALT, _ALT),))
     writers = _writers(design, outputs.output)
     return finish(outputs, writers, tables, None, figures=lambda: {"": draw()}, report=design.summary(), page=page)
 

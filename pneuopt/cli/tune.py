@@ -38,7 +38,7 @@ from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.status import Code
-from pneuopt.report.fit_page import Source
+from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Page, report_exports
 from pneuopt.report.tuning_page import LoopView, tuning_page
 from pneuopt.tuning.result import report_tuning
@@ -69,8 +69,8 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     with suppress(KeyboardInterrupt):
         compared, dither = _compare_dither(console, task, parameters, result, quiet)
     title = f"Tuning of {fit.name} by {tuning.name}"
-    told = {"stands": f"the gains of {tuning}", "was": was, "dither": dither}
-    return job.finish(result, saved, partial(_make_page, job, result, title, told), compared)
+    details = {"stands": f"the gains of {tuning}", "was": was, "dither": dither}
+    return job.finish(result, saved, partial(_make_page, job, result, title, details), compared)
 
 
 def run_certify(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet: bool) -> int:
@@ -191,12 +191,12 @@ def _read_job(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs) -> _J
 
 def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, Any]) -> Page:
     """The page of a design, or of what was refused."""
-    source = Source(title, file_hashes(*job.inputs), warnings=describe_status(job.stored))
+    head = PageHead(title, file_hashes(*job.inputs), warnings=describe_status(job.stored))
     place = job.outputs.output if result.status.converged else None
     task = job.task
     design = (task.loop.controller, result.parameters, task.references, task.centre)
     exports = Report() if place is None else report_exports(*design, job.fit, place)
-    return tuning_page(source, result, job.view(result), exports=exports, **told)
+    return tuning_page(head, result, job.view(result), exports=exports, **told)
 
 
 def _compare_dither(
@@ -282,9 +282,9 @@ def _tables(result: TuningResult) -> dict[str, Any]:
     gains = result.parameters.select(result.parameters.free_names).to_frame()
     tables = {"gains": gains, "claimed": result.claimed.T, "certified": result.certified.T}
     tables |= {"requirements": result.requirements, "relaxations": result.relaxations}
-    told: dict[str, Any] = {name: records(table) for name, table in tables.items()} | {"active": result.active}
-    told |= {"best": dict(result.best)} if result.best else {}
+    document: dict[str, Any] = {name: records(table) for name, table in tables.items()} | {"active": result.active}
+    document |= {"best": dict(result.best)} if result.best else {}
     if result.status.converged:
-        told |= {} if result.certificate is None else {"notes": list(result.certificate.notes)}
-        told |= {} if result.validation is None else {"validation": records(result.validation.figures)}
-    return told
+        document |= {} if result.certificate is None else {"notes": list(result.certificate.notes)}
+        document |= {} if result.validation is None else {"validation": records(result.validation.figures)}
+    return document

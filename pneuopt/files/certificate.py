@@ -76,8 +76,8 @@ def check_certificate(fit: StoredFit, tuned: str | Path) -> CertificateCheck | N
         return CertificateCheck(False, ("its gains were not written by pneuopt tune",))
     ended = () if status.code is Code.CONVERGED else (f"its tuning ended so: {status.code.value}",)
     if not isinstance(stored, dict):
-        told = "it was written by an older version, or by hand, and has no checksum"
-        return CertificateCheck(False, ended or (f"{told}; run pneuopt certify",))
+        message = "it was written by an older version, or by hand, and has no checksum"
+        return CertificateCheck(False, ended or (f"{message}; run pneuopt certify",))
     parts = _describe(table, tuned, fit)
     if _digest(parts) == stored.get("hash"):
         return CertificateCheck(not ended, ended)
@@ -269,9 +269,9 @@ class _Writer:
         for table in (self.tuned, self.fit):
             entries = table.get(section)
             entry = entries.get(key) if isinstance(entries, dict) else None
-            said = entry.get(field) if isinstance(entry, dict) else entry
-            if isinstance(said, str):
-                return read_unit(said, unit or "1")
+            stated = entry.get(field) if isinstance(entry, dict) else entry
+            if isinstance(stated, str):
+                return read_unit(stated, unit or "1")
         return ""
 
 

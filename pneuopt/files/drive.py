@@ -308,13 +308,13 @@ def read_status(path: str | Path) -> Status | None:
 
 def stored_status(toml: Mapping[str, Any], path: str | Path) -> Status | None:
     """The status in a parsed file; see `read_status`."""
-    said = toml.get("status")
-    if said is None:
+    stated = toml.get("status")
+    if stated is None:
         return None
     codes = [code.value for code in Code]
-    require(isinstance(said, dict), f"{path}: status must be a section, [status]")
-    check_names("status", [str(said.get("code"))], codes, f"{path}: [status] code")
-    return Status(Code(said["code"]), tuple(filter(None, [str(said.get("message", ""))])))
+    require(isinstance(stated, dict), f"{path}: status must be a section, [status]")
+    check_names("status", [str(stated.get("code"))], codes, f"{path}: [status] code")
+    return Status(Code(stated["code"]), tuple(filter(None, [str(stated.get("message", ""))])))
 
 
 def write_fit(path: str | Path, source: str | Path, result: IdentificationResult) -> None:
@@ -365,12 +365,12 @@ def _write_absolute(document: tomlkit.TOMLDocument, given: ParameterSet) -> None
     for name, p in given.items():
         section, _, key = name.partition(".")
         entries: Any = document.get(section, {})
-        said = entries.get(key)
-        if isinstance(said, dict):
+        stated = entries.get(key)
+        if isinstance(stated, dict):
             for part in ("value", "lower", "upper"):
-                if "(g)" in str(said.get(part)):
-                    said[part] = write_value(getattr(p, part), p.unit, FILE_DIGITS)
-        elif "(g)" in str(said):
+                if "(g)" in str(stated.get(part)):
+                    stated[part] = write_value(getattr(p, part), p.unit, FILE_DIGITS)
+        elif "(g)" in str(stated):
             entries[key] = write_value(p.value, p.unit, FILE_DIGITS)
 
 
@@ -389,7 +389,7 @@ def _agreement_rows(fit: "pd.DataFrame") -> dict[str, Any]:
 def _read_parameters(system: System, kind: DriveKind, sections: Sections, places: FileLocations) -> ParameterSet:
     defaults = system.parameters
     _check_keys(defaults, kind, sections, places)
-    entries = {f"{s}.{k}": v for s, said in sections.items() for k, v in said.items() if f"{s}.{k}" in defaults}
+    entries = {f"{s}.{k}": v for s, stated in sections.items() for k, v in stated.items() if f"{s}.{k}" in defaults}
 
     def read(name: str) -> Parameter:
         return read_parameter(entries[name], defaults[name], _parameter_place(name, places))
@@ -419,15 +419,15 @@ def _check_keys(defaults: ParameterSet, kind: DriveKind, sections: Sections, pla
 
 def _check_hardware(system: System, entries: Mapping[str, Any], places: FileLocations) -> None:
     """Refuse impossible values first, for the model's bounds do not say what would be possible."""
-    said = {n: entry.get("value") if isinstance(entry, dict) else entry for n, entry in entries.items()}
-    units = {n: system.parameters[n].unit for n in said}
-    given = {n: read_value(v, units[n], where=_parameter_place(n, places)) for n, v in said.items() if v is not None}
+    stated = {n: entry.get("value") if isinstance(entry, dict) else entry for n, entry in entries.items()}
+    units = {n: system.parameters[n].unit for n in stated}
+    given = {n: read_value(v, units[n], where=_parameter_place(n, places)) for n, v in stated.items() if v is not None}
     try:
         system.check(system.parameters | ParameterSet({n: Parameter(v, units[n]) for n, v in given.items()}))
     except HardwareError as error:
         if error.parameter not in given:
             raise InputError(f"{places}: {error} (the model's own value; the file has none)") from None
-        written = f"{_parameter_place(error.parameter, places)} = {tomlkit.item(said[error.parameter]).as_string()}"
+        written = f"{_parameter_place(error.parameter, places)} = {tomlkit.item(stated[error.parameter]).as_string()}"
         raise InputError(f"{written} is impossible; {error.remedy}") from None
 
 
@@ -435,8 +435,8 @@ def _read_alias(
     alias: Alias, sections: Sections, entries: Mapping[str, Any], defaults: ParameterSet, places: FileLocations
 ) -> dict[str, Any]:
     """The entry of the parameter that an alias says; nothing where the file does not hold the alias."""
-    said = sections.get(alias.section, {}).get(alias.key)
-    if said is None:
+    stated = sections.get(alias.section, {}).get(alias.key)
+    if stated is None:
         return {}
     where, own = _parameter_place(f"{alias.section}.{alias.key}", places), alias.parameter.partition(".")[2]
     require(alias.parameter not in entries, f"{where} and {own} say the same; leave one of them out")
@@ -451,7 +451,7 @@ def _read_alias(
     def convert(entry: Any) -> str:
         return f"{alias.convert(entry, values, where)!r} {defaults[alias.parameter].unit}"
 
-    fields = said if isinstance(said, dict) else {"value": said}
+    fields = stated if isinstance(stated, dict) else {"value": stated}
     return {alias.parameter: {f: convert(v) if f in ("value", "lower", "upper") else v for f, v in fields.items()}}
 
 

@@ -221,10 +221,10 @@ def read_sample_spreads(
             found[pattern] = _read_spread(given, pattern, where, parameters)
             continue
         spot = f"{where} {pattern}"
-        said = read_table(SPREAD_KEYS, given, spot)
+        stated = read_table(SPREAD_KEYS, given, spot)
         word = given.get("distribution", SPREAD_KEYS["distribution"].usual)
-        spread = _read_spread(said["spread"], pattern, where, parameters, word)
-        found[pattern] = construct_at(partial(said["distribution"], spread), spot)
+        spread = _read_spread(stated["spread"], pattern, where, parameters, word)
+        found[pattern] = construct_at(partial(stated["distribution"], spread), spot)
     return found
 
 
@@ -587,8 +587,8 @@ def read_loop_sections(
     """The loop and its parameters; limits in the file are those of the wire, the loop's are about `centre`."""
     wiring = {n: s for n, s in read_table(LOOP_KEYS["loop"], table.get("loop", {}), f"{path}: [loop]").items() if s}
     for section, first in FIRST_PARAMETERS.items():
-        told = f"{path}: [{section}] has no {first}, without which it does nothing; write {first}"
-        require(section not in table or first in table[section], told)
+        message = f"{path}: [{section}] has no {first}, without which it does nothing; write {first}"
+        require(section not in table or first in table[section], message)
     pid = _pid(table["pid"], f"{path}: [pid]")
     dither = _dither(table["dither"], f"{path}: [dither]") if "dither" in table else None
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
@@ -654,8 +654,8 @@ def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
 
 def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedule:
     """A schedule of the gains whose coefficients are stated."""
-    told = f'{where} has no high, the other end of the stroke; write low = "0 mm" and high = "200 mm", say'
-    require("high" in table, told)
+    message = f'{where} has no high, the other end of the stroke; write low = "0 mm" and high = "200 mm", say'
+    require("high" in table, message)
     axis, units = plant.axis or Axis(), {q.name: q.unit for q in plant.outputs}
     unit = units.get(axis.position, "m")
     low, high = (read_parameter(table[key], Parameter(0.0, unit), f"{where} {key}").value for key in ("low", "high"))
@@ -664,8 +664,8 @@ def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedu
         inertia = plant.parameters.get(axis.inertia)
         load = read_parameter(table["load"], Parameter(1.0, inertia.unit if inertia else "1"), f"{where} load").value
     gains = GainSchedule.stated_gains(table)
-    told = "schedules no gain; write a coefficient such as Kp_slope = { value = 0, lower = -1, upper = 1, free = true }"
-    require(bool(gains), f"{where} {told}")
+    example = "Kp_slope = { value = 0, lower = -1, upper = 1, free = true }"
+    require(bool(gains), f"{where} schedules no gain; write a coefficient such as {example}")
     return construct_at(lambda: GainSchedule(gains, low, high, load, axis.position), where)
 
 
@@ -692,8 +692,8 @@ def _fault_values(read: dict[str, Parameter], loop: ClosedLoop, centre: float, w
     """The parameters with the safe output about the valve's centre, from that on the wire; none of a fault is free."""
     for key in loop.pid.fixed_parameters:
         given = read.get(f"pid.{key}")
-        told = f"{where} {key} says what the machine does in a fault, which no search decides; take free = true out"
-        require(given is None or not given.free, told)
+        message = f"{where} {key} says what the machine does in a fault, which no search decides; take free = true out"
+        require(given is None or not given.free, message)
     count = read.get("pid.fault_samples")
     whole = count is None or (count.value >= 1 and count.value == round(count.value))
     require(whole, f"{where} fault_samples is a whole number of samples, 1 at least; the default is {FAULT_SAMPLES:g}")

@@ -171,8 +171,8 @@ def _member_of(kind: type, name: str, meaning: str, is_optional: bool) -> Member
     if not is_word and annotation not in _HOLDS:
         raise TypeError(f"{kind.__name__}.{name}: no output holds {annotation}")
     words = f"one of {', '.join(str(word.value) for word in annotation)}" if is_word else ""
-    told = "; ".join(filter(None, [meaning or name.replace("_", " "), words]))
-    return Member(told, Holds.TEXT if is_word else _HOLDS[annotation], is_optional=is_optional)
+    text = "; ".join(filter(None, [meaning or name.replace("_", " "), words]))
+    return Member(text, Holds.TEXT if is_word else _HOLDS[annotation], is_optional=is_optional)
 
 
 _STATUS = Member("how it ended", Holds.RECORD, members_of(Status, ("code", "message")))

@@ -276,8 +276,8 @@ def read_study(path: str | Path) -> Study:
     require(not (tune and batch), f"{path}: [study] a batch is of one design: leave out tune or batch")
     require(not (batch and "pareto" in sections), f"{path}: [study] batch is of cases; a front is tuned: leave it out")
     require(not (tune and "pareto" in sections), f"{path}: [study] tune belongs to a grid; a front is tuned anyway")
-    told = "sensitivity" in sections
-    require(not (told and (tune or batch)), f"{path}: [sensitivity] evaluates one design: leave out tune and batch")
+    alone = not ("sensitivity" in sections and (tune or batch))
+    require(alone, f"{path}: [sensitivity] evaluates one design: leave out tune and batch")
     require(not (tune and cases), f"{path}: [study] tune needs a grid, whose cells have neighbours: write [axes]")
     require(not (tune and band), f"{path}: [metrics] band would not be the one tuned for; state it in {tuning.name}")
     return Study(
@@ -351,8 +351,8 @@ def _read_axis(name: str, entry: Any, unit: str, where: str) -> SweptAxis:
     if isinstance(entry, list):
         first, values = entry[0], [read_value(e, unit, where=where) for e in entry]
     else:
-        said = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
-        first, values = entry.get("from"), [float(v) for v in np.linspace(said["from"], said["to"], said["steps"])]
+        ends = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
+        first, values = entry.get("from"), np.linspace(ends["from"], ends["to"], ends["steps"]).tolist()
     written = read_unit(first, unit)
     factor, offset = si_conversion(written, unit, where=where)
     return SweptAxis(name, tuple(values), written, factor, offset)

@@ -62,8 +62,8 @@ class FileLocations:
         for number, line in enumerate(self.text.splitlines(), 1):
             entry, table = _KEY_LINE.match(line), _SECTION_HEAD.match(line)
             head = _key_parts(table[1]) if table else head
-            said = head + _key_parts(entry[1]) if entry and not table else head
-            if said[: len(wanted)] == wanted:
+            parts = head + _key_parts(entry[1]) if entry and not table else head
+            if parts[: len(wanted)] == wanted:
                 return f"{self.path}:{number}"
         return str(self.path) if not key else self.location(section)
 

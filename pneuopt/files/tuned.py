@@ -97,7 +97,7 @@ def _check_subject(
         values = f"{write_value(p.value, p.unit)}, the result was made with {write_value(gains[n].value, p.unit)}"
         require(same, f"{path}: {n} is {values}" if n in task.parameters else f"{fit.path}: {n} is {values}")
     labels = [case.label for case in cases(task.references, task.scenarios(known), known)]
-    told = "the result was made with other references or scenarios than its file has"
-    require(labels == [str(n) for n in result.certified.columns], f"{path}: {told}")
+    message = "the result was made with other references or scenarios than its file has"
+    require(labels == [str(n) for n in result.certified.columns], f"{path}: {message}")
     same = not result.limits or dict(result.limits) == metric_limits(task.specification.limits)
     require(same, f"{path}: the result was made with other limits than its file has")

@@ -212,8 +212,8 @@ def read_references(entries: Any, loop: ClosedLoop, path: str | Path) -> tuple[R
     require(several, f"{path}: write each reference as a section of its own, [[reference]]")
     require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
     found = tuple(_reference(e, loop, Path(path), k) for k, e in enumerate(entries, 1))
-    told = "two references step between the same values; tables tell them by that"
-    require(len({r.label for r in found}) == len(found), f"{path}: {told}")
+    message = "two references step between the same values; tables tell them by that"
+    require(len({r.label for r in found}) == len(found), f"{path}: {message}")
     return found
 
 
@@ -279,7 +279,7 @@ def _read_stated(keys: Mapping[str, Key], entry: Mapping[str, Any], loop: Closed
     values = read_table(plain, entry, where, units=units, partial=True)
     if "moves" in entry:
         own = [move if isinstance(move, dict) else {"distance": move} for move in entry["moves"]]
-        values["moves"] = [{n: all_[n] for n in said} for all_, said in zip(values["moves"], own, strict=True)]
+        values["moves"] = [{n: all_[n] for n in stated} for all_, stated in zip(values["moves"], own, strict=True)]
     return {n: values[n] for n in plain if n in entry}
 
 

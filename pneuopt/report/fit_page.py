@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Source:
+class PageHead:
     """What a page says beside its result."""
 
     title: str
@@ -43,7 +43,7 @@ class Source:
 
 
 def fit_page(
-    source: Source,
+    head: PageHead,
     result: IdentificationResult,
     experiments: Sequence[Experiment] = (),
     model: HasSystem | ClosedLoop | None = None,
@@ -72,14 +72,14 @@ def fit_page(
         _finding_section(findings),
         _known_section(result),
         data_section((*experiments, *held_out), noise=counted),
-        provenance_section(result.provenance, {**source.hashes, **log_hashes(held_out)}),
+        provenance_section(result.provenance, {**head.hashes, **log_hashes(held_out)}),
     )
-    warnings = tuple(dict.fromkeys((*unknown, *doubts, *source.warnings)))
-    return Page(source.title, report_status(result.status), sections, warnings)
+    warnings = tuple(dict.fromkeys((*unknown, *doubts, *head.warnings)))
+    return Page(head.title, report_status(result.status), sections, warnings)
 
 
 def refusal_page(
-    source: Source, reason: str, experiments: Sequence[Experiment], finding: LogFinding | None = None
+    head: PageHead, reason: str, experiments: Sequence[Experiment], finding: LogFinding | None = None
 ) -> Page:
     """The page of logs that no fit takes: why, what shows it, and the logs as they were read."""
     pictures = []
@@ -93,13 +93,13 @@ def refusal_page(
     sections = (
         Section("What shows it", tuple(pictures)),
         data_section(experiments),
-        provenance_section({}, {**log_hashes(experiments), **source.hashes}),
+        provenance_section({}, {**log_hashes(experiments), **head.hashes}),
     )
-    return Page(source.title, verdict, sections, source.warnings)
+    return Page(head.title, verdict, sections, head.warnings)
 
 
 def prediction_page(
-    source: Source, table: "pd.DataFrame", runs: Sequence[Trajectory], experiments: Sequence[Experiment]
+    head: PageHead, table: "pd.DataFrame", runs: Sequence[Trajectory], experiments: Sequence[Experiment]
 ) -> Page:
     """The page of logs that are predicted in open loop."""
     verdict = Line("the prediction diverges, or there is nothing to compare it with", Tone.BAD)
@@ -111,15 +111,15 @@ def prediction_page(
         Section("Agreement with the logs", (report_agreement(table), _comparison(runs, experiments, "predicted"))),
         Section("Residuals", (_residual_picture(runs, experiments),)),
         data_section(experiments),
-        provenance_section({}, {**log_hashes(experiments), **source.hashes}),
+        provenance_section({}, {**log_hashes(experiments), **head.hashes}),
     )
-    return Page(source.title, Report((verdict,)), sections, source.warnings)
+    return Page(head.title, Report((verdict,)), sections, head.warnings)
 
 
 def _estimate_section(result: IdentificationResult) -> Section:
     notes = result.estimates["note"].to_dict()
-    said = tuple(Line(f"{n}: {note}") for n, note in notes.items() if isinstance(note, str) and note)
-    parts: list[Report | Picture] = [report_estimates(result.estimates, result.widths), Report(said)]
+    lines = tuple(Line(f"{n}: {note}") for n, note in notes.items() if isinstance(note, str) and note)
+    parts: list[Report | Picture] = [report_estimates(result.estimates, result.widths), Report(lines)]
     if result.window is not None:
         parts.append(Report((Line(str(result.window)),)))
     if int(result.estimates["stderr"].notna().sum()) > 1:

@@ -147,7 +147,8 @@ def live_script(
     """The script of a loop, which fills the page's element "live"; empty where the loop cannot move in a page.
 
     Where a parameter moves the rest, or steady motion, at which a response begins (a load's force, a supply's
-    pressure), the script finds it anew; it has no slider where the script could not.
+    pressure), the script finds it anew; it has no slider where the script could not. A limit is watched only where the
+    script's metrics agree with `certified`, a column a reference.
     """
     loop = add_disturbances(loop, references)
     steps = {k: r for k, r in enumerate(references) if isinstance(r, Step)}

@@ -174,8 +174,8 @@ def provenance_section(provenance: Mapping[str, str], hashes: Mapping[str, str])
     options = others.pop("options", "")
     lines = [Line(", ".join(f"{n} {value}" for n, value in others.items()))] if others else []
     tables = [Table(text_columns("read", "SHA-256"), files)] if files else []
-    said = [Line("options", Tone.HEADING), *(Line(text) for text in options.split("; "))] if options else []
-    return Section("Provenance", (Report((*tables, *lines, *said)),))
+    heading = [Line("options", Tone.HEADING), *(Line(text) for text in options.split("; "))] if options else []
+    return Section("Provenance", (Report((*tables, *lines, *heading)),))
 
 
 def _channel_row(log: Experiment, channel: str, counted: Mapping[tuple[str, str], float]) -> tuple[str, ...]:
@@ -241,8 +241,8 @@ def report_exports(
     taken = {form: what for form, what in EXPORTS.items() if form not in {block.value for block in refused}}
     rows = tuple((what, f"pneuopt export {fit} {tuned} --to {form}") for form, what in taken.items())
     makers = ", ".join(MAKER_BLOCKS[block].maker for block in refused)
-    told = f"The PID block of these makers cannot hold this design: {makers}. The structured text holds it whole."
-    return Report((Table(text_columns("what it takes", "command"), rows), *([Line(told)] if refused else [])))
+    message = f"The PID block of these makers cannot hold this design: {makers}. The structured text holds it whole."
+    return Report((Table(text_columns("what it takes", "command"), rows), *([Line(message)] if refused else [])))
 
 
 def report_settings(controller: Controller, parameters: ParameterSet) -> Report:

@@ -23,7 +23,7 @@ from pneuopt.quantities.parameters import ParameterSet, as_tuple
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.results import Shown
 from pneuopt.quantities.status import report_status
-from pneuopt.report.fit_page import Source, fit_page
+from pneuopt.report.fit_page import PageHead, fit_page
 from pneuopt.report.live import live_script
 from pneuopt.report.page import (
     Page,
@@ -118,20 +118,20 @@ def write_report(
         as_tuple(n, given, Experiment, LOGS) for n, given in (("experiments", experiments), ("held_out", held_out))
     )
     require(not others or model is not None, "held-out logs are predicted with the model: give both")
-    source = Source(title or _TITLES.get(type(result), type(result).__name__))
+    head = PageHead(title or _TITLES.get(type(result), type(result).__name__))
     if isinstance(result, IdentificationResult):
-        page = fit_page(source, result, logs, model, held_out=others)
+        page = fit_page(head, result, logs, model, held_out=others)
     elif isinstance(result, TuningResult):
-        page = tuning_page(source, result, _view(model, steps, result.parameters, parameters, band))
+        page = tuning_page(head, result, _view(model, steps, result.parameters, parameters, band))
     elif isinstance(result, Certificate):
         require(model is None or parameters is not None, "a certificate holds no gains: give parameters with the loop")
-        page = simulation_page(source, result, _view(model, steps, parameters, None, band))
+        page = simulation_page(head, result, _view(model, steps, parameters, None, band))
     else:
         pictures = (tracking_picture(result),) if isinstance(result, Tracking) else ()
         if isinstance(result, Sensitivity):
             alt = "For each figure the share of its variance that each parameter brings, with its 95 % interval."
             pictures = (Picture(partial(plot_sensitivity, result), alt, "Shares of the variance."),)
-        page = summary_page(source, result.summary(), pictures, (), getattr(result, "provenance", {}))
+        page = summary_page(head, result.summary(), pictures, (), getattr(result, "provenance", {}))
     write_page(path, page)
 
 
@@ -187,7 +187,7 @@ def _view(
 
 
 def tuning_page(
-    source: Source,
+    head: PageHead,
     result: TuningResult,
     view: LoopView | None = None,
     *,
@@ -213,15 +213,15 @@ def tuning_page(
         Section("Other plants", (report_validation(tried),) if tried is not None and found else ()),
         Section("Dither", (dither,) if dither else ()),
         _loop_section(view),
-        provenance_section(result.provenance, source.hashes),
+        provenance_section(result.provenance, head.hashes),
     )
     defects = tuple(f.sentence for f in certificate.findings) if certificate is not None else ()
     script = None if view is None else partial(view.script, result.limits, result.certified if found else None)
-    return Page(source.title, verdict, sections, (*defects, *source.warnings), script)
+    return Page(head.title, verdict, sections, (*defects, *head.warnings), script)
 
 
 def simulation_page(
-    source: Source,
+    head: PageHead,
     found: Certificate,
     view: LoopView | None = None,
     limits: Mapping[str, float] | None = None,
@@ -241,10 +241,10 @@ def simulation_page(
         _form_section(view),
         _margin_section(found, bode),
         _loop_section(view),
-        provenance_section({}, source.hashes),
+        provenance_section({}, head.hashes),
     )
     script = None if view is None else partial(view.script, limits or {}, found.metrics)
-    return Page(source.title, verdict, sections, source.warnings, script)
+    return Page(head.title, verdict, sections, head.warnings, script)
 
 
 def _design_sections(
@@ -311,7 +311,7 @@ def _some(picture: Picture | None) -> tuple[Picture, ...]:
 
 
 def study_page(
-    source: Source,
+    head: PageHead,
     report: Report,
     draw: "Callable[[], Figure] | None",
     *,
@@ -324,11 +324,11 @@ def study_page(
     pictures = () if draw is None else (Picture(draw, alt, alt),)
     settings = () if design is None else (report_settings(design[0].controller, design[1].fixed("*")),)
     sections = Section(what, (*pictures, table)), Section("The design", settings)
-    return Page(source.title, verdict, (*sections, provenance_section({}, source.hashes)), source.warnings)
+    return Page(head.title, verdict, (*sections, provenance_section({}, head.hashes)), head.warnings)
 
 
 def summary_page(
-    source: Source,
+    head: PageHead,
     found: Report,
     pictures: Sequence[Picture] = (),
     experiments: Sequence[Experiment] = (),
@@ -342,9 +342,9 @@ def summary_page(
         Section("Figures", tuple(pictures)),
         Section("Result", (details,)),
         *((data_section(experiments),) if experiments else ()),
-        provenance_section(dict(provenance or {}), {**source.hashes, **log_hashes(experiments)}),
+        provenance_section(dict(provenance or {}), {**head.hashes, **log_hashes(experiments)}),
     )
-    return Page(source.title, Report((first,) if is_line else ()), sections, source.warnings)
+    return Page(head.title, Report((first,) if is_line else ()), sections, head.warnings)
 
 
 def tracking_picture(found: Tracking) -> Picture:

@@ -26,7 +26,7 @@ from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.report.fit_page import Source
+from pneuopt.report.fit_page import PageHead
 from pneuopt.report.live import RestFinder, live_script, to_script
 from pneuopt.report.page import render_page
 from pneuopt.report.tuning_page import LoopView, simulation_page
@@ -222,7 +222,7 @@ def test_what_a_rest_leaves_undetermined_has_no_slider() -> None:
 def test_a_page_runs_our_script_and_no_other() -> None:
     loop, p = axis_loop()
     found = certificate(loop, STEP, p)
-    page = simulation_page(Source(HOSTILE), found, LoopView(loop, [STEP], p))
+    page = simulation_page(PageHead(HOSTILE), found, LoopView(loop, [STEP], p))
     text = render_page(replace(page, sections=()))
     read = read_page(text)
     assert text.count("<script>") == text.count("</script>") == 1
