@@ -208,7 +208,7 @@ def _expect(condition: bool, where: str) -> None:
         raise DamagedError(where)
 
 
-FORMAT = 1
+FORMAT = 2
 """Version of the file's layout: a file of another one is refused, not misread."""
 
 
