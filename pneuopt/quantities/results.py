@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 NOT_SAVED = {"saved": False}
 """Metadata of a dataclass's field that a file leaves out, as it is no data; it comes back as its default."""
-FORMAT = 1
+FORMAT = 2
 """Version of the file's layout: a file of another one is refused, not misread."""
 _NONFINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 _PLAIN_TYPES: dict[Any, tuple[type, ...]] = {str: (str,), int: (int,), bool: (bool,), types.NoneType: (types.NoneType,)}

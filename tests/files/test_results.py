@@ -176,7 +176,7 @@ def test_a_damaged_file_is_one_error_that_names_it(data: st.DataObject, tmp_path
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
-        (lambda d: d.update(format=2), "has format 2, this pneuopt reads 1"),
+        (lambda d: d.update(format=1), "has format 1, this pneuopt reads 2"),
         (lambda d: d.update(pneuopt="TuningResul"), "did you mean 'TuningResult'"),
         (lambda d: d["result"]["status"].update(code="fine"), "was damaged or changed"),
         (lambda d: d.pop("sha256"), "not a result that pneuopt has saved"),
