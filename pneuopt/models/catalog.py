@@ -71,7 +71,7 @@ def catalogue_values(size: str, cylinder: str | None = None, valve: str | None =
     UnknownNameError
         If the catalogue has no such part.
     """
-    found = ParameterSet()
+    values = ParameterSet()
     for what, name, known, sections in (
         ("size", size, {n: n for n in SIZES}, ""),
         ("cylinder", cylinder, CYLINDERS, "cylinder."),
@@ -79,9 +79,9 @@ def catalogue_values(size: str, cylinder: str | None = None, valve: str | None =
     ):
         if name is not None:
             check_names(what, [name], known, "catalogue")
-            own = SIZES[known[name]]()[1]
-            found |= own.select(n for n, p in own.items() if n.startswith(sections) and p.source == CATALOGUE_SOURCE)
-    return found
+            part = SIZES[known[name]]()[1]
+            values |= part.select(n for n, p in part.items() if n.startswith(sections) and p.source == CATALOGUE_SOURCE)
+    return values
 
 
 def r25(lugre: bool = False) -> DriveSet:
@@ -198,7 +198,7 @@ def _lugre_values(numbers: tuple[float, ...]) -> dict[str, float]:
 
 
 def _with_source(drive: PneumaticDrive, values: Mapping[str, float], source: str) -> ParameterSet:
-    given = drive.parameters.with_values(values)
-    found = given | ParameterSet({n: replace(given[n], source=source) for n in values})
-    drive.check(found)
-    return found
+    parameters = drive.parameters.with_values(values)
+    sourced = parameters | ParameterSet({n: replace(parameters[n], source=source) for n in values})
+    drive.check(sourced)
+    return sourced

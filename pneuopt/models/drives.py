@@ -369,16 +369,16 @@ class _PushedBodyRest:
 
     def __call__(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
         """Return the rest; `ConvergenceError` where a motion changes the push that it needs, that of a spring say."""
-        held = (self.axis.position, self.axis.speed)
-        others = ", ".join(sorted(outputs.keys() - set(held)))
-        require(not others, f"this drive starts from {' and '.join(held)}, not from {others}; leave {others} out")
-        y, v = (outputs.get(n, 0.0) for n in held)
-        at = dict(zip(held, (y, v), strict=True))
-        found = self._balance.equilibrium(at, parameters)
-        if v and self._balance.linearise(found, at, parameters).B[0, 0]:
+        axis_names = (self.axis.position, self.axis.speed)
+        others = ", ".join(sorted(outputs.keys() - set(axis_names)))
+        require(not others, f"this drive starts from {' and '.join(axis_names)}, not from {others}; leave {others} out")
+        y, v = (outputs.get(n, 0.0) for n in axis_names)
+        at = dict(zip(axis_names, (y, v), strict=True))
+        balance_states = self._balance.equilibrium(at, parameters)
+        if v and self._balance.linearise(balance_states, at, parameters).B[0, 0]:
             moving = f"a motion at {self.axis.speed} {v:g} changes the {self.push.name} that {self.axis.position} needs"
-            raise ConvergenceError(f"{moving}; start at rest", found)
-        push, *inner = found.tolist()
+            raise ConvergenceError(f"{moving}; start at rest", balance_states)
+        push, *inner = balance_states.tolist()
         return Rest({**at, **dict(zip(names(self._balance.states[1:]), inner, strict=True))}, {self.push.name: push})
 
     @cached_property
@@ -393,5 +393,5 @@ class _PushedBodyRest:
             rates = dict(zip(names(self.system.states), ca.vertsplit(xdot), strict=True))
             return {self.push.name: rates[self.axis.speed], **{q.name: rates[q.name] for q in inner}}, {}
 
-        held = [q for q in self.system.states if q not in inner]
-        return define([self.push, *inner], held, [], self.system.parameters, rhs)
+        imposed = [q for q in self.system.states if q not in inner]
+        return define([self.push, *inner], imposed, [], self.system.parameters, rhs)

@@ -204,8 +204,8 @@ def _build_plant(sections: DriveSections) -> Plant:
     for key, name in zip(("input", "output"), signals, strict=True):
         unit = options[f"{key}_unit"]
         if unit is None:
-            known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
-            quantities.append(known.get(name, Quantity(name, CHANNELS[name])))
+            usual = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
+            quantities.append(usual.get(name, Quantity(name, CHANNELS[name])))
         else:  # in another unit than the channel's: that of a transducer, say
             where = sections.place("plant", f"{key}_unit")
             message = f'{where}: {unit!r} is no SI unit without a prefix, such as "V"'
@@ -436,20 +436,20 @@ class LinearStarts:
     def _build_start(
         self, fit: "_Fit", records: Sequence["_EvenLog"], logs: Mapping[str, Log], searched: Sequence[str]
     ) -> Start:
-        found = dict(zip(searched, fit.values, strict=True)) | {
+        estimates = dict(zip(searched, fit.values, strict=True)) | {
             PLANT_GAIN: fit.gain,
             COULOMB_LEVEL: max(fit.coulomb, 0.0),
         }
-        known = next(iter(logs.values())).parameters
+        parameters = next(iter(logs.values())).parameters
         values: dict[str, float] = {}
-        for n in (n for n in found if n in known and known[n].free):
-            value = float(np.clip(found[n], known[n].lower, known[n].upper))
-            values |= {f"{n}[{log}]": value for log in logs} if known[n].per_log else {n: value}
+        for n in (n for n in estimates if n in parameters and parameters[n].free):
+            value = float(np.clip(estimates[n], parameters[n].lower, parameters[n].upper))
+            values |= {f"{n}[{log}]": value for log in logs} if parameters[n].per_log else {n: value}
         states = {
             name: self._state_trajectory(fit, record, error).interpolate(log.measured.t)
             for (name, log), record, error in zip(logs.items(), records, fit.errors, strict=True)
         }
-        return Start(states, values, ", ".join(f"{n.removeprefix('plant.')} {v:.3g}" for n, v in found.items()))
+        return Start(states, values, ", ".join(f"{n.removeprefix('plant.')} {v:.3g}" for n, v in estimates.items()))
 
     def _state_trajectory(self, fit: "_Fit", record: "_EvenLog", error: Array) -> Trajectory:
         response = record.y - error
@@ -500,8 +500,8 @@ class _Fit:
 
 def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
     measured, gain = log.measured, log.parameters[PLANT_GAIN]
-    known = np.isfinite(measured[source]) & np.isfinite(measured[output])
-    t, u, y = (a[known] for a in (measured.t, measured[source], measured[output]))
+    finite = np.isfinite(measured[source]) & np.isfinite(measured[output])
+    t, u, y = (a[finite] for a in (measured.t, measured[source], measured[output]))
     few = (
         f"{name}: {len(t)} samples of {source} and {output} are too few to start from; give {MIN_START_SAMPLES} or more"
     )
@@ -526,9 +526,9 @@ def _thin_log(record: _EvenLog, most: int) -> _EvenLog:
 
 def _trial_values(name: str, records: Sequence[_EvenLog], parameters: ParameterSet) -> Array:
     """Values to try: one if the parameter is fixed, else the range that the logs can show, within the bounds."""
-    known = parameters[name]
-    if not known.free:
-        return np.array([known.value])
+    parameter = parameters[name]
+    if not parameter.free:
+        return np.array([parameter.value])
     fast, slow = 2 * min(float(r.t[1]) for r in records), max(float(r.t[-1]) for r in records)
     if name == PLANT_DAMPING:
         values = np.array(DAMPING_GRID)
@@ -537,7 +537,7 @@ def _trial_values(name: str, records: Sequence[_EvenLog], parameters: ParameterS
         values = np.append(least, np.geomspace(max(fast / 2, least), max(slow / 4, least), 12))
     else:
         values = np.geomspace(fast, slow, 24) if name.endswith("constant") else np.geomspace(1 / slow, 1 / fast, 24)
-    return np.unique(np.clip(values, known.lower, known.upper))
+    return np.unique(np.clip(values, parameter.lower, parameter.upper))
 
 
 def _least_value(name: str, records: Sequence[_EvenLog], parameters: ParameterSet) -> float:
@@ -613,9 +613,11 @@ def _solve_linear_part(
     size = np.abs(matrix).max(axis=0) + 1e-300
     weights = np.linalg.lstsq(matrix / size, target, rcond=1e-9)[0] / size
     errors = target - matrix @ weights
-    known, misfit = records[0].gain, float(np.mean(errors**2))
-    gain = float(weights[0]) if known is None else known
-    coulomb = float(weights[0 if known is not None else 1]) / gain if responses[0].friction_responses and gain else 0.0
+    fixed_gain, misfit = records[0].gain, float(np.mean(errors**2))
+    gain = float(weights[0]) if fixed_gain is None else fixed_gain
+    coulomb = (
+        float(weights[0 if fixed_gain is not None else 1]) / gain if responses[0].friction_responses and gain else 0.0
+    )
     ends = np.cumsum([len(r.t) for r in records])[:-1]
     split = tuple(np.split(errors, ends))
     return _Fit((*shaping, *dead), misfit if np.isfinite(misfit) else np.inf, gain, coulomb, split)

@@ -106,9 +106,9 @@ def coarse_delay(log: Trajectory, late: str, other: str, longest: float = MAX_SE
     grid = np.arange(log.t[0], log.t[-1], step)
     curves = []
     for name in (late, other):
-        known = np.isfinite(log[name])
-        require(bool(known.any()), f"channel {name!r} holds no sample")
-        column = np.interp(grid, log.t[known], log[name][known])
+        finite = np.isfinite(log[name])
+        require(bool(finite.any()), f"channel {name!r} holds no sample")
+        column = np.interp(grid, log.t[finite], log[name][finite])
         to_speed = name == "position" and (late, other) != ("position", "position")
         curves.append(np.gradient(column, grid) if to_speed else column)
     a, b = curves
@@ -186,8 +186,8 @@ class _Sensors:
         guessed = {name: self._guess_delays(log) for name, log in logs.items()}
         plant = {name: self._correct_log(log, guessed[name]) for name, log in logs.items()}
         delays: dict[str, float] = {}
-        for name in dict.fromkeys(n for found in guessed.values() for n in found):
-            by_log = {log: found[name] for log, found in guessed.items() if name in found}
+        for name in dict.fromkeys(n for guess in guessed.values() for n in guess):
+            by_log = {log: guess[name] for log, guess in guessed.items() if name in guess}
             if any(logs[log].parameters[name].per_log for log in by_log):
                 delays |= {f"{name}[{log}]": delay for log, delay in by_log.items()}
             else:
@@ -200,14 +200,14 @@ class _Sensors:
 
     def _guess_delays(self, log: Log) -> dict[str, float]:
         """Free delays of a log by cross-correlation of position and speed, where both are logged."""
-        found = {}
+        delays = {}
         for late, other in (("position", "speed"), ("speed", "position")):
             name = f"sensor.{late}.delay"
             free = late in self.delay and log.parameters[name].free
             if free and other not in self.delay and late in log.measured and other in log.measured:
                 p = log.parameters[name]
-                found[name] = float(np.clip(coarse_delay(log.measured, late, other), p.lower, p.upper))
-        return found
+                delays[name] = float(np.clip(coarse_delay(log.measured, late, other), p.lower, p.upper))
+        return delays
 
     def _correct_log(self, log: Log, guessed: Mapping[str, float]) -> Log:
         """Log without the sensors' delays, lags and offsets, for the plant's starts."""
@@ -218,9 +218,9 @@ class _Sensors:
                 for kind in ("delay", "lag")
             )
             column = log.measured[n]
-            known = np.isfinite(column)
-            shifted = np.interp(t + late, t[known], column[known])
-            columns[n] = np.where(known, shifted, np.nan) - self._parameter_value(log.parameters, n, "offset")
+            finite = np.isfinite(column)
+            shifted = np.interp(t + late, t[finite], column[finite])
+            columns[n] = np.where(finite, shifted, np.nan) - self._parameter_value(log.parameters, n, "offset")
         return Log(log.measured.with_columns(columns), log.parameters.select(self.plant.parameters))
 
     def _complete_states(self, start: Start, name: str, log: Log, guessed: Mapping[str, float]) -> Trajectory:

@@ -172,8 +172,8 @@ def _regress(
         [np.array([columns.get(n, np.zeros(len(y))) for n in free]).reshape(-1, len(y)).T for columns, y in parts]
     )
     y = np.concatenate([y for _, y in parts])
-    known = np.isfinite(y)
-    sliding = known & (np.abs(np.concatenate([rows.speed for rows in logs.values()])) > SLIDING_SPEED)
+    finite = np.isfinite(y)
+    sliding = finite & (np.abs(np.concatenate([rows.speed for rows in logs.values()])) > SLIDING_SPEED)
     if friction.start.bristles is not None and sliding.any():
         level = float(np.median(np.abs(y[sliding])))
         pull = {name: force for name, (_, force) in zip(logs, parts, strict=True)}
@@ -181,7 +181,7 @@ def _regress(
         travelled = np.concatenate([_distance_since_reversal(part) for part in logs.values()])
         sliding &= travelled > PRESLIDING_DEFLECTIONS * level / stiffness
     slides = np.count_nonzero(sliding) > 10 * len(free)
-    rows = sliding if slides else known
+    rows = sliding if slides else finite
     if not free:
         return {}, y[rows], y[rows]
     bases = {n: parameters[n.split("[")[0]] for n in free}
@@ -193,8 +193,8 @@ def _regress(
         (np.array([columns.get(n, 0.0) for n in free]), level)
         for columns, level in _static_levels(friction, logs, tried)
     ]
-    given = np.array([row for row, _ in stuck]).reshape(-1, len(free)), np.array([level for _, level in stuck])
-    x = _robust_least_squares(A[rows], y[rows], lower, upper, (weight * given[0], weight * given[1]))
+    level_rows = np.array([row for row, _ in stuck]).reshape(-1, len(free)), np.array([level for _, level in stuck])
+    x = _robust_least_squares(A[rows], y[rows], lower, upper, (weight * level_rows[0], weight * level_rows[1]))
     values = _raise_levels(friction.start, dict(zip(free, x.tolist(), strict=True)), parameters)
     return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}, y[rows] - A[rows] @ x, y[rows]
 
@@ -243,25 +243,25 @@ def _log_columns(
         samples = replace(samples, side=stuck, level_speed=np.zeros_like(speed))
     columns = {n: c for n, c in rows.columns.items() if n in p}
     columns |= {f"friction.{n}": c for n, c in friction.start.columns(samples).items() if f"friction.{n}" in p}
-    known = {n: p.value(n) for n in columns}
+    values_of = {n: p.value(n) for n in columns}
     for level, base in ((f"friction.{n}", f"friction.{below}") for n, below in friction.start.above.items()):
-        known[level] -= p.value(base)
+        values_of[level] -= p.value(base)
         if p[base].free and not p[level].free:
             # the level is fixed, so its excess over the other level shrinks as that one grows
-            known[level] = p.value(level)
+            values_of[level] = p.value(level)
             columns[base] = columns[base] - columns[level]
     target = rows.force - sum(
-        (known[n] * c for n, c in columns.items() if not p[n].free), start=np.zeros(len(rows.force))
+        (values_of[n] * c for n, c in columns.items() if not p[n].free), start=np.zeros(len(rows.force))
     )
     return {f"{n}[{name}]" if p[n].per_log else n: c for n, c in columns.items() if p[n].free}, target
 
 
 def _robust_least_squares(
-    A: Array, y: Array, lower: Array, upper: Array, given: tuple[Array, Array] | None = None
+    A: Array, y: Array, lower: Array, upper: Array, exact: tuple[Array, Array] | None = None
 ) -> Array:
     """Bounded least squares with Cauchy weights, except on the given rows, and a ridge (`RIDGE_WEIGHT`)."""
     k = A.shape[1]
-    given_A, given_y = (np.empty((0, k)), np.empty(0)) if given is None else given
+    given_A, given_y = (np.empty((0, k)), np.empty(0)) if exact is None else exact
     scale = np.linalg.norm(A, axis=0) + 1e-300
     weight, x = np.ones(len(A)), np.zeros(k)
     for _ in range(5):
@@ -279,8 +279,8 @@ def _regression_bounds(start: FrictionStart, bases: Mapping[str, Parameter], lev
     """Bounds of the regression: those of the parameters, and the law's floors, which keep friction positive."""
     floors = {f"friction.{n}": share * level for n, share in start.floors.items()}
     excesses, shared = _excesses(start), {n: n.split("[")[0] for n in bases}
-    given = [0.0 if shared[n] in excesses else p.lower for n, p in bases.items()]
-    lower = np.array([max(floors.get(shared[n], -np.inf), lo) for n, lo in zip(bases, given, strict=True)])
+    bounds = [0.0 if shared[n] in excesses else p.lower for n, p in bases.items()]
+    lower = np.array([max(floors.get(shared[n], -np.inf), lo) for n, lo in zip(bases, bounds, strict=True)])
     upper = np.array([max(p.upper, lo + 1e-9) for p, lo in zip(bases.values(), lower, strict=True)])
     return lower, upper
 

@@ -184,17 +184,10 @@ def _draw_controller(sheet: Sheet, loop: ClosedLoop) -> None:
     notes += ["it is clamped at a limit"] if loop.pid.limits and loop.pid.anti_windup is AntiWindup.CLAMPING else []
     sheet.write_below(sheet.draw_block(LAWS[loop.pid.form], STYLE.pid_width), "\n".join(notes))
     if loop.feedforward:
-        centre = sheet.draw_source(
-            "feedforward\n" + r"gain $\frac{time\;s}{time\;s + 1}$", STYLE.source_width, STYLE.source_height
-        )
-        sheet.draw_branch(STYLE.branch, 0.0)
-        sheet.draw_line(
-            [
-                (STYLE.branch, 0.0),
-                (STYLE.branch, STYLE.source_height),
-                (centre - STYLE.source_width / 2, STYLE.source_height),
-            ]
-        )
+        width, height, begin = STYLE.source_width, STYLE.source_height, STYLE.branch
+        centre = sheet.draw_source("feedforward\n" + r"gain $\frac{time\;s}{time\;s + 1}$", width, height)
+        sheet.draw_branch(begin, 0.0)
+        sheet.draw_line([(begin, 0.0), (begin, height), (centre - width / 2, height)])
     for part in loop.compensators:  # each adds to the command that it gets
         sheet.draw_arrow()
         centre = sheet.draw_block(fill(part.section.replace("_", " "), 14), STYLE.compensator_width)

@@ -128,16 +128,16 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
     require(bool(channels), "the runs and the logs have no channel in common")
     shown = channels[:MAX_PLOT_CHANNELS]
     figure, grid = axes_grid(len(shown), 4, [2.4] * len(shown), width=13.0)
-    for (over_time, own, crossed, spread), channel in zip(grid, shown, strict=True):
+    for (over_time, auto, crossed, spread), channel in zip(grid, shown, strict=True):
         factor, unit = plot_unit([e for _, e in pairs], channel)
-        found = _channel_residuals(pairs, channel)
-        every = max(1, sum(len(log) for log, _ in found) // MAX_PLOT_POINTS)
-        for number, (log, e) in enumerate(found):
-            colour = (BLUE, ORANGE)[number % 2] if len(found) <= 4 else BLUE
+        residuals = _channel_residuals(pairs, channel)
+        every = max(1, sum(len(log) for log, _ in residuals) // MAX_PLOT_POINTS)
+        for number, (log, e) in enumerate(residuals):
+            colour = (BLUE, ORANGE)[number % 2] if len(residuals) <= 4 else BLUE
             over_time.plot(log.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
         over_time.axhline(0, color=GREY, lw=0.8)
         over_time.set_ylabel(f"{channel} [{unit}]")
-        _draw_autocorrelation(own, pairs, channel)
+        _draw_autocorrelation(auto, pairs, channel)
         _draw_crosscorrelation(crossed, pairs, channel)
         _draw_distribution(spread, pairs, channel)
     for axes, title in zip(
@@ -159,10 +159,10 @@ def plot_correlation(result: IdentificationResult) -> "Figure":
         If no estimate has a standard deviation.
     """
     covariance = result.covariance
-    known = np.isfinite(np.diag(covariance.to_numpy()))
-    require(bool(known.any()), "no estimate has a standard deviation, so that there is no correlation to draw")
-    names = [str(n) for n in covariance.index[known]]
-    values, count = correlation(covariance.to_numpy()[np.ix_(known, known)]), len(names)
+    finite = np.isfinite(np.diag(covariance.to_numpy()))
+    require(bool(finite.any()), "no estimate has a standard deviation, so that there is no correlation to draw")
+    names = [str(n) for n in covariance.index[finite]]
+    values, count = correlation(covariance.to_numpy()[np.ix_(finite, finite)]), len(names)
     side = max(3.2, min(8.0, 0.62 * count))
     figure, ((axes,),) = axes_grid(1, 1, [side], width=side + 3.0)
     image = axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
@@ -194,31 +194,31 @@ def _channel_residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: 
 
 
 def _draw_autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
-    found = [e for _, e in _channel_residuals(pairs, channel)]
-    rho = _mean_correlogram([_correlogram(e, e) for e in found])
+    residuals = [e for _, e in _channel_residuals(pairs, channel)]
+    rho = _mean_correlogram([_correlogram(e, e) for e in residuals])
     axes.vlines(range(1, len(rho)), 0, rho[1:], color=BLUE, lw=1.4)
-    _draw_band(axes, found)
-    p = [ljung_box(e)[1] for e in found]
-    known = [q for q in p if math.isfinite(q)]
+    _draw_band(axes, residuals)
+    p = [ljung_box(e)[1] for e in residuals]
+    finite = [q for q in p if math.isfinite(q)]
     message = ""
-    if known:
-        least = f"{min(known):.2g}" if min(known) >= 1e-4 else "< 1e-4"
-        message = f"Ljung-Box p {least}" + (f" (least of {len(known)})" if len(known) > 1 else "")
+    if finite:
+        least = f"{min(finite):.2g}" if min(finite) >= 1e-4 else "< 1e-4"
+        message = f"Ljung-Box p {least}" + (f" (least of {len(finite)})" if len(finite) > 1 else "")
     axes.text(0.98, 0.03, message, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
     _set_symmetric_limits(axes, rho[1:])
 
 
 def _draw_crosscorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
-    found = _channel_residuals(pairs, channel)
+    residuals = _channel_residuals(pairs, channel)
     outputs = {n for run, _ in pairs for n in run}
-    logged = dict.fromkeys([*CHANNELS, *(n for log, _ in found for n in log)])
-    inputs = [n for n in logged if n not in outputs and any(n in log for log, _ in found)]
+    logged = dict.fromkeys([*CHANNELS, *(n for log, _ in residuals for n in log)])
+    inputs = [n for n in logged if n not in outputs and any(n in log for log, _ in residuals)]
     every = []
     for name, colour in zip(inputs, (BLUE, ORANGE, RED), strict=False):
-        rho = _mean_correlogram([_correlogram(e, log[name]) for log, e in found if name in log])
+        rho = _mean_correlogram([_correlogram(e, log[name]) for log, e in residuals if name in log])
         axes.plot(range(len(rho)), rho, color=colour, lw=1.2, label=name)
         every.append(rho)
-    _draw_band(axes, [e for _, e in found])
+    _draw_band(axes, [e for _, e in residuals])
     if inputs:
         axes.legend(fontsize=8, frameon=False, loc="upper right")
         _set_symmetric_limits(axes, np.concatenate(every))
@@ -248,8 +248,8 @@ def _draw_distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experimen
 
 def _correlogram(e: Array, other: Array) -> Array:
     """Correlation of residuals with another column 0 to `MAX_CORRELATION_LAG` samples before; NaN if constant."""
-    known = np.isfinite(e) & np.isfinite(other)
-    a, b = (np.where(known, v - np.mean(v[known]), 0.0) if known.any() else np.zeros(len(v)) for v in (e, other))
+    finite = np.isfinite(e) & np.isfinite(other)
+    a, b = (np.where(finite, v - np.mean(v[finite]), 0.0) if finite.any() else np.zeros(len(v)) for v in (e, other))
     size = math.sqrt(float(a @ a) * float(b @ b))
     lags = min(MAX_CORRELATION_LAG, len(e) - 2) + 1
     return np.array([a[k:] @ b[: len(b) - k] for k in range(lags)]) / size if size > 0 else np.full(lags, np.nan)
@@ -362,10 +362,10 @@ def _drive_points(
 ) -> tuple[Array, Array]:
     """Speed, and what pushes the mass without accelerating it."""
     log, run, axis = experiment.trajectory, result.trajectories[name], _moving_axis(system)
-    found = {str(n): float(v) for n, v in result.estimates["value"].items()}
-    own = {n.partition("[")[0]: v for n, v in found.items() if n.endswith(f"[{name}]")}
-    known = {n: v for n, v in experiment.conditions.items() if n in result.parameters}
-    parameters = result.parameters.with_values({**own, **known})
+    estimates = {str(n): float(v) for n, v in result.estimates["value"].items()}
+    of_log = {n.partition("[")[0]: v for n, v in estimates.items() if n.endswith(f"[{name}]")}
+    conditions = {n: v for n, v in experiment.conditions.items() if n in result.parameters}
+    parameters = result.parameters.with_values({**of_log, **conditions})
     deviation = {n: log[n] - run[n] for n in (axis.speed, axis.position) if n in log}
     if axis.speed not in deviation:
         deviation[axis.speed] = _smooth_derivative(log.t, deviation[axis.position])
@@ -427,10 +427,10 @@ def _state_rates(
 ) -> dict[str, Array]:
     """The states' rates at many points at once."""
     count = len(next(iter(x.values())))
-    given = [np.array([part[q.name] for q in group]) for part, group in ((x, system.states), (u, system.inputs))]
+    arguments = [np.array([part[q.name] for q in group]) for part, group in ((x, system.states), (u, system.inputs))]
     p = np.tile(parameter_vector(system.parameters, parameters)[:, None], (1, count))
-    found = system.ode.map(count)(np.zeros((1, count)), *given, p)[0].full()
-    return dict(zip(names(system.states), np.asarray(found), strict=True))
+    rates = system.ode.map(count)(np.zeros((1, count)), *arguments, p)[0].full()
+    return dict(zip(names(system.states), np.asarray(rates), strict=True))
 
 
 def _smooth_derivative(t: Array, y: Array) -> Array:

@@ -103,7 +103,7 @@ def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
     panel.set_xlabel("half of the 95 % interval, of the value [%]")
 
 
-def plot_tracking(found: Tracking) -> "Figure":
+def plot_tracking(tracking: Tracking) -> "Figure":
     """Estimates with their intervals over dates, their line with its band, and where a drift was first seen.
 
     Returns
@@ -115,18 +115,18 @@ def plot_tracking(found: Tracking) -> "Figure":
 
     library: Any = dates  # its locators have no types
 
-    order = found.table.assign(calm=found.table["alarm"].isna()).sort_values(["calm", "p"]).index.tolist()
+    order = tracking.table.assign(calm=tracking.table["alarm"].isna()).sort_values(["calm", "p"]).index.tolist()
     shown = order[:MAX_PANELS]
     figure, grid = axes_grid(len(shown), 1, [2.2] * len(shown), sharex="col", width=8.0)
     for (panel,), name in zip(grid, shown, strict=True):
-        own, row = found.history.loc[name], found.table.loc[name]
-        value = own["value"].to_numpy(dtype=float)
-        ends = [value - own["ci_low"].to_numpy(dtype=float), own["ci_high"].to_numpy(dtype=float) - value]
-        panel.errorbar(own.index, value, yerr=ends, fmt="o", color=BLUE, ms=4, capsize=2, label="a log's, 95 %")
+        history, row = tracking.history.loc[name], tracking.table.loc[name]
+        value = history["value"].to_numpy(dtype=float)
+        ends = [value - history["ci_low"].to_numpy(dtype=float), history["ci_high"].to_numpy(dtype=float) - value]
+        panel.errorbar(history.index, value, yerr=ends, fmt="o", color=BLUE, ms=4, capsize=2, label="a log's, 95 %")
         panel.fill_between(
-            own.index, own["line_low"], own["line_high"], color=ORANGE, alpha=0.25, label="its 95 % band"
+            history.index, history["line_low"], history["line_high"], color=ORANGE, alpha=0.25, label="its 95 % band"
         )
-        panel.plot(own.index, own["line"], color=ORANGE, label="line through all")
+        panel.plot(history.index, history["line"], color=ORANGE, label="line through all")
         if pd.notna(row["alarm"]):
             panel.axvline(row["alarm"], color=RED, ls="--", label="drift seen")
         low, high = row["percent_a_week_low"], row["percent_a_week_high"]

@@ -98,11 +98,11 @@ def _draw_map(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], met
         ticks(np.arange(0, len(at), every) + 0.5, [f"{v:.3g}" for v in at[::every]])
     if max(len(x), len(y)) <= MAX_NUMBERED_CELLS:
         for (j, i), value in np.ndenumerate(values):
-            known = bool(np.isfinite(value))
-            text = f"{value:.3g}" if known else _failure_word(metric, str(errors[j, i]))
+            finite = bool(np.isfinite(value))
+            text = f"{value:.3g}" if finite else _failure_word(metric, str(errors[j, i]))
             red, green, blue, _ = mesh.to_rgba(np.array([value]))[0]
             light = 0.3 * red + 0.59 * green + 0.11 * blue > 0.5  # then black letters can be read, else white ones
-            colour = RED if not known else "black" if light else "white"
+            colour = RED if not finite else "black" if light else "white"
             panel.text(i + 0.5, j + 0.5, text, ha="center", va="center", fontsize=8, color=colour)
 
 
@@ -179,8 +179,8 @@ def plot_distribution(table: "pd.DataFrame", metrics: Mapping[str, str]) -> "Fig
 
 
 def _draw_shares(panel: "Axes", table: "pd.DataFrame", metric: str) -> None:
-    known = table.loc[(table["error"] == "") & table[metric].notna(), metric].to_numpy(dtype=float)
-    values = np.sort(known[np.isfinite(known)])
+    figures = table.loc[(table["error"] == "") & table[metric].notna(), metric].to_numpy(dtype=float)
+    values = np.sort(figures[np.isfinite(figures)])
     at_least = metric in METRICS and larger_is_better(metric)
     values = values[::-1] if at_least else values
     shares = np.arange(1, len(values) + 1) / len(table)
@@ -197,12 +197,12 @@ def _draw_shares(panel: "Axes", table: "pd.DataFrame", metric: str) -> None:
         panel.annotate(label, (values[k], 0.03), xytext=(-3, 0), textcoords="offset points", ha="right", fontsize=8)
 
 
-def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) -> "Figure":
+def plot_sensitivity(indices: Sensitivity, local: LocalSensitivity | None = None) -> "Figure":
     """Total and first index of each axis with their 95 % intervals; the axis that matters most stands on top.
 
     Parameters
     ----------
-    found : Sensitivity
+    indices : Sensitivity
         Of the figures to draw, a panel each.
     local : LocalSensitivity, optional
         Of a design on the same axes: its shares are a third bar, which agrees with an axis' share by itself where the
@@ -213,9 +213,9 @@ def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) 
     Figure
         Of the first three figures that were told about; it says if there are more.
     """
-    figures = list(found.figures.index)
+    figures = list(indices.figures.index)
     shown = figures[:MAX_PLOT_COLUMNS]
-    table = found.table
+    table = indices.table
     order = table["total"].groupby(level="axis").max().sort_values(ascending=False).index.tolist()
     width = 2.2 + 2.6 * len(shown)
     bars = 2 if local is None else 3
@@ -223,12 +223,12 @@ def plot_sensitivity(found: Sensitivity, local: LocalSensitivity | None = None) 
     picture, (row,) = axes_grid(1, len(shown), [0.8 + height * len(order)], width=width)
     places = np.arange(len(order)) - thick * (bars - 1) / 2
     for panel, figure in zip(row, shown, strict=True):
-        own = table.loc[figure].loc[order]
+        rows_of_figure = table.loc[figure].loc[order]
         for k, index, colour, label in (
             (0, "total", BLUE, "with what it does by way of others"),
             (1, "first", GREY, "by itself"),
         ):
-            value, low, high = (own[f"{index}{end}"].to_numpy(dtype=float) for end in ("", "_low", "_high"))
+            value, low, high = (rows_of_figure[f"{index}{end}"].to_numpy(dtype=float) for end in ("", "_low", "_high"))
             spread = np.nan_to_num(np.abs([value - low, high - value]))
             panel.barh(
                 places + k * thick, value, 0.95 * thick, xerr=spread, color=colour, label=label, ecolor="k", capsize=2

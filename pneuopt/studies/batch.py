@@ -79,8 +79,8 @@ class BatchEvaluation(Shown):
         """How many plants there are, the spread of each metric, and the largest differences from the certificate."""
         failed, differ = int((self.table["error"] != "").sum()), self.checks[~self.checks["agrees"]]
         cases, certified = len(self.table), self.checks["case"].nunique()
-        said = f"{differ['case'].nunique()} differ" if len(differ) else "all agree"
-        verdict = f"{cases} plants in lanes, {certified} of them certified: {said}"
+        agreement = f"{differ['case'].nunique()} differ" if len(differ) else "all agree"
+        verdict = f"{cases} plants in lanes, {certified} of them certified: {agreement}"
         rows = [self._row(metric, own) for metric, own in self.checks.groupby("metric", sort=False)]
         columns = *text_columns("metric"), *number_columns("median", "95 %", "worst", "none", "largest difference")
         parts: list[Line | Table] = [Line(verdict, Tone.BAD if len(differ) or failed else Tone.GOOD)]
@@ -245,11 +245,11 @@ class _Memory:
     def _recall(self, k: int) -> bool:
         """Fill a row of the columns, if the journal has all of it."""
         name, values = self._cases[k]
-        found = self._journal.find(name, self._marks.of(values)) if self._journal is not None else None
-        if found is None or not self._columns.keys() <= found.results.keys():
+        outcome = self._journal.find(name, self._marks.of(values)) if self._journal is not None else None
+        if outcome is None or not self._columns.keys() <= outcome.results.keys():
             return False
         for n, column in self._columns.items():
-            column[k] = found.results[n]
+            column[k] = outcome.results[n]
         return True
 
 
@@ -291,16 +291,16 @@ def _certify(
     rows = []
     if cases:
         run = partial(evaluate, loop, steps, band=band)
-        found = compute(run, parameters, {f"{CERTIFIED}{name}": values for name, values in cases.items()})
-        found["case"] = list(cases)
-        own, lanes = (t[t["case"].isin(list(cases))].set_index("case").to_dict("index") for t in (found, table))
+        computed = compute(run, parameters, {f"{CERTIFIED}{name}": values for name, values in cases.items()})
+        computed["case"] = list(cases)
+        exact, lanes = (t[t["case"].isin(list(cases))].set_index("case").to_dict("index") for t in (computed, table))
         typical = {str(c): abs(float(table[c].median())) for c in columns}
         for case, c in ((case, c) for case in cases for c in typical):
-            batch, certified = (float(rows_by_case[case].get(c, nan)) for rows_by_case in (lanes, own))
+            batch, certified = (float(rows_by_case[case].get(c, nan)) for rows_by_case in (lanes, exact))
             neither = bool(np.isnan(batch) and np.isnan(certified))
             apart = 0.0 if neither else abs(batch - certified)
             close = neither or apart <= tolerance * max(abs(certified), typical[c])
-            rows.append((case, c, batch, certified, apart, close and not own[case]["error"]))
+            rows.append((case, c, batch, certified, apart, close and not exact[case]["error"]))
     return pd.DataFrame(rows, columns=["case", "metric", "batch", "certified", "difference", "agrees"])
 
 
@@ -365,21 +365,21 @@ class PlantBatch:
     def measure(self, rows: Indices, columns: Mapping[str, Array]) -> None:
         """Run some plants on every reference and fill their rows of the columns."""
         for grid, start, substeps in zip(self.grids, self._starts, self.substeps, strict=True):
-            own, x0 = self._start_states(rows, grid.reference, start)
-            if not len(own):
+            startable, x0 = self._start_states(rows, grid.reference, start)
+            if not len(startable):
                 continue
-            p = np.tile(self.nominal, (len(own), 1))
-            p[:, self._places] = self._values[own]
+            p = np.tile(self.nominal, (len(startable), 1))
+            p[:, self._places] = self._values[startable]
             run, sound = self.lanes.run(grid, x0, p, substeps)
             if not sound.all() and 2 * substeps <= MAX_LOOP_SUBSTEPS:  # RK4 may be what runs away
                 again = ~sound
                 finer, sound[again] = self.lanes.run(grid, x0[again], p[again], 2 * substeps)
                 run.y[again] = finer.y
-            for k in own[~sound].tolist():
+            for k in startable[~sound].tolist():
                 self.errors[k] = self.errors[k] or f"{RAN_AWAY} in the lanes"
             for _, some, metrics in self.lanes.read(grid, run.y, p, sound, (self.band,), self.metrics):
                 for n, value in metrics.items():
-                    columns[self.column(n, grid)][own[some]] = value
+                    columns[self.column(n, grid)][startable[some]] = value
 
     def _start_states(self, rows: Indices, step: Reference, shared: Array | None) -> tuple[Indices, Array]:
         """The plants that can begin, and their states before the step; the others get their reason."""
@@ -392,8 +392,8 @@ class PlantBatch:
                 good.append(k)
             except PneuoptError as error:
                 self.errors[k] = str(error)
-        found = np.reshape(states, (len(good), len(self.loop.states)))
-        return np.array(good, dtype=np.intp), self.lanes.with_integral(found)
+        rows_of_states = np.reshape(states, (len(good), len(self.loop.states)))
+        return np.array(good, dtype=np.intp), self.lanes.with_integral(rows_of_states)
 
     def start(self, values: Mapping[str, float], step: Reference) -> Array:
         """The state before a step of the plant with these values."""

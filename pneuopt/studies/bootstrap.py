@@ -94,8 +94,8 @@ class Bootstrap(Shown):
         rows = []
         for name, row in self.table.iterrows():
             held = f"{row['covered']:.0f} of {row['intervals']:.0f}"
-            given = (row["value"], row["bias"], row["corrected"], row["spread"], row["stderr"])
-            numbers = (format_number(v, digits) for v, digits in zip(given, (4, 2, 4, 2, 2), strict=True))
+            figures_of_row = (row["value"], row["bias"], row["corrected"], row["spread"], row["stderr"])
+            numbers = (format_number(v, digits) for v, digits in zip(figures_of_row, (4, 2, 4, 2, 2), strict=True))
             rows.append((str(name), *numbers, held, str(row["unit"])))
         columns = *text_columns("parameter"), *number_columns(*figures, "interval holds"), *text_columns("unit")
         return Report((*head, Table(columns, tuple(rows))))
@@ -156,8 +156,10 @@ def bootstrap(
     require(fit.status.converged, f"the fit has not converged: {fit.status.verdict}; mend it first")
     model = as_estimation_model(system)
     logs = check_logs(model, experiments, fit.parameters)
-    given = [e.name for e in logs]
-    require(given == [*fit.trajectories], f"the fit is of {', '.join(fit.trajectories)}, not of {', '.join(given)}")
+    log_names = [e.name for e in logs]
+    require(
+        log_names == [*fit.trajectories], f"the fit is of {', '.join(fit.trajectories)}, not of {', '.join(log_names)}"
+    )
     plants = [_rig_of(rig or model.plant, log, fit, outputs_in_log(model, log)) for log in logs]
     runs = [_find_runs(plant, log, fit) for plant, log in zip(plants, logs, strict=True)]
     behaviour = [replace(log, intersample=input_behaviour(model, log)) for log in logs]
@@ -183,32 +185,32 @@ def _reason_for_doubt(row: "pd.Series[Any]") -> str:
 
 def _rig_of(rig: HasSystem | Rig | Runnable, log: Experiment, fit: IdentificationResult, outputs: Sequence[str]) -> Rig:
     """The rig with the log's own sensors where it has none."""
-    own = {}
+    sensors = {}
     for n in outputs:  # the noise that the fit counts, and the resolution that the log shows
         resolution = estimate_noise(log.trajectory[n], log.trajectory.t).resolution
         noise = math.sqrt(max(float(fit.fit["noise"][log.name, n]) ** 2 - resolution**2 / 12, 0.0))
-        own[n] = Sensor(noise=noise, resolution=resolution)
+        sensors[n] = Sensor(noise=noise, resolution=resolution)
     if isinstance(rig, Rig):
-        return replace(rig, sensors=own | {n: s for n, s in rig.sensors.items() if n in own})
+        return replace(rig, sensors=sensors | {n: s for n, s in rig.sensors.items() if n in sensors})
     plant = as_runnable(rig, "rig").plant
-    return Rig(plant, own, actuated=names(plant.inputs)[0])
+    return Rig(plant, sensors, actuated=names(plant.inputs)[0])
 
 
 def _find_runs(rig: Rig, log: Experiment, fit: IdentificationResult) -> list[tuple[int, int]]:
     """Begin and end of the parts of a log along which the rig stays near the fitted motion."""
     fitted, parts = fit.trajectories[log.name], known_runs(log)
     spans = {n: MAX_WANDER * float(np.nanmax(fitted[n]) - np.nanmin(fitted[n])) for n in rig.sensors}
-    quiet, found = replace(rig, sensors=dict.fromkeys(rig.sensors, Sensor())), list[tuple[int, int]]()
+    quiet, runs = replace(rig, sensors=dict.fromkeys(rig.sensors, Sensor())), list[tuple[int, int]]()
     while parts:
         begin, end = parts.pop(0)
         run = _simulate(quiet, log, fit, begin, end, seed=0)
         stays = all(bool((np.abs(run[n] - fitted[n][begin:end]) <= span).all()) for n, span in spans.items())
         middle = (begin + end) // 2
         if stays or middle - begin < MIN_ROWS:
-            found.append((begin, end))
+            runs.append((begin, end))
         else:
             parts[:0] = [(begin, middle), (middle, end)]
-    return found
+    return runs
 
 
 def _simulate(
@@ -222,13 +224,15 @@ def _simulate(
     initial = {n: float(fitted[n][begin]) for n in names(plant.states) if n in fitted}
     rows = log.trajectory.rows(begin, end)
     inputs = Trajectory(rows.t, {n: rows[n] for n in names(plant.inputs)})
-    own = parameters.select(n for n in parameters if n in plant.parameters)
+    rig_parameters = parameters.select(n for n in parameters if n in plant.parameters)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # an end stop: the part is cut where the motion leaves the log's
         if rig.actuator != type(rig.actuator)() or any(s.lag for s in rig.sensors.values()):
-            read = record(rig, inputs, own, initial=initial, seed=seed).experiment.trajectory
+            read = record(rig, inputs, rig_parameters, initial=initial, seed=seed).experiment.trajectory
             return {n: read[n] for n in rig.sensors}
-        run = simulate(plant, inputs, own, initial=initial, intersample=log.intersample, rtol=1e-8, atol=1e-10)
+        run = simulate(
+            plant, inputs, rig_parameters, initial=initial, intersample=log.intersample, rtol=1e-8, atol=1e-10
+        )
     draw = np.random.default_rng(seed)
     return {
         n: np.array([s.reading(v, z) for v, z in zip(run[n], draw.standard_normal(len(rows)), strict=True)])
@@ -242,8 +246,8 @@ def _simulate_log(
     """A log in the place of the given one: its inputs and gaps, the rig's readings."""
     columns = {n: np.full(len(log.trajectory), np.nan) for n in rig.sensors}
     for k, (begin, end) in enumerate(runs):
-        own = int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
-        readings = _simulate(rig, log, fit, begin, end, seed=own)
+        part_seed = int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
+        readings = _simulate(rig, log, fit, begin, end, seed=part_seed)
         for n, column in columns.items():
             column[begin:end] = np.where(np.isnan(log.trajectory[n][begin:end]), np.nan, readings[n])
     joints = {(end, end) for (_, end), (begin, _) in itertools.pairwise(runs) if end == begin}
@@ -279,10 +283,10 @@ def _refit(
         )
     if not again.status.converged:
         raise ConvergenceError(again.status.verdict, again)
-    found: dict[str, float | str] = {"verdict": again.status.verdict}
+    row_of_draw: dict[str, float | str] = {"verdict": again.status.verdict}
     for name, row in again.estimates.iterrows():
-        found |= {f"{name}.{part}": float(row[part]) for part in ("value", "ci_low", "ci_high")}
-    return found
+        row_of_draw |= {f"{name}.{part}": float(row[part]) for part in ("value", "ci_low", "ci_high")}
+    return row_of_draw
 
 
 def _tabulate(fit: IdentificationResult, draws: "pd.DataFrame") -> "pd.DataFrame":
@@ -293,16 +297,16 @@ def _tabulate(fit: IdentificationResult, draws: "pd.DataFrame") -> "pd.DataFrame
     for name, row in fit.estimates.iterrows():
         if row["mark"] == Mark.UNIDENTIFIABLE or f"{name}.value" not in draws:
             continue
-        value, found = float(row["value"]), draws[f"{name}.value"].dropna()
-        bias = float(found.mean()) - value
+        value, drawn = float(row["value"]), draws[f"{name}.value"].dropna()
+        bias = float(drawn.mean()) - value
         low, high = (draws[f"{name}.{end}"] for end in ("ci_low", "ci_high"))
-        spread = float(found.std())
+        spread = float(drawn.std())
         rows[name] = {
             "value": value,
             "unit": row["unit"],
             "corrected": value - bias,
             "bias": bias,
-            "bias_error": spread / math.sqrt(max(len(found), 1)),
+            "bias_error": spread / math.sqrt(max(len(drawn), 1)),
             "spread": spread,
             "stderr": float(row["stderr"]),
             "intervals": int(low.notna().sum()),

@@ -288,8 +288,8 @@ class _Crew:
         """Start a process, which follows this one; loky puts another in its place where its memory grows."""
         import loky
 
-        given = (self._packed,)
-        process = loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_begin, initargs=given)
+        arguments = (self._packed,)
+        process = loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_begin, initargs=arguments)
         self._processes.append(process)
         with _one_thread_each():
             self.busy[process.submit(_load_task)] = _Run(process, None, inf)
@@ -354,12 +354,12 @@ def _receive(
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Processes that are started within have one thread for linear algebra; what the user has said of it goes first."""
-    own = {n: "1" for n in _THREAD_VARIABLES if n not in os.environ}
-    os.environ.update(own)
+    added = {n: "1" for n in _THREAD_VARIABLES if n not in os.environ}
+    os.environ.update(added)
     try:
         yield
     finally:
-        for n in own:
+        for n in added:
             del os.environ[n]
 
 

@@ -321,8 +321,8 @@ class CaseMarks:
     def of(self, values: CaseValues) -> str:
         """The mark of a case."""
         mark = self._common.copy()
-        own = dict(values) if isinstance(values, ParameterSet) else {n: float(v) for n, v in values.items()}
-        mark.update(repr(sorted(own.items(), key=lambda entry: entry[0])).encode())
+        case = dict(values) if isinstance(values, ParameterSet) else {n: float(v) for n, v in values.items()}
+        mark.update(repr(sorted(case.items(), key=lambda entry: entry[0])).encode())
         return mark.hexdigest()[:16]
 
 

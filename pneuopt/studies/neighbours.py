@@ -89,11 +89,11 @@ def sweep_from_neighbours(
             best = _best_beside(table, cases[name], places, value) if value in table else -1
             start = {n: float(table[column].iloc[best]) for column, n in starts.items()} if best >= 0 else {}
             chosen[name] = cases[name] | start
-        found = sweep(fn, parameters, chosen, executor=executor, progress=progress, journal=journal)
-        found = found.drop(columns=[n for n in starts.values() if n in found])
-        found = found.assign(**{n: [cases[name][n] for name in wave] for n in axes})
-        table = pd.concat([table, found], ignore_index=True)
-        if (found["error"] == INTERRUPTED_CASE).any():
+        computed = sweep(fn, parameters, chosen, executor=executor, progress=progress, journal=journal)
+        computed = computed.drop(columns=[n for n in starts.values() if n in computed])
+        computed = computed.assign(**{n: [cases[name][n] for name in wave] for n in axes})
+        table = pd.concat([table, computed], ignore_index=True)
+        if (computed["error"] == INTERRUPTED_CASE).any():
             break
     rest = [name for name in cases if name not in set(table["case"])]
     if rest:
@@ -176,20 +176,20 @@ def search_again(
         }
         for row in flagged
     }
-    found = table.copy()
+    better = table.copy()
     if cases:
         again = sweep(fn, parameters, cases, executor=executor, progress=progress)
         results = [n for n in table if n in again and n != "case" and n not in axes]
         for place, row in enumerate(flagged):
             if _number(again, value, place) < _number(table, value, row):
                 for n in results:
-                    found.loc[found.index[row], n] = again[n].iloc[place]
-    found["again"] = [row in set(flagged) for row in range(len(table))]
-    found["breaks"] = [
-        _breaks(found, value, row, _best_neighbour(found, axes, value, row)) or _number(found, value, row) == inf
+                    better.loc[better.index[row], n] = again[n].iloc[place]
+    better["again"] = [row in set(flagged) for row in range(len(table))]
+    better["breaks"] = [
+        _breaks(better, value, row, _best_neighbour(better, axes, value, row)) or _number(better, value, row) == inf
         for row in range(len(table))
     ]
-    return found
+    return better
 
 
 def _waves(
@@ -198,8 +198,8 @@ def _waves(
     """The names of the cells by their distance, in steps of the grid, from the one nearest to the parameters."""
     distances = dict.fromkeys(cases, 0)
     for n, values in axes.items():
-        places, own = _places(values), parameters.value(n)
-        middle = places[min((abs(v - own), v) for v in places)[1]]
+        places, nominal = _places(values), parameters.value(n)
+        middle = places[min((abs(v - nominal), v) for v in places)[1]]
         distances = {name: d + abs(places[cases[name][n]] - middle) for name, d in distances.items()}
     waves = [[n for n, d in distances.items() if d == wave] for wave in range(max(distances.values()) + 1)]
     return [wave for wave in waves if wave]

@@ -46,9 +46,9 @@ def evaluate_case(fn: CaseFunction, parameters: ParameterSet, values: CaseValues
     """Call the function; whatever it raises becomes the outcome's error, so an outcome always fits through a pipe."""
     begun = time.perf_counter()
     try:
-        given = values if isinstance(values, ParameterSet) else parameters.with_values(values)
+        case = values if isinstance(values, ParameterSet) else parameters.with_values(values)
         begun = time.perf_counter()
-        result, seconds = fn(given), time.perf_counter() - begun
+        result, seconds = fn(case), time.perf_counter() - begun
         results = _plain_results(result)
         numbers = [v for v in results.values() if isinstance(v, float | int) and not isinstance(v, bool)]
         error = ""  # a NaN among numbers says something, a metric that a response lacks; NaN alone is no result

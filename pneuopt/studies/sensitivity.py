@@ -74,9 +74,9 @@ class Sensitivity(Shown):
             lost = f"; {100 * about['lost']:.2g} % of the points have none" if about["lost"] else ""
             mean, spread = (format_number(float(about[n]), 4) for n in ("mean", "std"))
             parts.append(Line(f"{figure}: mean {mean}, standard deviation {spread}{lost}", Tone.HEADING))
-            own = self.table.loc[[figure]].droplevel(0).sort_values("total", ascending=False)
+            of_figure = self.table.loc[[figure]].droplevel(0).sort_values("total", ascending=False)
             rows = []
-            for axis, row in own.iterrows():
+            for axis, row in of_figure.iterrows():
                 cells = [str(axis)]
                 for name in ("total", "first"):
                     low, high = row[f"{name}_low"], row[f"{name}_high"]
@@ -155,8 +155,8 @@ def sensitivity(
 
 def _chosen(cases: "pd.DataFrame", parameters: ParameterSet, figures: Sequence[str] | None) -> list[str]:
     """The columns of results to tell about."""
-    known = [str(n) for n in cases.columns if n not in (*parameters, "case", "seconds", "error")]
-    numbers = [n for n in known if cases[n].dtype.kind in "fiub"]
+    results = [str(n) for n in cases.columns if n not in (*parameters, "case", "seconds", "error")]
+    numbers = [n for n in results if cases[n].dtype.kind in "fiub"]
     why = next((str(e) for e in cases["error"] if e), "it returns no number")
     require(len(numbers) > 0, f"no case of the study gave a figure: {why}")
     wanted = as_tuple("figures", figures or (), str, 'names of figures, as ["SettlingTime"]')
@@ -199,7 +199,7 @@ def _indices(blocks: Array, axes: int) -> Iterator[dict[str, float]]:
         return
     from scipy.stats import bootstrap
 
-    found = _estimate(blocks)
+    indices = _estimate(blocks)
     # ends of 95 % intervals, by drawing the points again; the same for the same figures
     drawn: Any = bootstrap(
         [np.arange(blocks.shape[1])],
@@ -211,7 +211,7 @@ def _indices(blocks: Array, axes: int) -> Iterator[dict[str, float]]:
     )
     low, high = drawn.confidence_interval.low, drawn.confidence_interval.high
     for k in range(axes):
-        ends = zip(found[:, k], low[:, k], high[:, k], strict=True)
+        ends = zip(indices[:, k], low[:, k], high[:, k], strict=True)
         yield dict(zip(_COLUMNS, (float(v) for index in ends for v in index), strict=True))
 
 
@@ -219,9 +219,9 @@ def _estimate(blocks: Array) -> Array:
     """First and total indices, shape (2, axes), from figures at A, B, and A with each axis of B."""
     from scipy.stats import sobol_indices
 
-    given: Any = {"f_A": blocks[:1], "f_B": blocks[1:2], "f_AB": blocks[2:, None]}
-    found = sobol_indices(func=given, n=blocks.shape[1])
-    return np.vstack([found.first_order, found.total_order])
+    values: Any = {"f_A": blocks[:1], "f_B": blocks[1:2], "f_AB": blocks[2:, None]}
+    indices = sobol_indices(func=values, n=blocks.shape[1])
+    return np.vstack([indices.first_order, indices.total_order])
 
 
 LOCAL_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError")
@@ -254,10 +254,10 @@ class LocalSensitivity(Shown):
         for figure, about in self.figures.iterrows():
             value, spread = (format_number(float(about[n]), 4) for n in ("value", "std"))
             parts.append(Line(f"{figure}: {value}, standard deviation {spread} if it were linear", Tone.HEADING))
-            own = self.table.loc[[figure]].droplevel(0).sort_values("share", ascending=False)
+            of_figure = self.table.loc[[figure]].droplevel(0).sort_values("share", ascending=False)
             rows = (
                 (str(axis), format_number(r["change"], 3), format_number(100 * r["relative"], 3), f"{r['share']:.2f}")
-                for axis, r in own.iterrows()
+                for axis, r in of_figure.iterrows()
             )
             parts.append(Table(columns, tuple(rows)))
         return Report(tuple(parts))
@@ -343,18 +343,18 @@ def local_sensitivity(
 
 def _axis_steps(loop: ClosedLoop, parameters: ParameterSet, spreads: SampleSpreads) -> dict[str, dict[str, float]]:
     """By axis the standard deviation of each of its parameters [SI], of one sign where they rise together."""
-    axes, found = axis_labels(parameters, spreads), dict[str, dict[str, float]]()
+    axes, steps = axis_labels(parameters, spreads), dict[str, dict[str, float]]()
     shares = (np.arange(SPREAD_POINTS) + 0.5) / SPREAD_POINTS
     for k, axis in enumerate(axes):
         points = np.full((SPREAD_POINTS, len(axes)), 0.5)
         points[:, k] = shares
         rows = values_at(parameters, spreads, points)
         columns = {n: np.array([row[n] for row in rows]) for n in rows[0]}
-        found[axis] = {n: float(np.sign(v[-1] - v[0]) * v.std()) for n, v in columns.items() if np.ptp(v)}
-        check_names("parameter", found[axis], loop.parameters, "spreads")
-        fixed = [n for n in found[axis] if n in GRID_PARAMETERS]
+        steps[axis] = {n: float(np.sign(v[-1] - v[0]) * v.std()) for n, v in columns.items() if np.ptp(v)}
+        check_names("parameter", steps[axis], loop.parameters, "spreads")
+        fixed = [n for n in steps[axis] if n in GRID_PARAMETERS]
         require(not fixed, f"{', '.join(fixed)}: the samples of a response hang on it; sweep `evaluate` for it")
-    return found
+    return steps
 
 
 def _measure(
@@ -369,9 +369,9 @@ def _measure(
     y, along = _run_with_sensitivities(loop, batch, grid, substeps, axes)
     moved = np.concatenate([y[None], y + SIDE * along, y - SIDE * along])
     period = loop.dither_period(loop.complete(parameters))
-    found = read_metrics(grid, moved, (batch.band,), period, batch.metrics, (), batch.lanes.channels)
+    figures = read_metrics(grid, moved, (batch.band,), period, batch.metrics, (), batch.lanes.channels)
     m = len(along)
-    return {n: (float(v[0]), (v[1 : 1 + m] - v[1 + m :]) / (2 * SIDE)) for n, v in found.items()}
+    return {n: (float(v[0]), (v[1 : 1 + m] - v[1 + m :]) / (2 * SIDE)) for n, v in figures.items()}
 
 
 def _run_with_sensitivities(

@@ -303,11 +303,11 @@ def sweep(
                 rows.add(name, outcome)
         journal.append_rows(rows.row(name) for name in cases if not rows.is_missing(name))
     missing = ((name, values) for name, values in cases.items() if rows.is_missing(name))
-    given = fn, parameters, missing, len(cases) - rows.done
+    task = fn, parameters, missing, len(cases) - rows.done
     if executor is None or isinstance(executor, Processes):
-        outcomes = run_in_processes(executor or Processes(), *given)
+        outcomes = run_in_processes(executor or Processes(), *task)
     else:
-        outcomes = run_in_executor(executor, *given)
+        outcomes = run_in_executor(executor, *task)
     report, meter = ProgressReporter(progress, "sweep"), _Meter(rows)
     with closing(outcomes), suppress(KeyboardInterrupt):
         for name, outcome in outcomes if rows.done < len(cases) else ():
@@ -331,11 +331,11 @@ class _Meter:
     def text(self) -> str:
         """A line; rate and time left are in it some seconds after the first case."""
         rows, now = self._rows, time.monotonic()
-        known, begun = self._first = self._first or (rows.done, now)
+        done_before, begun = self._first = self._first or (rows.done, now)
         text = f"{rows.done} of {rows.count} cases" + (f", {rows.failed} failed" if rows.failed else "")
         if now - begun < RATE_AFTER:
             return text
-        rate = (rows.done - known) / (now - begun)
+        rate = (rows.done - done_before) / (now - begun)
         left = round((rows.count - rows.done) / rate)
         return f"{text}, {rate:.3g} a second, {timedelta(seconds=left)} left"
 
@@ -371,5 +371,5 @@ def evaluate_at_sample_time(
     max_steps: float = MAX_STEPS,
 ) -> "pd.DataFrame":
     """The metrics of a case that may have a sample time among its parameters; as `evaluate`."""
-    own, given = loop_at_sample_time(loop, parameters)
-    return evaluate(own, references, given, band=band, max_steps=max_steps)
+    sampled, others = loop_at_sample_time(loop, parameters)
+    return evaluate(sampled, references, others, band=band, max_steps=max_steps)

@@ -310,8 +310,8 @@ class PneumaticDrive:
         air, expansion = through.supply_a + through.supply_b, ca.log(p["supply.pressure"] / p["ambient.pressure"])
         power = air * p["gas.constant"] * p["ambient.temperature"] * expansion
         drawn = [air, self._spool_position(x, u, p), power]
-        given = [ca.SX.sym("t"), *map(stack, (x, u, p))]
-        return ca.Function("meter", given, drawn, ["t", "x", "u", "p"], ["air", "spool", "power"])
+        arguments = [ca.SX.sym("t"), *map(stack, (x, u, p))]
+        return ca.Function("meter", arguments, drawn, ["t", "x", "u", "p"], ["air", "spool", "power"])
 
     @cached_property
     def _balance_function(self) -> ca.Function:
@@ -319,26 +319,26 @@ class PneumaticDrive:
 
         The bristles' rates are linear in their deflections, so one Newton step from zero gives the steady ones.
         """
-        given = {n: ca.SX.sym(n) for n in ("position", "speed", "valve.spool", "pressure_a", "pressure_b")}
+        arguments = {n: ca.SX.sym(n) for n in ("position", "speed", "valve.spool", "pressure_a", "pressure_b")}
         p = {n: ca.SX.sym(n) for n in self.parameters}
         warm = dict.fromkeys(("temperature_a", "temperature_b"), p["ambient.temperature"])
         inner = {f"friction.{q.name}": ca.SX.sym(q.name) for q in self.friction.states}
-        known = {**given, **warm, **inner}
-        x = {n: known.get(n, ca.SX(0)) for n in names(self.states)}
+        signals = {**arguments, **warm, **inner}
+        x = {n: signals.get(n, ca.SX(0)) for n in names(self.states)}
         rates, _ = self._rhs(
-            ca.SX(0), x, {VALVE_VOLTAGE.name: p["valve.centre"] + given["valve.spool"] * p["valve.span"]}, p
+            ca.SX(0), x, {VALVE_VOLTAGE.name: p["valve.centre"] + arguments["valve.spool"] * p["valve.span"]}, p
         )
         z, zdot = stack(inner), stack({n: rates[n] for n in inner})
         steady = ca.substitute(-ca.solve(ca.jacobian(zdot, z), zdot), z, 0) if inner else z
-        found = [ca.vertcat(*(rates[n] for n in BALANCE_RATES)), stack(x)]
-        found = ca.substitute(found, [z], [steady]) if inner else found
-        return ca.Function("glide", [*given.values(), stack(p)], [ca.densify(v) for v in found])
+        results = [ca.vertcat(*(rates[n] for n in BALANCE_RATES)), stack(x)]
+        results = ca.substitute(results, [z], [steady]) if inner else results
+        return ca.Function("glide", [*arguments.values(), stack(p)], [ca.densify(v) for v in results])
 
     def _find_rest(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
-        known = ("position", "speed", "pressure_b", *names(self.load.outputs))
-        others = ", ".join(sorted(outputs.keys() - set(known)))
+        allowed = ("position", "speed", "pressure_b", *names(self.load.outputs))
+        others = ", ".join(sorted(outputs.keys() - set(allowed)))
         message = (
-            f"a cylinder starts from {', '.join(known[:-1])} and {known[-1]}, not from {others}; leave {others} out"
+            f"a cylinder starts from {', '.join(allowed[:-1])} and {allowed[-1]}, not from {others}; leave {others} out"
         )
         require(not others, message)
         start = dict(outputs)
@@ -385,8 +385,8 @@ _AIR_PARAMETERS = ParameterSet(
 def _log_warnings(zeros: LogWarningHook, lines: LogWarningHook, logs: Mapping[str, Log]) -> Sequence[str]:
     """Warnings of impossible positions; where there are none, of wrong pressures, which a wrong position would hide."""
     moved = {name: log for name, log in logs.items() if "position" in log.measured}
-    found = {name: position_warning(log.parameters, log.measured["position"]) for name, log in moved.items()}
-    outside = [f"{name}: {sentence}" for name, sentence in found.items() if sentence]
+    warnings = {name: position_warning(log.parameters, log.measured["position"]) for name, log in moved.items()}
+    outside = [f"{name}: {sentence}" for name, sentence in warnings.items() if sentence]
     return outside or zeros(logs) or lines(logs)
 
 

@@ -52,33 +52,35 @@ class LinePressureCheck:
         return [sentence for name, log in active.items() if (sentence := self._examine(name, log))]
 
     def _examine(self, name: str, log: Log) -> str:
-        given = min((self._balance(log, shape) for shape in trial_shapes(log)), key=lambda found: found.residual)
-        if given.residual < MAX_UNQUESTIONED_SHARE * given.total:
+        measured_balance = min(
+            (self._balance(log, shape) for shape in trial_shapes(log)), key=lambda balance: balance.residual
+        )
+        if measured_balance.residual < MAX_UNQUESTIONED_SHARE * measured_balance.total:
             return ""
-        lead, best, worse = 0.0, given, 0
+        lead, best, worse = 0.0, measured_balance, 0
         for tried in LEADS:
-            found = self._behind_line(log, given, tried)
-            lead, best, worse = (tried, found, 0) if found.residual < best.residual else (lead, best, worse + 1)
+            balance = self._behind_line(log, measured_balance, tried)
+            lead, best, worse = (tried, balance, 0) if balance.residual < best.residual else (lead, best, worse + 1)
             if worse == MAX_WORSE_LEADS:
                 break
-        if best.residual > min(given.residual / MIN_RESIDUAL_RATIO**2, MAX_RESIDUAL_SHARE * best.total):
+        if best.residual > min(measured_balance.residual / MIN_RESIDUAL_RATIO**2, MAX_RESIDUAL_SHARE * best.total):
             return ""
         drop = lead * max(float(np.quantile(np.abs(flow), 0.999)) for flow in best.flows)
-        ratio = np.sqrt(given.residual / best.residual)
+        ratio = np.sqrt(measured_balance.residual / best.residual)
         message = f"{name}: the pressures lead the chambers by {1e3 * lead:.2g} ms, as before a line that drops up to "
         message += f"{drop / 1e5:.2g} bar (their mass balance then leaves {ratio:.1f} times smaller residuals)"
         return f"{message}: put the sensors at the cylinder, or leave them out; else raise valve.bandwidth"
 
-    def _behind_line(self, log: Log, given: "Balance", lead: float) -> "Balance":
+    def _behind_line(self, log: Log, uncorrected: "Balance", lead: float) -> "Balance":
         """The balance of the pressures behind a line that leads so much, with its own flow."""
-        found, flows = given, given.flows
+        balance, flows = uncorrected, uncorrected.flows
         for _ in range(PASSES):
-            behind = {n: log.measured[n] - lead * flow for n, flow in zip(given.channels, flows, strict=True)}
+            behind = {n: log.measured[n] - lead * flow for n, flow in zip(uncorrected.channels, flows, strict=True)}
             if min(float(np.nanmin(p)) for p in behind.values()) <= 0:
-                return given
-            found = self._balance(log._replace(measured=log.measured.with_columns(behind)), given.shape)
-            flows = [(old + new) / 2 for old, new in zip(flows, found.flows, strict=True)]
-        return found
+                return uncorrected
+            balance = self._balance(log._replace(measured=log.measured.with_columns(behind)), uncorrected.shape)
+            flows = [(old + new) / 2 for old, new in zip(flows, balance.flows, strict=True)]
+        return balance
 
     def _balance(self, log: Log, shape: Mapping[str, float]) -> "Balance":
         run = self.prepare({"": log})[""]
@@ -147,15 +149,15 @@ class PressureZeroCheck:
         for name, log in logs.items():
             rates = {n: filter_channel(log.measured, n, 1) for n in _pressure_channels(log)}
             spread[name] = {n: float(np.sum((rate - rate.mean()) ** 2)) for n, rate in rates.items()}
-        found = [self._shift_residuals(logs, ZERO_SHIFTS[0])]
+        by_shift = [self._shift_residuals(logs, ZERO_SHIFTS[0])]
         doubtful = {
             name: log
             for name, log in logs.items()
-            if any(left > MAX_UNQUESTIONED_SHARE * spread[name][n] for n, left in found[0][name].items())
+            if any(left > MAX_UNQUESTIONED_SHARE * spread[name][n] for n, left in by_shift[0][name].items())
         }
-        found += [self._shift_residuals(doubtful, remedy) for remedy in ZERO_SHIFTS[1:]] if doubtful else []
+        by_shift += [self._shift_residuals(doubtful, remedy) for remedy in ZERO_SHIFTS[1:]] if doubtful else []
         return {
-            name: {n: np.array([spread[name][n], *(each[name][n] for each in found)]) for n in spread[name]}
+            name: {n: np.array([spread[name][n], *(each[name][n] for each in by_shift)]) for n in spread[name]}
             for name in doubtful
         }
 
@@ -181,8 +183,8 @@ class PressureZeroCheck:
 
 def is_informative(log: Log) -> bool:
     """Whether a log has motion and a pressure, and the supply pressure is known, without which no ratio is."""
-    known = SUPPLY_PRESSURE not in log.parameters.free_names
-    return known and any(n in log.measured for n in ("position", "speed")) and bool(_pressure_channels(log))
+    supply_known = SUPPLY_PRESSURE not in log.parameters.free_names
+    return supply_known and any(n in log.measured for n in ("position", "speed")) and bool(_pressure_channels(log))
 
 
 def most_active_part(log: Log) -> Log:
@@ -220,9 +222,9 @@ def _warning_sentences(name: str, logs: Collection[Mapping[str, Array]]) -> Iter
     """Sentences, one for each pressure for which another zero point fits better in these logs together."""
     for channel in PRESSURE_NAMES:
         rows = [left[channel] for left in logs if channel in left]
-        total, given, *shifted = np.sum(rows, axis=0) if rows else np.zeros(1 + len(ZERO_SHIFTS))
+        total, unshifted, *shifted = np.sum(rows, axis=0) if rows else np.zeros(1 + len(ZERO_SHIFTS))
         best = int(np.argmin(shifted))
-        if 0 < shifted[best] < min(given / MIN_RESIDUAL_RATIO**2, MAX_RESIDUAL_SHARE * total):
-            better = f"leaves {math.sqrt(given / shifted[best]):.1f} times smaller residuals"
+        if 0 < shifted[best] < min(unshifted / MIN_RESIDUAL_RATIO**2, MAX_RESIDUAL_SHARE * total):
+            better = f"leaves {math.sqrt(unshifted / shifted[best]):.1f} times smaller residuals"
             where = f"{channel} of {name}" if name else channel
             yield f"{where}: its chamber's mass balance {better} with {ZERO_SHIFTS[1 + best].advice}"

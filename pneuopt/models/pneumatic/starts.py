@@ -216,10 +216,10 @@ class PneumaticLog:
         if centre not in self._air_by_centre:
             self._air_by_centre[centre] = self._simulate_air([{CENTRE: centre}])[0]
         air = self._air_by_centre[centre]
-        given = self._known_signals.with_columns(air)
+        signals = self._known_signals.with_columns(air)
         simulator = self._simulator_for((*self.known_states, *air))
         which = [PRESSURE_NAMES.index(n) for n in self.logged_pressures]
-        closed, edges, leaking = simulator.pressure_rates(given, self._with_valves(probes))[:, :, which]
+        closed, edges, leaking = simulator.pressure_rates(signals, self._with_valves(probes))[:, :, which]
         columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
         rates = [filter_channel(self.measured, n, 1, self._window) for n in self.logged_pressures]
         return columns, np.column_stack(rates) - closed
@@ -290,8 +290,8 @@ def _search_values(
 
     def best_of(grid: Array) -> Array:
         grid = np.clip(grid, lower, upper)
-        found = misfits([dict(zip(names, point, strict=True)) for point in grid.tolist()])
-        return np.asarray(grid[np.argmin(np.nan_to_num(found, nan=np.inf))])
+        misfit_of = misfits([dict(zip(names, point, strict=True)) for point in grid.tolist()])
+        return np.asarray(grid[np.argmin(np.nan_to_num(misfit_of, nan=np.inf))])
 
     point = best_of(np.array(list(itertools.product(*tried.values()))))
     step = np.array([REFINEMENT_STEPS[n] for n in names])
@@ -313,13 +313,13 @@ def _fit_valve_to_pressures(
     conductance, leak = parameters.value(VALVE_CONDUCTANCE), parameters.value(VALVE_LEAK)
     # the vector (C, C * leak) as a known part and a basis for the free part
     if VALVE_CONDUCTANCE in free:
-        known, basis = np.zeros(2), np.eye(2) if VALVE_LEAK in free else np.array([[1.0], [leak]])
+        solution, basis = np.zeros(2), np.eye(2) if VALVE_LEAK in free else np.array([[1.0], [leak]])
     elif VALVE_LEAK in free:
-        known, basis = np.array([conductance, 0.0]), np.array([[0.0], [conductance]])
+        solution, basis = np.array([conductance, 0.0]), np.array([[0.0], [conductance]])
     else:
-        known, basis = np.array([conductance, conductance * leak]), np.empty((2, 0))
-    known = known + basis @ np.linalg.lstsq(A @ basis, y - A @ known, rcond=None)[0]
-    leak = float(known[1] / known[0]) if known[0] > 0 else 0.0
-    found = {VALVE_CONDUCTANCE: float(known[0]), VALVE_LEAK: max(leak, MIN_LEAK)}
-    values = {n: float(np.clip(v, parameters[n].lower, parameters[n].upper)) for n, v in found.items() if n in free}
-    return values, float(np.sum((y - A @ known) ** 2))
+        solution, basis = np.array([conductance, conductance * leak]), np.empty((2, 0))
+    solution = solution + basis @ np.linalg.lstsq(A @ basis, y - A @ solution, rcond=None)[0]
+    leak = float(solution[1] / solution[0]) if solution[0] > 0 else 0.0
+    estimates = {VALVE_CONDUCTANCE: float(solution[0]), VALVE_LEAK: max(leak, MIN_LEAK)}
+    values = {n: float(np.clip(v, parameters[n].lower, parameters[n].upper)) for n, v in estimates.items() if n in free}
+    return values, float(np.sum((y - A @ solution) ** 2))
