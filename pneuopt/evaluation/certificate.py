@@ -519,15 +519,15 @@ def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Refer
     half = band_share(band, reference) * size
     if count / 2 <= half * (1 + EDGE_ROUNDING):
         return None
-    told = f"the settling band of +-{write_value(half, unit, 3)} is narrower than half"
+    narrow = f"the settling band of +-{write_value(half, unit, 3)} is narrower than half"
     change, wider = write_value(count, unit, 3), _wider_band(count / 2, size, band, unit)
     if sees_speed(loop):
         remedy = "a finer encoder or a longer filter of the sensor"
-        return f"{told} the {change} by which one count changes the reading; {wider}{remedy}"
+        return f"{narrow} the {change} by which one count changes the reading; {wider}{remedy}"
     ripple = loop.dither_period(parameters) is not None
     tells = "tells inside from outside only by its dither's ripple" if ripple else "cannot tell inside from outside"
     remedy = "a larger step or a finer encoder"
-    return f"{told} the encoder's count of {change}, the controller {tells}; {wider}{remedy}"
+    return f"{narrow} the encoder's count of {change}, the controller {tells}; {wider}{remedy}"
 
 
 def _wider_band(half: float, size: float, band: Band, measured: str) -> str:

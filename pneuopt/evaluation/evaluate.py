@@ -169,7 +169,13 @@ def evaluate_cases(
     inner, rig = _loop_and_rig(loop, steps)
     full = inner.complete(parameters)
     for case in cases(steps, scenarios, full):
-        yield _evaluate_case(inner, rig, case, full, band, envelope)
+        own, reference = case.case_parameters(full), case.reference
+        response = _respond(inner, rig, reference, own)
+        metrics = measure(inner, own, reference, response, band, envelope)
+        metrics |= limit_cycle_metrics(inner, own, reference, response)
+        metrics |= meter_metrics(inner, own, response, reference.at)
+        rows = margin_rows(inner, own, reference, response) if rig is None else ()
+        yield CaseEvaluation(inner, case, own, metrics | worst_margins(rows), response, rows)
 
 
 def respond(loop: ClosedLoop | Rig, reference: Reference, parameters: ParameterSet) -> Trajectory:
@@ -208,18 +214,6 @@ def _respond(loop: ClosedLoop, rig: Rig | None, reference: Reference, parameters
             break
         response = simulate(loop, run, parameters, initial=start, t_out=finer, max_steps=inf)
     return response
-
-
-def _evaluate_case(
-    loop: ClosedLoop, rig: Rig | None, case: TuningCase, parameters: ParameterSet, band: Band, envelope: Envelope
-) -> CaseEvaluation:
-    parameters = case.case_parameters(parameters)
-    response = _respond(loop, rig, case.reference, parameters)
-    metrics = measure(loop, parameters, case.reference, response, band, envelope)
-    metrics |= limit_cycle_metrics(loop, parameters, case.reference, response)
-    metrics |= meter_metrics(loop, parameters, response, case.reference.at)
-    rows = margin_rows(loop, parameters, case.reference, response) if rig is None else ()
-    return CaseEvaluation(loop, case, parameters, metrics | worst_margins(rows), response, rows)
 
 
 def limit_cycle_metrics(

@@ -301,7 +301,10 @@ def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
 
     Logarithmic from three decades below the slowest pole or zero to three above the fastest, denser at resonances.
     """
-    roots = np.concatenate([eigvals(open_loop.A), eigvals(_closed_loop(open_loop)), _zeros(open_loop)])
+    poles, pencil = eigvals(open_loop.A), np.block([[open_loop.A, open_loop.B], [open_loop.C, open_loop.D]])
+    zeros = np.asarray(eigvals(pencil, np.diag([1.0] * len(poles) + [0.0])), dtype=complex)
+    zeros = zeros[np.abs(zeros) < 1e3 * np.max(np.abs(poles), initial=1.0)]
+    roots = np.concatenate([poles, eigvals(_closed_loop(open_loop)), zeros])
     size = [s for s in np.abs(roots) if s > 1e-10 * np.max(np.abs(roots))]
     low, high = min(size, default=1.0), max(size, default=1.0)
     decades = np.log10(high / low) + 6
@@ -309,14 +312,6 @@ def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
     ringing = roots[(roots.imag > 0) & (np.abs(roots.real) < 0.2 * roots.imag) & (roots.real != 0)]
     around = [r.imag + abs(r.real) * np.linspace(-4, 4, 41) for r in ringing]
     return np.unique(np.concatenate([grid, *around]))
-
-
-def _zeros(open_loop: Linearisation) -> ComplexArray:
-    n = len(open_loop.A)
-    pencil = np.block([[open_loop.A, open_loop.B], [open_loop.C, open_loop.D]])
-    zeros = np.asarray(eigvals(pencil, np.diag([1.0] * n + [0.0])), dtype=complex)
-    fastest = np.max(np.abs(eigvals(open_loop.A)), initial=1.0)
-    return np.array([z for z in zeros if np.abs(z) < 1e3 * fastest], dtype=complex)
 
 
 def _closed_loop(open_loop: Linearisation) -> Array:
@@ -364,18 +359,14 @@ def sensitivity_terms(
     that counts, a cascade or scheduled gains is refused: its sensitivity is no such function of the gains.
     """
     shaping = ", ".join(type(c).__name__ for c in loop.controller.acting_always)
-    told = "a cascade's speed loop has a response of its own; use margins(open_loop(...))"
-    require(loop.outer is None, told, ModelError)
-    told = "scheduled gains change with the operating point; use margins(open_loop(...))"
-    require(loop.schedule is None, told, ModelError)
-    message = f"{shaping}: its slope at the operating point counts in the sensitivity; use margins(open_loop(...))"
-    require(not shaping, message, ModelError)
-    free = [n for n in parameters.free_names if n in loop.plant.parameters]
-    require(
-        not free,
-        f"{', '.join(free)}: free, but the sensitivity needs a fixed plant; fix it",
-        ModelError,
-    )
+    for fits, reason in (
+        (loop.outer is None, "a cascade's speed loop has a response of its own"),
+        (loop.schedule is None, "scheduled gains change with the operating point"),
+        (not shaping, f"{shaping}: its slope at the operating point counts in the sensitivity"),
+    ):
+        require(fits, f"{reason}; use margins(open_loop(...))", ModelError)
+    free = ", ".join(n for n in parameters.free_names if n in loop.plant.parameters)
+    require(not free, f"{free}: free, but the sensitivity needs a fixed plant; fix it", ModelError)
     w = np.asarray(omega, dtype=float)
     P = frequency_response(linear_plant(loop, parameters, x), w) * pade_delay_response(w, loop.dead_time)
     p = ca.SX.sym("p", len(loop.parameters))

@@ -594,8 +594,8 @@ def band_share(band: Band, reference: Reference) -> float:
         require(0 < band < 1, f"band is a fraction between 0 and 1, got {band:g}; 2 % is 0.02")
         return band
     size = abs(reference.nominal_size)
-    told = f"reference {reference.label}: its size of {size:g} lies within the tolerance of +-{band.half_width:g}"
-    require(band.half_width < size, f"{told}; narrow the tolerance, or leave the reference out")
+    message = f"reference {reference.label}: its size of {size:g} lies within the tolerance of +-{band.half_width:g}"
+    require(band.half_width < size, f"{message}; narrow the tolerance, or leave the reference out")
     return band.half_width / size
 
 

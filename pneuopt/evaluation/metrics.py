@@ -294,8 +294,8 @@ def _remove_ripple(
         return raw, raw.y[:, -1], np.zeros(len(raw.y))
     if averaged is None:
         last = raw.t[-1] - period / 2
-        told = f"the record of {raw.t[-1]:g} s is too short to average over {period:g} s; simulate longer"
-        require(period > 0 and last > raw.t[0] + period, told)
+        message = f"the record of {raw.t[-1]:g} s is too short to average over {period:g} s; simulate longer"
+        require(period > 0 and last > raw.t[0] + period, message)
         averaged = period_mean(raw.t, raw.y, initial, period, raw.t[raw.t <= last])
     found = remove_ripple(raw.t, raw.y, averaged, period)
     return Samples(raw.t, found.signal), found.final, found.ripple

@@ -181,16 +181,16 @@ class _Abilities:
         """Where full command from rest does not come so far, or not accelerate so much."""
         way, reached = abs(move.distance) / 2, float(self.push["acceleration"].max())
         full = f"{self.limits[1 if self.side > 0 else 0]:.3g} {self.loop.command.unit}"
-        told = f"full command ({full}) from rest"
+        message = f"full command ({full}) from rest"
         if acceleration > reached:
             wanted, most = (self._write(v, "/s^2") for v in (acceleration, ALLOWED_SHARE * reached))
-            return f"it accelerates with {wanted}, {told} with {most}; lower its acceleration"
+            return f"it accelerates with {wanted}, {message} with {most}; lower its acceleration"
         ahead = np.maximum.accumulate(self.push["way"])
         time = float(np.interp(way, ahead, self.push.t)) if ahead[-1] >= way else inf
         if time > half:
             best = f"takes {time:.3g} s" if time < inf else f"has not come so far in {self.push.t[-1]:.3g} s"
             least = f", so that the move takes {2 * time:.3g} s at least" if time < inf else ""
-            return f"its first half takes {half:.3g} s, {told} {best}{least}; lower its acceleration and speed"
+            return f"its first half takes {half:.3g} s, {message} {best}{least}; lower its acceleration and speed"
         return ""
 
     def _write(self, value: float, per: str) -> str:
@@ -318,12 +318,16 @@ def excitation_run(
     InputError
         If there is no room, the limit is too slow, or the controller cannot move the drive so; with what can be.
     """
-    loop, known = _position_loop(plant, sample_time), plant.parameters | parameters
+    axis, stops = plant.axis, [g for g in plant.validity_limits if g.state == "position"]
+    if axis is None or axis.final_element is None or len(stops) != 2 or plant.rest_hook is None:
+        message = 'an excitation run needs a drive whose valve moves an axis between two end stops, kind = "pneumatic"'
+        raise ModelError(f"{message}; for another drive plan one with pneuopt next-experiment")
+    loop, known = ClosedLoop(plant, PID(sample_time), measured=axis.position), plant.parameters | parameters
     plant.check(known)
     ends = _room(plant, known, between)
-    told = f"a run with a speed of {write_value(speed, 'm/s', 3)} at most does not tell viscous friction from Coulomb's"
-    least = write_value(LEAST_FAST_SPEED, "m/s")
-    require(speed >= LEAST_FAST_SPEED, f"{told}; allow {least} or more")
+    least, most = write_value(LEAST_FAST_SPEED, "m/s"), write_value(speed, "m/s", 3)
+    message = f"a run with a speed of {most} at most does not tell viscous friction from Coulomb's"
+    require(speed >= LEAST_FAST_SPEED, f"{message}; allow {least} or more")
     low, high, _ = command_range(loop, loop.complete(known))
     p = loop.complete(known).with_values({"pid.lower": low, "pid.upper": high})
     fast = _fast_move(loop, p, ends, speed)
@@ -332,17 +336,13 @@ def excitation_run(
     moves = _sequence(ends, fast, p.value("pid.Kp") * fast.speed / abs(command))
     for move in {(abs(m.distance), m.speed): m for m in moves.chain}.values():
         check_move(loop, replace(move, at=0.0), p)
-    run = ExcitationRun(loop, p, moves, ends, _simulate(loop, p, moves, sample_time), command_centre(plant, known))
-    _check_response(run)
-    return run
-
-
-def _position_loop(plant: System, sample_time: float) -> ClosedLoop:
-    axis, stops = plant.axis, [g for g in plant.validity_limits if g.state == "position"]
-    if axis is None or axis.final_element is None or len(stops) != 2 or plant.rest_hook is None:
-        told = 'an excitation run needs a drive whose valve moves an axis between two end stops, kind = "pneumatic"'
-        raise ModelError(f"{told}; for another drive plan one with pneuopt next-experiment")
-    return ClosedLoop(plant, PID(sample_time), measured=axis.position)
+    response, (rear, front) = _simulate(loop, p, moves, sample_time), _end_stops(plant, p)
+    position, (low, high) = response[loop.feedback.name], ends
+    beyond = max(low - float(position.min()), float(position.max()) - high)
+    message = f"the plain controller overshoots the run by {write_value(beyond, 'm', 3)}"
+    fits = beyond < GUESS_SHARE * min(low - rear, front - high)
+    require(fits, f"{message}; allow a lower speed, or correct mass and valve in the drive's file")
+    return ExcitationRun(loop, p, moves, ends, response, command_centre(plant, known))
 
 
 def _room(plant: System, p: ParameterSet, between: tuple[float, float] | None) -> tuple[float, float]:
@@ -353,8 +353,8 @@ def _room(plant: System, p: ParameterSet, between: tuple[float, float] | None) -
     low, high = map(_place, (low, high))
     shown = [write_value(x, "m", 3) for x in (low, high, rear, front)]
     inside = rear < low and high < front
-    told = f"the run would go from {shown[0]} to {shown[1]}, and the end stops are at {shown[2]} and {shown[3]}"
-    require(inside, f"{told}; keep the run between them")
+    message = f"the run would go from {shown[0]} to {shown[1]}, and the end stops are at {shown[2]} and {shown[3]}"
+    require(inside, f"{message}; keep the run between them")
     way = f"{write_value(max(high - low, 0.0), 'm', 3)} from {shown[0]} to {shown[1]}"
     room = f"an excitation run needs a way of {write_value(LEAST_SPAN, 'm')}, there are {way}"
     require(high - low >= LEAST_SPAN, f"{room}; correct [cylinder] stroke, or say between which positions it may move")
@@ -369,8 +369,8 @@ def _fast_move(loop: ClosedLoop, p: ParameterSet, ends: tuple[float, float], spe
     fastest = [shortest_move(loop, move, p) for move in both]
     own = GUESS_SHARE * min(move.speed for move in fastest)
     least, most = (write_value(v / GUESS_SHARE, "m/s", 3) for v in (LEAST_FAST_SPEED, own))
-    told = f"the drive moves at {most} at most, by its file, and an excitation run needs {least}"
-    require(own >= LEAST_FAST_SPEED, f"{told}; correct valve, supply and load in the drive's file")
+    message = f"the drive moves at {most} at most, by its file, and an excitation run needs {least}"
+    require(own >= LEAST_FAST_SPEED, f"{message}; correct valve, supply and load in the drive's file")
     acceleration = GUESS_SHARE**2 * min(move.acceleration for move in fastest)
     return replace(shape, speed=_round(min(own, speed)), acceleration=_round(acceleration))
 
@@ -437,16 +437,6 @@ def _simulate(loop: ClosedLoop, p: ParameterSet, moves: MoveSequence, sample_tim
     sound = bool(np.isfinite(run.y).all())
     require(sound, "the run cannot be simulated: the drive in the file meets its end stops or cannot be controlled so")
     return Trajectory(given.t, dict(zip(names(discrete.outputs), run.y[0].T, strict=True)))
-
-
-def _check_response(run: ExcitationRun) -> None:
-    """Refuse a run that leads the axis out of its stroke on the plant as guessed."""
-    position, (low, high) = run.response[run.loop.feedback.name], run.between
-    rear, front = _end_stops(run.loop.plant, run.parameters)
-    beyond = max(low - float(position.min()), float(position.max()) - high)
-    told = f"the plain controller overshoots the run by {write_value(beyond, 'm', 3)}"
-    spare = GUESS_SHARE * min(low - rear, front - high)
-    require(beyond < spare, f"{told}; allow a lower speed, or correct mass and valve in the drive's file")
 
 
 def _end_stops(plant: System, p: ParameterSet) -> tuple[float, float]:

@@ -233,8 +233,8 @@ class SettlingTime(Requirement):
 
     def __post_init__(self) -> None:
         proper = isinstance(self.band, Tolerance) or 0 < self.band < 1
-        told = f"SettlingTime: band is a fraction between 0 and 1, got {self.band}; 2 % is 0.02"
-        require(proper, f"{told}, 0.1 mm is Tolerance(1e-4)")
+        message = f"SettlingTime: band is a fraction between 0 and 1, got {self.band}; 2 % is 0.02"
+        require(proper, f"{message}, 0.1 mm is Tolerance(1e-4)")
         super().__post_init__()
 
 

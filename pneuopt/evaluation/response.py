@@ -173,8 +173,9 @@ def cases(
         require(bool(name), "a scenario needs a name: {'heavy load': {'load.mass': 8.0}}")
         check_names("parameter", values, parameters, f"scenario {name!r}")
         for n in (n for n, value in values.items() if n in tuned and not isinstance(value, Factor)):
-            told = f"scenario {name!r}: {n} is tuned, so no scenario can fix its value; for a tolerance around it write"
-            raise InputError(f"{told} tolerances(parameters, {{{n!r}: 0.01}})")
+            message = f"scenario {name!r}: {n} is tuned, so no scenario can fix its value"
+            remedy = f"for a tolerance around it write tolerances(parameters, {{{n!r}: 0.01}})"
+            raise InputError(f"{message}; {remedy}")
     nominal = [TuningCase(r) for r in references]
     return (*nominal, *(TuningCase(r, name, values) for name, values in scenarios.items() for r in references))
 

@@ -61,8 +61,8 @@ class NoHunting:
     def __post_init__(self) -> None:
         proper = 0 < self.duration < inf
         require(proper, f"NoHunting: duration must be positive and finite, got {self.duration:g} s; 60 s is usual")
-        told = f"NoHunting: repeatability must be positive, got {self.repeatability:g}; leave it out for any"
-        require(self.repeatability > 0, told)
+        message = f"NoHunting: repeatability must be positive, got {self.repeatability:g}; leave it out for any"
+        require(self.repeatability > 0, message)
 
 
 class RestKind(Enum):
@@ -222,8 +222,8 @@ def check_rest(
         raise ModelError("this rig has no controller, so it follows no reference; make it of a ClosedLoop")
     require(isfinite(duration), f"check_rest: duration must be finite, got {duration} s")
     for step in steps:
-        told = f"check_rest: duration {duration:g} s ends before the horizon of {step.label}, {step.horizon:g} s"
-        require(duration >= step.horizon - step.at, told)
+        message = f"check_rest: duration {duration:g} s ends before the horizon of {step.label}, {step.horizon:g} s"
+        require(duration >= step.horizon - step.at, message)
     loop = add_disturbances(model.loop, steps)
     rig = replace(model, model=loop) if isinstance(model, Rig) else None
     full = loop.complete(parameters)
@@ -273,7 +273,12 @@ def _read_rest(
     still = STILL_SHARE * abs(reference.nominal_size)
     kind = _kind(error, run, stands, [e for e in breaks if e.t >= middle], late, still)
     hunts, slips = kind is RestKind.HUNTS, len([e for e in breaks if e.t >= middle])
-    push = _push(run, late) if sticks else nan
+    push = nan
+    if sticks:
+        moving = np.flatnonzero(run["stuck"] == 0)
+        since = late & (np.arange(len(run.t)) > (moving[-1] if len(moving) else 0))
+        t, u = run.t[since], run["control"][since]
+        push = float((u[-1] - u[0]) / (t[-1] - t[0])) if len(t) > 1 else 0.0
     period = 2 * float(np.mean(np.diff([e.t for e in breaks if e.t >= stands[0]]))) if hunts else nan
     return RestCase(
         case.label,
@@ -302,14 +307,6 @@ def _kind(
         return RestKind.UNDECIDED
     sizes = np.abs(np.interp(stands, run.t, error))[-MIN_STANDSTILLS:]
     return RestKind.HUNTS if np.all(sizes[1:] >= MIN_KEPT_ERROR * sizes[:-1]) else RestKind.UNDECIDED
-
-
-def _push(run: Trajectory, late: Mask) -> float:
-    """Mean rate of the command while the body last sticks, in the second half [command's unit/s]."""
-    moving = np.flatnonzero(run["stuck"] == 0)
-    since = late & (np.arange(len(run.t)) > (moving[-1] if len(moving) else 0))
-    t, u = run.t[since], run["control"][since]
-    return float((u[-1] - u[0]) / (t[-1] - t[0])) if len(t) > 1 else 0.0
 
 
 def _describe(loop: ClosedLoop, p: ParameterSet, kind: RestKind, error: Array, push: float, period: float) -> str:

@@ -473,11 +473,14 @@ def axis_labels(parameters: ParameterSet, spreads: SampleSpreads) -> tuple[str, 
 
 def values_at(parameters: ParameterSet, spreads: SampleSpreads, shares: Array) -> list[dict[str, float]]:
     """Parameter values [SI] at points of a box of spreads, `shares` of its width or probability, shape (n, n_axes)."""
-    columns = {
-        n: _sample_values(parameters, n, spread, shares[:, k]).tolist()
-        for k, (names, spread) in enumerate(_axis_names(parameters, spreads).values())
-        for n in names
-    }
+    columns = dict[str, list[float]]()
+    for k, (names, spread) in enumerate(_axis_names(parameters, spreads).values()):
+        for n in names:
+            if isinstance(spread, float | int | tuple):
+                low, high = _spread_ends(parameters, n, spread)
+                columns[n] = (low + shares[:, k] * (high - low)).tolist()
+            else:
+                columns[n] = quantiles(spread, n, parameters[n], shares[:, k]).tolist()
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
@@ -565,14 +568,6 @@ def _axis_names(
             taken[name] = axis
         out[axis] = names, spread
     return out
-
-
-def _sample_values(parameters: ParameterSet, name: str, spread: Spread | Distribution, shares: Array) -> Array:
-    """The values of a parameter at these shares of its axis."""
-    if isinstance(spread, float | int | tuple):
-        low, high = _spread_ends(parameters, name, spread)
-        return np.asarray(low + shares * (high - low))
-    return quantiles(spread, name, parameters[name], shares)
 
 
 def _spread_ends(parameters: ParameterSet, name: str, spread: Spread | Distribution) -> tuple[float, float]:

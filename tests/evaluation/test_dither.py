@@ -18,7 +18,6 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.system import System
 from pneuopt.evaluation.dither import (
     DitherEffect,
     Usefulness,
@@ -32,7 +31,6 @@ from pneuopt.models.catalog import r25, t32
 from pneuopt.models.drives import ForceDrive, RotaryDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.linear import SecondOrder
-from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 
 GAINS = {"pid.Kp": 4.5, "pid.Ki": 24.6, "pid.Kd": 0.2, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.upper": 5.0}
@@ -281,29 +279,19 @@ def test_another_plant_is_judged_by_its_response_alone() -> None:
     assert np.isnan(verdict.effect.force)
 
 
-def test_no_dither_is_nothing_to_judge() -> None:
-    loop, p = paper()
-    with pytest.raises(InputError, match=r"no dither to judge: dither.amplitude is 0"):
-        judge_dither(loop, Step(0.05), p.with_values({"dither.amplitude": 0.0}))
-    with pytest.raises(InputError, match="no dither to judge: ClosedLoop"):
-        judge_dither(ClosedLoop(loop.plant, PID(), measured="speed"), Step(0.05), p)
-
-
-STEP_COMPENSATOR_VERDICT = Step(0.1, horizon=0.5)
-GAINS_COMPENSATOR_VERDICT = {"pid.Kp": 120.0, "pid.Ki": 300.0}
+RUBBING_STEP = Step(0.1, horizon=0.5)
+RUBBING_GAINS = {"pid.Kp": 120.0, "pid.Ki": 300.0}
 
 
 def rubbing(**sizes: float) -> tuple[ClosedLoop, ParameterSet]:
     """A mass with Coulomb friction, whose level the inverse of a dead zone adds to the force."""
     loop = ClosedLoop(ForceDrive(Coulomb()).system(), PID(1e-3), compensators=(DeadZoneInverse(),))
-    return loop, loop.parameters.with_values(
-        GAINS_COMPENSATOR_VERDICT | {f"dead_zone_inverse.{n}": v for n, v in sizes.items()}
-    )
+    return loop, loop.parameters.with_values(RUBBING_GAINS | {f"dead_zone_inverse.{n}": v for n, v in sizes.items()})
 
 
 def test_what_friction_takes_is_useful_where_it_is_given_back() -> None:
     loop, p = rubbing(width=18.0, smoothing=1.0)
-    found = judge_compensators(loop, STEP_COMPENSATOR_VERDICT, p)
+    found = judge_compensators(loop, RUBBING_STEP, p)
     assert found.usefulness is Usefulness.HELPS_THESE_GAINS
     assert float(found.table["with"]["SettlingTime"]) < 0.8 * float(found.table["without"]["SettlingTime"])
     assert str(found).splitlines()[0] == (
@@ -315,14 +303,11 @@ def test_what_friction_takes_is_useful_where_it_is_given_back() -> None:
 def test_against_gains_that_need_none_it_is_not() -> None:
     loop, p = rubbing(width=18.0, smoothing=1.0)
     strong = p.with_values({"pid.Kp": 900.0, "pid.Ki": 9000.0})
-    found = judge_compensators(loop, STEP_COMPENSATOR_VERDICT, p, without=strong)
+    found = judge_compensators(loop, RUBBING_STEP, p, without=strong)
     assert found.usefulness is Usefulness.HARMFUL
     assert found.baseline == "gains tuned without it"
 
 
-def test_one_of_size_zero_is_useless_and_none_cannot_be_judged(second_order: System) -> None:
+def test_one_of_size_zero_is_useless() -> None:
     loop, p = rubbing(width=0.0)
-    assert judge_compensators(loop, STEP_COMPENSATOR_VERDICT, p).usefulness is Usefulness.USELESS
-    bare = ClosedLoop(second_order, PID())
-    with pytest.raises(InputError, match=r"there is nothing to judge: .*Knocker\(\)"):
-        judge_compensators(bare, STEP_COMPENSATOR_VERDICT, bare.parameters)
+    assert judge_compensators(loop, RUBBING_STEP, p).usefulness is Usefulness.USELESS

@@ -22,7 +22,7 @@ from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.racing import Racing
@@ -143,16 +143,6 @@ def test_a_horizon_longer_than_the_stroke_allows_is_refused() -> None:
         evaluate(Rig(loop, {"position": Sensor(resolution=1e-5)}), Step(0.3, horizon=0.6), p)
     with pytest.raises(InputError, match=r"reference 0 to 0.3 \[short\]: .* there are 74.9 mm"):
         evaluate(loop, Step(0.3, horizon=0.3), p, scenarios={"short": {"cylinder.stroke": 0.15}})
-
-
-def test_bad_input_is_named() -> None:
-    loop, p = axis(Stribeck())
-    with pytest.raises(ModelError, match="follows no reference"):
-        evaluate(Rig(loop.plant, {"speed": Sensor()}), Step(0.1), p)
-    with pytest.raises(InputError, match=r"two references are '0 to 0.1'"):
-        evaluate(loop, [Step(0.1), Step(0.1, horizon=0.5)], p)
-    with pytest.raises(InputError, match="starts from position, speed and pressure_b, not from valve"):
-        evaluate(cylinder(Stribeck())[0], Step(0.1, start={"valve": 0.0}), p)
 
 
 def test_hunting_is_measured_and_a_ringing_that_dies_out_is_not() -> None:

@@ -28,7 +28,7 @@ from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.quantities.errors import InputError, ModelError
+from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import tune
@@ -263,32 +263,6 @@ def test_a_limit_of_speed_and_of_the_way_is_kept() -> None:
     assert run.fastest == 0.1
     places = run.moves.values(run.response.t)
     assert (places.min(), places.max()) == pytest.approx((0.06, 0.14))
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"speed": 0.01}, "with a speed of 10 mm/s at most does not tell .*; allow 50 mm/s or more"),
-        ({"between": (0.1, 0.11)}, "needs a way of 30 mm, there are 10 mm from 100 mm to 110 mm"),
-        ({"between": (0.0, 0.1)}, "from 0 m to 100 mm, and the end stops are at 0.1 mm and 200 mm; keep the run"),
-    ],
-)
-def test_a_run_that_shows_too_little_is_refused(given: dict[str, float], words: str) -> None:
-    drive, known = guessed()
-    with pytest.raises(InputError, match=words):
-        excitation_run(drive.system(), known, **given)  # type: ignore[arg-type]
-
-
-def test_a_drive_that_cannot_make_the_run_is_refused() -> None:
-    drive, known = guessed()
-    short = known.with_values({"cylinder.stroke": 0.04, "cylinder.start": 0.02})
-    with pytest.raises(InputError, match=r"needs a way of 30 mm, there are 19.8 mm .*; correct \[cylinder\] stroke"):
-        excitation_run(drive.system(), short)
-    weak = known.with_values({"valve.conductance": known.value("valve.conductance") / 100})
-    with pytest.raises(InputError, match=r"moves at .* mm/s at most, by its file, and an excitation run needs 0.1 m/s"):
-        excitation_run(drive.system(), weak)
-    with pytest.raises(ModelError, match="needs a drive whose valve moves an axis between two end stops"):
-        excitation_run(ForceDrive(Coulomb()).system(), ParameterSet())
 
 
 def rig_log() -> tuple[Trajectory, Rig, ParameterSet]:

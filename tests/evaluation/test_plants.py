@@ -16,7 +16,6 @@ from pneuopt.models.drives import ForceDrive, RotaryDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 RIG = ParameterSet(
@@ -78,16 +77,6 @@ def test_the_first_plants_are_those_of_a_shorter_draw() -> None:
     given = {"covariance": COVARIANCE, "estimates": ESTIMATES, "seed": 4}
     long, short = monte_carlo(RIG, 20, **given), monte_carlo(RIG, 5, **given)  # type: ignore[arg-type]
     assert list(long.items())[:5] == list(short.items())
-
-
-def test_a_draw_of_nothing_is_refused() -> None:
-    for covariance in (None, pd.DataFrame([[1.0]], ["valve.gain"], ["valve.gain"])):
-        with pytest.raises(InputError, match="nothing varies: state how a parameter spreads, or give a fit"):
-            monte_carlo(RIG, 5, covariance=covariance)
-    with pytest.raises(InputError, match="count must be at least 1, got 0"):
-        monte_carlo(RIG, 0, covariance=COVARIANCE)
-    with pytest.raises(UnknownNameError, match=r"load\.mas"):
-        monte_carlo(RIG, 5, spreads={"load.mas": 0.1})
 
 
 def parameters() -> ParameterSet:

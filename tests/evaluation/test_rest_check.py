@@ -20,7 +20,6 @@ from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import InputError, ModelError
 
 GAINS = {"pid.Kp": 5000.0, "pid.Ki": 20000.0, "pid.Kd": 200.0, "pid.Tf": 2e-3}
 FALL = {"friction.stribeck_velocity": 1e-3}
@@ -174,13 +173,3 @@ def test_a_rig_with_an_encoder_rests_within_its_count() -> None:
     found = check_rest(Rig(loop, {"position": Sensor(resolution=1e-3)}), STEP, values, duration=3.0)
     assert found.cases[0].kind is RestKind.RESTS
     assert abs(found.cases[0].error) <= 0.5e-3
-
-
-def test_bad_input() -> None:
-    smooth = ClosedLoop(ForceDrive(Coulomb()).system(), PID(), measured="position")
-    with pytest.raises(ModelError, match="has no Karnopp friction"):
-        check_rest(smooth, STEP, smooth.parameters)
-    with pytest.raises(InputError, match=r"duration 0.5 s ends before the horizon of 0 to 0.1, 1 s"):
-        watch(0.5)
-    with pytest.raises(ModelError, match="this rig has no controller"):
-        check_rest(Rig(ForceDrive(Karnopp(Coulomb())).system(), {}), STEP, smooth.parameters)

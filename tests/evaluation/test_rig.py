@@ -1,6 +1,5 @@
 """The rig: ideal hardware changes nothing, each imperfection does what it says, the log is what a rig would know."""
 
-from collections.abc import Mapping
 from itertools import pairwise
 from math import exp, pi
 
@@ -21,7 +20,6 @@ from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -201,30 +199,3 @@ def test_a_pneumatic_rig_logs_pressures() -> None:
             late.append(a * late[-1] + (1 - a) * before + a * (now - before))
         assert np.std(log[name] - late) == pytest.approx(run.experiment.noise[name], rel=0.15)
     assert np.abs(log["position"] - run.truth["position"]).max() <= 0.5e-5 + 1e-12
-
-
-def bad(values: Mapping[str, float]) -> Sensor:
-    return Sensor(**values)
-
-
-def test_bad_input_is_named() -> None:
-    loop, p = drive_loop(Karnopp(Stribeck()))
-    for name in ("lag", "noise", "resolution"):
-        with pytest.raises(InputError, match=f"Sensor: {name} must not be negative, got -1"):
-            bad({name: -1.0})
-    with pytest.raises(InputError, match="Actuator: hysteresis must not be negative"):
-        Actuator(hysteresis=-0.1)
-    with pytest.raises(InputError, match="Encoder: filter must not be negative"):
-        Encoder(filter=-1.0)
-    with pytest.raises(UnknownNameError, match=r"Rig: sensors: unknown output 'positon'; did you mean 'position'"):
-        Rig(loop, {"positon": Sensor()})
-    with pytest.raises(ModelError, match="the controller needs 'position', which no sensor measures"):
-        Rig(loop, {})
-    with pytest.raises(ModelError, match="a rig's controller is sampled"):
-        Rig(ClosedLoop(loop.plant, PID()), {"speed": Sensor()})
-    with pytest.raises(ModelError, match="a rig's dither comes from its controller"):
-        Rig(ClosedLoop(loop.plant, PID(sample_time=1e-3), Dither(analogue=True)), {"speed": Sensor()})
-    with pytest.raises(InputError, match=r"'reference' is nan at t = 0\.001 s"):
-        record(Rig(loop, REAL), Trajectory([0.0, 1e-3], {"reference": [0.0, np.nan]}), p)
-    with pytest.raises(UnknownNameError, match="Rig: actuated: unknown input 'voltage'"):
-        Rig(loop.plant, REAL, actuated="voltage")
