@@ -347,8 +347,8 @@ def _fit_states(
     problem = EstimationProblem(system, (experiment,), fixed, method)
     if window is None:
         return solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method).trajectories[0]
+    check_window(replace(problem, window=window))
     windows = replace(problem, window=window, method=replace(method, segment_time=window))
-    check_window(windows)
     fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
     return solve_least_squares(windows.transcription(windows.start_from(fit)), windows.method).trajectories[0]
 
