@@ -150,6 +150,7 @@ class _Job:
         The page shows the figure if `is_drawn`, and the controller if all cases share it; returns the exit status.
         """
         study, output = self.study, self.outputs.output
+        report = Report((Line(verdict, Tone.BAD if status else Tone.GOOD),)) + report
         hashes = file_hashes(study.path, study.drive, study.tuning)
 
         def make_page() -> Page:
@@ -164,7 +165,7 @@ class _Job:
             {"verdict": verdict, **tables, "provenance": hashes},
             Status(Code.INTERRUPTED, (verdict,)) if status == ExitStatus.INTERRUPTED else None,
             figures=lambda: {"": draw()},
-            report=Report((Line(verdict, Tone.BAD if status else Tone.GOOD),)) + report,
+            report=report,
             page=make_page,
         )
         return status

@@ -31,7 +31,7 @@ from pneuopt.files.loop import (
     read_spreads,
     signal_units_of,
 )
-from pneuopt.files.tolerances import CHECKSUM_DIGITS, MAX_CHANGES
+from pneuopt.files.tolerances import CHECKSUM_DIGITS
 from pneuopt.files.toml import read_toml, toml_table
 from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning_table
 from pneuopt.quantities.errors import UnitError
@@ -66,7 +66,7 @@ class CertificateCheck:
         return tuple(f"NOT CERTIFIED: {reason}" for reason in self.reasons)
 
 
-def check_certificate(fit: StoredFit, tuned: str | Path) -> CertificateCheck | None:
+def check_certificate(fit: StoredFit, tuned: str | Path, most: int = 8) -> CertificateCheck | None:
     """Whether the certificate in a tuned.toml holds, and if not, what was changed; None for a file without one."""
     table = read_toml(tuned).unwrap()
     if not any(name in table for name in TUNED_SECTIONS):
@@ -85,8 +85,8 @@ def check_certificate(fit: StoredFit, tuned: str | Path) -> CertificateCheck | N
     kept = {part: own.get("hash") for part, own in stored.items() if isinstance(own, dict)}
     others = [part for part, now in parts.items() if kept.get(part) != _digest(now)[:16]]
     changes = changes or [f"its {part} was changed, and its [checksum] with it" for part in others]
-    more = f"and {len(changes) - MAX_CHANGES} more changes"
-    told_changes = changes[:MAX_CHANGES] + ([more] if len(changes) > MAX_CHANGES else [])
+    more = f"and {len(changes) - most} more changes"
+    told_changes = changes[:most] + ([more] if len(changes) > most else [])
     return CertificateCheck(False, (*ended, *(told_changes or ["its [checksum] was edited, or is damaged"])))
 
 

@@ -2,8 +2,6 @@
 
 CHECKSUM_DIGITS = 12
 """Significant digits of a number in the checksum: fewer miss an edit, more depend on the last bit of a conversion."""
-MAX_CHANGES = 8
-"""Changes that are told one by one, at most: more bury the first; a fit of other logs changes every estimate."""
 COVARIANCE_ROUNDING = 1e-8
 """Asymmetry of a covariance, over the deviations of its row and column [1]: a file that was rounded by hand; more
 is another matrix."""

@@ -5,7 +5,6 @@ import re
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 import tomlkit
 
@@ -31,10 +30,6 @@ tuning = "tuned.toml"
 count = 2
 fit = true
 """
-T = 0.01 * np.arange(300)
-U = np.sign(np.sin(3 * T))
-ROWS = (f"{t:.2f},{u:.1f},{0.12 * u * (1 - np.exp(-((t * 3) % np.pi) / 0.6)):.4f}" for t, u in zip(T, U, strict=True))
-LOG = "\n".join(["time [s],valve_voltage [V],speed [m/s]", *ROWS])
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +156,6 @@ def test_the_best_of_a_refused_tuning_has_its_own_gains_and_no_certificate(place
         "study study.toml --report page.html --executor 1",
         "next-experiment fit.toml --duration 1s --sample-time 10ms --limit valve_voltage=-1V..1V --budget 1 "
         "--noise speed=1mm/s --report page.html",
-        "track fit.toml a.csv b.csv c.csv d.csv --dates 2026-01-01,2026-01-08,2026-01-15,2026-01-22 --tuned tuned.toml",
     ],
 )
 def test_a_fit_is_parsed_once_a_command(place: Path, command: str, parsed: list[str]) -> None:
@@ -171,7 +165,5 @@ def test_a_fit_is_parsed_once_a_command(place: Path, command: str, parsed: list[
         uncertain = '[estimates]\n"plant.gain" = { value = 0.12, stderr = 1e-3 }\n'
         edit(place / "fit.toml", "[plant]", f"{uncertain}[plant]")
         Path("study.toml").write_text(STUDY, "utf-8")
-        for log in "abcd":
-            Path(f"{log}.csv").write_text(LOG, "utf-8")
     assert run(command).exit_code in (0, 1)
     assert parsed.count(Path("fit.toml").read_text("utf-8")) == 1
