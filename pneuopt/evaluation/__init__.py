@@ -1,8 +1,7 @@
 """What a loop is worth, without any optimiser: simulated responses, metrics, margins, limit cycles, air and energy.
 
-`certificate` says what holds of a design, and what is shared with the search that found it: the model and the metrics'
-definitions, and no step of the search; `evaluate` gives its metrics.
-So this room imports neither shooting nor tuning, and no models; identification, tuning, studies and what is above them
-may import it. A newcomer adds a requirement: a class with its `Metric` in a file of its own (`energy.py` shows one) and
-a row of `REQUIREMENT_KINDS` in `requirements.py`; files, tables and searches read that row.
+Read `certificate.py` first: it says what holds of a design, and what is shared with the search that found it: the model
+and the metrics' definitions, and no step of the search. So this room imports neither shooting nor tuning, and no
+models; identification, tuning, studies and what is above them may import it. A newcomer adds a requirement: a class
+with its `Metric` in `requirements.py`, and a row of `REQUIREMENT_KINDS` there, which files, tables and searches read.
 """
