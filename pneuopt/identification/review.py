@@ -46,7 +46,7 @@ from pneuopt.identification.tolerances import (
     MODEL_ERROR_LEVEL,
     PROFILE_DRAG_DEVIATIONS,
     RESIDUAL_BLOCK_SAMPLES,
-    TRIAL_ITERATIONS,
+    TRIAL_FIT_ITERATIONS,
     WHOLE_SHARE,
 )
 from pneuopt.identification.widths import advise_widths
@@ -397,7 +397,7 @@ def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -
 
 def _search_freed(freed: EstimationProblem, fit: Fit, allowed: float) -> Fit | None:
     """A short search with a value freed; None where its squares a sample would stay above those that are allowed."""
-    *others, last = (replace(stage, iterations=TRIAL_ITERATIONS) for stage in freed.method.stages[1:])
+    *others, last = (replace(stage, iterations=TRIAL_FIT_ITERATIONS) for stage in freed.method.stages[1:])
     method = replace(freed.method, max_misfit=allowed, allows_state_noise=False)
     found = fit
     for stages in ((*others, replace(last, refine=1)), (replace(last, iterations=LAST_TRIAL_ITERATIONS),)):
