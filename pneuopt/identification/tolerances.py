@@ -98,7 +98,10 @@ MIN_REPORTED_GAP = 1e-4  # [nominal sizes] of a state: smaller gaps are integrat
 MIN_PROMISED_SHARE = 0.5  # [1] of the misfit that a freed value must explain by the linearised equations to be tried
 MIN_EXPLAINED_SHARE = 0.8  # [1] the same by a fit, to be named
 WHOLE_SHARE = 0.98  # [1] of the misfit, from which a value explains all of it
-TRIAL_FIT_ITERATIONS, LAST_TRIAL_ITERATIONS = 4, 10  # of a trial's stages: a value that explains the logs took 17 in all
+TRIAL_FIT_ITERATIONS, LAST_TRIAL_ITERATIONS = (
+    4,
+    10,
+)  # of a trial's stages: a value that explains the logs took 17 in all
 MAX_FREED_TRIALS, MAX_TESTS = 2, 2  # values that are tried in a test, and tests of one problem
 MIN_RELATIVE_CHANGE = 0.03  # [1] of a wrong value: a Coulomb law at a Stribeck curve asks for 1.3 % of the mass
 ALIKE_SQUARES = 20.0  # [variances of the residuals] above the best, up to which logs do not tell two values apart
