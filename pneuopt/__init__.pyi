@@ -2,7 +2,6 @@
 
 from . import plotting
 from .control.averaging import average_dither, mean_start, ripple
-from .control.bumpless import bumpless_transfer
 from .control.compensators import (
     AccelerationFeedback,
     DeadZoneInverse,
@@ -17,7 +16,7 @@ from .control.controller import Feedforward, PositionLoop
 from .control.dither import Dither, Waveform
 from .control.gain_schedule import GainSchedule
 from .control.linear_loop import linear_plant, open_loop
-from .control.loop import ClosedLoop
+from .control.loop import ClosedLoop, bumpless_transfer
 from .control.moves import MotionPath, Move, MoveProfile, MoveSequence
 from .control.pid import (
     PID,
@@ -48,7 +47,7 @@ from .evaluation.dither import (
     judge_dither,
 )
 from .evaluation.evaluate import evaluate, respond
-from .evaluation.limit_cycle import LimitCycle, find_limit_cycle
+from .evaluation.limit_cycle import LimitCycle, NoHunting, RestCase, RestCheck, RestKind, check_rest, find_limit_cycle
 from .evaluation.margins import Margins, frequency_response, margins
 from .evaluation.metric import Tolerance
 from .evaluation.metrics import BandCentre, step_metrics
@@ -78,7 +77,6 @@ from .evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from .evaluation.rest_check import NoHunting, RestCase, RestCheck, RestKind, check_rest
 from .evaluation.rig import Actuator, Recording, Rig, Sensor, record
 from .evaluation.scenarios import (
     Factor,
@@ -94,26 +92,23 @@ from .evaluation.scenarios import (
     tolerances,
 )
 from .experiments.design import AOptimal, DOptimal, ExperimentDesign, Precision, WantedPrecision
-from .experiments.next_experiment import next_experiment
-from .experiments.outlook import DesignOutlook, predict_loss
+from .experiments.next_experiment import DesignOutlook, next_experiment, predict_loss
 from .export.blocks import export_settings
 from .export.fmu import export_fmu
 from .export.languages import Language, export_controller
 from .export.makers import Block
 from .files.drive import read_drive, write_fit
-from .files.results import load_result
+from .files.outputs import load_result
 from .files.tuned import write_tuned
 from .files.tuning import read_path, read_tuning
 from .identification.checkup import Assumption, Checkup, check
-from .identification.compare_logs import LogComparison, compare_logs
-from .identification.examination import examine_logs
-from .identification.identifiability import identifiability
+from .identification.identifiability import examine_logs, identifiability
 from .identification.identify import identify, predict, validate
 from .identification.losses import Huber, SoftL1
 from .identification.profiles import Profile, PropagatedValue, profile, propagate_error
 from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
 from .identification.select_model import ModelSelection, select_model
-from .identification.tracking import Tracking, track
+from .identification.tracking import LogComparison, Tracking, compare_logs, track
 from .logs.doctor import LogFinding, Severity
 from .logs.experiment import Experiment, differentiate, resample, split
 from .logs.read_log import read_log
@@ -123,15 +118,15 @@ from .models.drives import ForceDrive, MotionDrive, RotaryDrive
 from .models.friction import (
     Asymmetric,
     Coulomb,
+    Karnopp,
     LoadDependent,
     LuGre,
     Presliding,
     PressureDependent,
     Stribeck,
     Viscous,
+    friction_ladder,
 )
-from .models.friction_laws import friction_ladder
-from .models.karnopp import Karnopp
 from .models.linear import FirstOrder, Integrator, SecondOrder
 from .models.load import Load
 from .models.pneumatic.chamber import Polytropic, Thermal
@@ -145,8 +140,7 @@ from .plotting.diagram import plot_loop
 from .plotting.fits import plot_correlation, plot_fit, plot_friction, plot_prediction, plot_residuals
 from .plotting.logs import plot_logs
 from .plotting.loops import plot_bode, plot_steps
-from .plotting.plans import plot_tracking
-from .plotting.studies import plot_distribution, plot_front, plot_map, plot_sensitivity
+from .plotting.studies import plot_distribution, plot_front, plot_map, plot_sensitivity, plot_tracking
 from .quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from .quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
 from .quantities.report import Report
@@ -159,15 +153,20 @@ from .studies.batch import BatchEvaluation, evaluate_batch
 from .studies.bootstrap import Bootstrap, bootstrap
 from .studies.executors import Processes, open_executor
 from .studies.journal import Journal, RowFile
-from .studies.neighbours import search_again, sweep_from_neighbours
-from .studies.sensitivity import LocalSensitivity, Sensitivity, local_sensitivity, sensitivity
+from .studies.sensitivity import (
+    LocalSensitivity,
+    Sensitivity,
+    local_sensitivity,
+    search_again,
+    sensitivity,
+    sweep_from_neighbours,
+)
 from .studies.sweep import grid, read_cases, sweep
 from .tuning.front import pareto_front
 from .tuning.racing import Racing
-from .tuning.tune import TuningResult, certify, tune
+from .tuning.tune import TuningResult, certify, tune, tune_without_dither
 from .tuning.two_phase import TwoPhase
 from .tuning.validation import DesignValidation, validate_design
-from .tuning.without_dither import tune_without_dither
 
 __version__: str
 __all__ = [

@@ -8,15 +8,14 @@ from typing import Any
 import typer
 
 from pneuopt.cli.init import write_files
-from pneuopt.cli.run import ExitStatus
-from pneuopt.cli.shared import make_console, read_fit_and_tuning, show_output_files, warn
+from pneuopt.cli.shared import ExitStatus, make_console, read_fit_and_tuning, show_output_files, warn
 from pneuopt.export.blocks import export_settings
 from pneuopt.export.fmu import export_fmu
 from pneuopt.export.languages import Language, export_controller
 from pneuopt.export.makers import Block
-from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.toml import read_toml
+from pneuopt.files.tuned import CertificateCheck, check_certificate
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import read_toml_source
 from pneuopt.quantities.units import difference_unit, read_value

@@ -32,7 +32,7 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import DRIVE_KINDS, stick_slip_drive
-from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
+from pneuopt.models.friction import friction_ladder, usual_unknowns
 from pneuopt.plotting import (
     has_friction_map,
     plot_correlation,

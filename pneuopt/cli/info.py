@@ -13,10 +13,9 @@ from itertools import groupby
 import numpy as np
 import typer
 
-from pneuopt.cli.run import ExitStatus
-from pneuopt.cli.shared import make_console, show_pairs
+from pneuopt.cli.shared import ExitStatus, make_console, show_pairs
 from pneuopt.dynamics.compiled.compiler import COMPILER_FLAGS, cache_directory, cached_libraries, find_compiler
-from pneuopt.dynamics.compiled.self_check import check_machine_code
+from pneuopt.dynamics.compiled.rollout import check_machine_code
 from pneuopt.dynamics.system import discretise, parameter_vector
 from pneuopt.files.keys import FILE_MEANINGS, KeyRow, list_keys
 from pneuopt.files.outputs import OUTPUTS, describe_member, describe_outputs

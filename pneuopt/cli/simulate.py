@@ -15,8 +15,8 @@ from pneuopt.cli.shared import (
 )
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.evaluate import evaluate, metric_limits, relevant_units, report_metrics
-from pneuopt.files.certificate import CertificateCheck, check_certificate
 from pneuopt.files.drive import StoredFit
+from pneuopt.files.tuned import CertificateCheck, check_certificate
 from pneuopt.files.tuning import Tuning
 from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
+    ExitStatus,
     Outputs,
     add_to_stem,
     describe_status,
@@ -68,11 +68,15 @@ from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Page
 from pneuopt.report.tuning_page import study_page
 from pneuopt.studies.batch import LANE_METRICS, evaluate_batch
-from pneuopt.studies.executors import Processes, open_executor
+from pneuopt.studies.executors import INTERRUPTED_CASE, Processes, open_executor
 from pneuopt.studies.journal import PARQUET, Journal, RowFile, parquet_bytes
-from pneuopt.studies.neighbours import sweep_from_neighbours
-from pneuopt.studies.outcome import INTERRUPTED_CASE
-from pneuopt.studies.sensitivity import LocalSensitivity, Sensitivity, local_sensitivity, sensitivity
+from pneuopt.studies.sensitivity import (
+    LocalSensitivity,
+    Sensitivity,
+    local_sensitivity,
+    sensitivity,
+    sweep_from_neighbours,
+)
 from pneuopt.studies.sweep import (
     SAMPLE_TIME_AXIS,
     evaluate_at_sample_time,

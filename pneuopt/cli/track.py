@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.cli.identify import read_experiments, read_free_drive
-from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
+    ExitStatus,
     Outputs,
     Writers,
     file_hashes,
@@ -23,8 +23,7 @@ from pneuopt.cli.shared import (
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
 from pneuopt.experiments.design import AOptimal, DOptimal, ExperimentDesign
-from pneuopt.experiments.next_experiment import next_experiment
-from pneuopt.experiments.outlook import DesignOutlook, predict_loss
+from pneuopt.experiments.next_experiment import DesignOutlook, next_experiment, predict_loss
 from pneuopt.files.drive import read_fit
 from pneuopt.files.tuning import read_tuning
 from pneuopt.identification.identify import identify

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.cli.run import interruption_status
 from pneuopt.cli.shared import (
     BEST_STEM,
     Outputs,
@@ -15,6 +14,7 @@ from pneuopt.cli.shared import (
     describe_status,
     file_hashes,
     finish,
+    interruption_status,
     make_console,
     progress,
     read_fit_and_tuning,
@@ -42,8 +42,7 @@ from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Page, report_exports
 from pneuopt.report.tuning_page import LoopView, tuning_page
 from pneuopt.tuning.result import report_tuning
-from pneuopt.tuning.tune import TuningResult, certify, tune
-from pneuopt.tuning.without_dither import tune_without_dither
+from pneuopt.tuning.tune import TuningResult, certify, tune, tune_without_dither
 
 if TYPE_CHECKING:
     import pandas as pd

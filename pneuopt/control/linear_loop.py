@@ -16,11 +16,10 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from pneuopt.control.averaging import AveragedPlant
+from pneuopt.control.averaging import AveragedPlant, linear_controller, operating_point
 from pneuopt.control.compensators import ControllerSnapshot
 from pneuopt.control.controller import Controller
 from pneuopt.control.dither import DITHER_OFFSET
-from pneuopt.control.linear_controller import linear_controller, operating_point
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag, Signals
 from pneuopt.control.tolerances import LARGEST_TAYLOR_NORM, TAYLOR_TERMS

@@ -139,7 +139,7 @@ def simulate_stick_slip(
     --------
     >>> from pneuopt.models.drives import ForceDrive
     >>> from pneuopt.models.friction import Coulomb
-    >>> from pneuopt.models.karnopp import Karnopp
+    >>> from pneuopt.models.friction import Karnopp
     >>> drive = ForceDrive(Karnopp(Coulomb())).system()
     >>> push = Trajectory([0.0, 0.1, 0.2, 0.9], {"force": [29.0, 65.0, 29.0, 29.0]})
     >>> run = simulate_stick_slip(drive, push, drive.parameters)

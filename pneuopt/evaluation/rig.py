@@ -277,7 +277,7 @@ def record(
     --------
     >>> from pneuopt.models.drives import ForceDrive
     >>> from pneuopt.models.friction import Coulomb
-    >>> from pneuopt.models.karnopp import Karnopp
+    >>> from pneuopt.models.friction import Karnopp
     >>> rig = Rig(ForceDrive(Karnopp(Coulomb())).system(), {"position": Sensor(resolution=1e-3)})
     >>> push = Trajectory([0.0, 0.1, 0.2, 0.3], {"force": [29.0, 65.0, 65.0, 29.0]})
     >>> run = record(rig, push, rig.plant.parameters)

@@ -6,6 +6,7 @@ from math import inf
 from types import MappingProxyType
 from typing import Any
 
+from pneuopt.evaluation.limit_cycle import NoHunting
 from pneuopt.evaluation.metric import Band, Tolerance
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
@@ -22,7 +23,6 @@ from pneuopt.evaluation.requirements import (
     upper_limit,
     with_upper_limit,
 )
-from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.tolerances import STABILITY_SENSITIVITY, TAIL_SHARE
 from pneuopt.quantities.errors import require
 

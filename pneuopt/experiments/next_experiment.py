@@ -5,32 +5,620 @@ nearly, so a library of them, from slow ramps to presliding wiggles, is simulate
 exchanged until no exchange helps (V. V. Fedorov, Theory of Optimal Experiments, 1972). The whole run is then refined
 block by block with random changes, since limits, sticking and a run's memory leave no useful gradient of the whole;
 only what keeps every limit at every sample, for every plant that is thought possible, is taken.
+
+`DesignSearch`: blocks of an excitation by exchange, then refined whole; what is best is an `ExperimentDesign`.
+
+A short run is simulated in a fraction of the time: the search also begins with a quarter of the duration, whose
+information counts four times. Where that does better, it is refined, played twice in a row, and refined again.
+
+A `Block` is a stretch of a planned excitation, a wave about a level. A `PlannedRun` simulates many candidates at once
+in SIMD lanes, with their limits and their information: that of the log that the run would leave, the plant's command
+and its measured outputs. So a loop only makes the run; it is the plant that is identified, along short segments whose
+sensitivities are chained, the start state eliminated, as `identify` does.
+
+`predict_loss`: what a tuned loop is worth as its plant drifts, and when it violates a requirement.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Reference
+from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runnable import HasSystem, as_runnable, check_smooth
-from pneuopt.dynamics.system import names
+from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
+from pneuopt.evaluation.certificate import certificate
+from pneuopt.evaluation.requirements import larger_is_better, metric_name, requirement_values
 from pneuopt.evaluation.scenarios import draws as draw_plants
 from pneuopt.evaluation.scenarios import further, generator
-from pneuopt.experiments.design import Criterion, DOptimal, ExperimentDesign
-from pneuopt.experiments.search import DesignSearch, Judge, Limits, PlannedRun, value_size
-from pneuopt.experiments.tolerances import MAX_SAMPLES, MAX_WRONG, MIN_BLOCK_SAMPLES
+from pneuopt.evaluation.specification import Objective, Specification, specify
+from pneuopt.experiments.design import Criterion, DOptimal, ExperimentDesign, linked_information, tabulate_design
+from pneuopt.experiments.tolerances import (
+    ALL_BLOCKS,
+    ALL_BLOCKS_SPREAD,
+    AMPLITUDES,
+    BATCH_SAMPLES,
+    BEGIN_SHARE,
+    BLOCKS,
+    CHIRP_RATIO,
+    COPIED_BLOCK,
+    CYCLES_A_SAMPLE,
+    FREQUENCIES,
+    FRESH_BLOCK,
+    LEAST_AMPLITUDE,
+    LEVEL_SHARE,
+    MAX_SAMPLES,
+    MAX_WRONG,
+    MIN_BLOCK_SAMPLES,
+    MIN_GAIN,
+    MIN_SUBSTEPS,
+    MOST_REPEATS,
+    ONE_BLOCK,
+    PART_SHARE,
+    QUIET_CYCLES,
+    QUIET_ROUNDS,
+    ROUNDS_A_SPREAD,
+    SLACK,
+    SPREADS,
+    VAGUE,
+    VARIATIONS,
+)
+from pneuopt.identification.logged_loop import REFERENCE_CHANNELS
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ModelError, check_names, require
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.identification.tracking import Tracking
+from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.quantities.errors import InputError, ModelError, check_names, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.report import Column, Line, Report, Table, Tone, format_number
+from pneuopt.quantities.results import Shown
 from pneuopt.quantities.status import Progress, ProgressReporter
-from pneuopt.shooting.least_squares import CpuBudget
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
+from pneuopt.shooting.least_squares import CpuBudget, LeastSquares
+from pneuopt.shooting.segments import Segments, gap_scales, segment, stable_substeps, start_nodes
+from pneuopt.shooting.transcription import Phase, Transcription
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     import pandas as pd
+
+
+class Wave(Enum):
+    """The form of a block."""
+
+    SINE = "sine"
+    TRIANGLE = "triangle"
+    SQUARE = "square wave"
+    CHIRP = "chirp"
+
+
+@dataclass(frozen=True)
+class Block:
+    """A wave about a level.
+
+    Attributes
+    ----------
+    wave : Wave
+    amplitude : float
+        Peak [unit of the excitation].
+    frequency : float
+        [Hz]; a chirp's first one.
+    level : float
+        About which it goes, counted from the start of the run [unit of the excitation].
+    """
+
+    wave: Wave
+    amplitude: float
+    frequency: float
+    level: float = 0.0
+
+    def samples(self, t: Array) -> Array:
+        """The wave at instants of the block, shape (n,), without its level; it begins at zero, but for a square one."""
+        phase = self.frequency * t
+        if self.wave is Wave.CHIRP:
+            rate = math.log(CHIRP_RATIO) / (t[-1] or 1.0)
+            phase = self.frequency * np.expm1(rate * t) / rate
+        if self.wave is Wave.TRIANGLE:
+            return np.asarray(self.amplitude * (1 - 4 * np.abs((phase + 0.25) % 1.0 - 0.5)))
+        sine = np.sin(2 * np.pi * phase)
+        return np.asarray(
+            self.amplitude * (np.where(phase % 1.0 < 0.5, 1.0, -1.0) if self.wave is Wave.SQUARE else sine)
+        )
+
+    def describe(self, unit: str) -> str:
+        """The block in words, "sine of 2 mm at 5 Hz"."""
+        speed = f", {self.frequency:.3g} to {CHIRP_RATIO * self.frequency:.3g} Hz"
+        pace = speed if self.wave is Wave.CHIRP else f" at {self.frequency:.3g} Hz"
+        level = f" about {write_value(self.level, unit, 3)}" if self.level else ""
+        return f"{self.wave.value} of {write_value(self.amplitude, unit, 3)}{pace}{level}"
+
+
+def join_blocks(blocks: Sequence[Block], t: Array) -> Array:
+    """The excitation of equally long blocks, counted from its start, shape (n,); levels are joined smoothly."""
+    out = np.empty(len(t))
+    edges = np.linspace(0, len(t), len(blocks) + 1).round().astype(int)
+    level = 0.0
+    for block, (begin, end) in zip(blocks, itertools.pairwise(edges.tolist()), strict=True):
+        own = t[begin:end] - t[begin]
+        way = np.clip(own / (LEVEL_SHARE * own[-1]), 0, 1) if own[-1] > 0 else np.ones_like(own)
+        out[begin:end] = level + (block.level - level) * (1 - np.cos(np.pi * way)) / 2 + block.samples(own)
+        level = block.level
+    return out
+
+
+def library(amplitude: float, duration: float, sample_time: float) -> list[Block]:
+    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps."""
+    fastest = max(CYCLES_A_SAMPLE / sample_time, 2 / duration)
+    sizes = amplitude * np.geomspace(LEAST_AMPLITUDE, 1.0, AMPLITUDES)
+    paces = np.geomspace(1 / duration, fastest, FREQUENCIES)
+    waves = [Block(w, a, f) for w, a, f in itertools.product(Wave, sizes.tolist(), paces.tolist())]
+    return [b for b in waves if b.wave is not Wave.CHIRP or CHIRP_RATIO * b.frequency <= fastest]
+
+
+def vary(block: Block, rng: np.random.Generator, spread: float, amplitude: float, ends: tuple[float, float]) -> Block:
+    """A block near another one, its numbers moved by about `spread` of themselves, its level by that of the range."""
+    size, pace, shift = rng.standard_normal(3) * spread
+    level = block.level + shift * amplitude * 0.3 if rng.random() < 0.5 else block.level
+    wave = list(Wave)[rng.integers(len(Wave))] if rng.random() < 0.15 else block.wave
+    return Block(
+        wave,
+        min(block.amplitude * math.exp(size), amplitude),
+        float(np.clip(block.frequency * math.exp(pace), *ends)),
+        float(np.clip(level, -amplitude, amplitude)),
+    )
+
+
+def vary_run(
+    run: Sequence[Block],
+    rng: np.random.Generator,
+    spread: float,
+    reach: tuple[float, float],
+    ends: tuple[float, float],
+    fresh: Sequence[Block],
+) -> list[Block]:
+    """A run near another one: mostly with one block changed, else with all, with one exchanged, copied or moved.
+
+    Small changes alone stay where the exchange of separate blocks began: what a block tells depends on its neighbours.
+    """
+    changed, amplitude = list(run), max(abs(v) for v in reach)
+    k, j = (int(n) for n in rng.integers(len(run), size=2))
+    kind, size = rng.random(), spread * rng.random()
+    if kind < ONE_BLOCK:
+        changed[k] = vary(run[k], rng, size, amplitude, ends)
+    elif kind < ALL_BLOCKS:
+        changed = [vary(b, rng, ALL_BLOCKS_SPREAD * spread, amplitude, ends) for b in run]
+    elif kind < FRESH_BLOCK:
+        level = float(rng.uniform(*reach) * rng.random())
+        changed[k] = replace(fresh[int(rng.integers(len(fresh)))], level=level)
+    elif kind < COPIED_BLOCK:
+        changed[k] = vary(run[j], rng, size, amplitude, ends)
+    else:
+        changed[k], changed[j] = run[j], run[k]
+    return changed
+
+
+Limits = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRun:
+    """The plant, or the loop that moves it, as a planned experiment runs it."""
+
+    plant: System
+    loop: ClosedLoop | None
+    free: tuple[str, ...]  # parameters of the plant whose information counts
+    per_log: tuple[str, ...]  # free ones that each log has for itself, which are eliminated
+    noise: Mapping[str, float]  # of the outputs that will be logged [unit]
+    limits: Limits  # of outputs, states, the command or the reference
+    sample_time: float  # [s]
+    start: Mapping[str, float]  # outputs at the rest from which each run begins
+    origin: float = 0.0  # the excitation there [its unit]
+
+    @cached_property
+    def command(self) -> Quantity:
+        """The plant's input."""
+        require(len(self.plant.inputs) == 1, _SEVERAL_INPUTS.format(", ".join(names(self.plant.inputs))), ModelError)
+        return self.plant.inputs[0]
+
+    @cached_property
+    def excited_quantity(self) -> Quantity:
+        """What is excited: the loop's reference as logs name it, or the plant's command."""
+        if self.loop is None:
+            return self.command
+        seen = self.loop.feedback
+        name = REFERENCE_CHANNELS.get(seen.name, f"{seen.name}_reference")
+        return Quantity(name, seen.unit, seen.nominal)
+
+    @property
+    def channels(self) -> tuple[Quantity, ...]:
+        """What a run shows: the excitation, the command, the plant's outputs, then states that are no outputs."""
+        shown = [self.excited_quantity, self.command, *self.plant.outputs, *self.plant.states]
+        return tuple({q.name: q for q in reversed(shown)}[n] for n in dict.fromkeys(names(shown)))
+
+    def rest_excitation(self, parameters: ParameterSet) -> float:
+        """The excitation at the start: the reference there, or the command that holds the plant at rest."""
+        if self.loop is not None:
+            return self.start.get(self.loop.feedback.name, 0.0)
+        hook, known = self.plant.rest_hook, self.plant.parameters | parameters
+        return 0.0 if hook is None else hook(known, self.start).inputs.get(self.command.name, 0.0)
+
+    def excited_limits(self) -> tuple[float, float]:
+        """The range of the excitation; a reference has that of its output if none of its own."""
+        name = self.excited_quantity.name
+        given = [n for n in (name, self.loop.feedback.name if self.loop else name) if n in self.limits]
+        ends = self.limits[given[0]] if given else (-math.inf, math.inf)
+        finite = math.isfinite(ends[0]) and math.isfinite(ends[1])
+        require(finite, f"limits: give the least and greatest value of {name!r}, which is excited")
+        return ends
+
+    def rest(self, parameters: ParameterSet) -> Array:
+        """The state from which a run begins, shape (n_states,)."""
+        if self.loop is None:
+            return self.plant.rest_state(parameters, self.start)
+        others = {n: v for n, v in self.start.items() if n != self.loop.feedback.name}
+        return self.loop.initial(parameters, reference=self.rest_excitation(parameters), start=others)
+
+    def simulate(self, signals: Array, parameters: ParameterSet, substeps: int) -> Array:
+        """Run excitations of shape (m, n), counted from the start; returns all `channels`, shape (m, n, n_channels)."""
+        m, n = signals.shape
+        size, given = max(1, BATCH_SAMPLES // n), signals[:, :, None] + self.origin
+        p, x0 = parameter_vector((self.loop or self.plant).parameters, parameters), self.rest(parameters)
+        t, h = np.arange(n) * self.sample_time, np.full(n, self.sample_time)
+        parts = []
+        for u in np.split(given, range(size, m, size)):
+            run = self._run.run(np.tile(x0, (len(u), 1)), u, p, t, h, substeps=substeps, states=1)
+            assert run.x is not None
+            held = run.y[:, :, -1:] if self.loop is not None else u
+            columns = {self.excited_quantity.name: u[..., 0], self.command.name: held[..., 0]}
+            columns |= {s: run.x[:, :, i] for i, s in enumerate(names(self.plant.states))}
+            columns |= {y: run.y[:, :, i] for i, y in enumerate(names(self.plant.outputs))}
+            parts.append(np.stack([columns[q.name] for q in self.channels], axis=2))
+        return np.concatenate(parts)
+
+    def violations(self, runs: Array, parameters: ParameterSet) -> Mapping[str, Array]:
+        """How far each run leaves each limit, as a share of its width, shape (m,); below zero: the room left."""
+        out, position = {}, {q.name: i for i, q in enumerate(self.channels)}
+        for name, (low, high) in self.all_limits(parameters).items():
+            values = runs[:, :, position[name]]
+            with np.errstate(invalid="ignore"):
+                beyond = np.maximum(low - values.min(axis=1), values.max(axis=1) - high)
+            width = high - low if np.isfinite(high - low) else max(abs(v) for v in (low, high) if np.isfinite(v))
+            out[name] = np.where(np.isfinite(values).all(axis=1), beyond / width, np.inf)
+        return out
+
+    def all_limits(self, parameters: ParameterSet) -> Limits:
+        """The given limits, and those of the plant's equations: the ends of the stroke, a vacuum."""
+        out: dict[str, tuple[float, float]] = {n: (float(low), float(high)) for n, (low, high) in self.limits.items()}
+        whole = self.plant.parameters | parameters
+        for limit in self.plant.validity_limits:
+            low, high = out.get(limit.state, (-np.inf, np.inf))
+            end = float(limit.limit(whole))
+            out[limit.state] = (low, min(high, end)) if limit.side > 0 else (max(low, end), high)
+        return out
+
+    def information(self, runs: Array, parameters: ParameterSet, substeps: int) -> Array:
+        """What `identify` will know of the free parameters from the log of each run, in their units; (m, k, k)."""
+        m, n = runs.shape[:2]
+        size = max(1, BATCH_SAMPLES // n)
+        parts = [self._information(runs[i : i + size], parameters, substeps) for i in range(0, m, size)]
+        k = len(self.free)
+        return np.concatenate(parts) if parts else np.zeros((0, k, k))
+
+    def _information(self, runs: Array, parameters: ParameterSet, substeps: int) -> Array:
+        m, n = runs.shape[:2]
+        method = LeastSquares()  # as `identify` places its nodes and weighs its gaps in the end
+        length = max(2, round(method.segment_time / self.sample_time))
+        count = -(-n // length)
+        padded = np.pad(runs, ((0, 0), (0, count * length - n), (0, 0)), mode="edge")
+        cut = padded.reshape(m * count, length, -1)
+        x = cut[:, 0, self._positions(self.plant.states)]
+        grid = np.arange(count * length) * self.sample_time
+        real = np.tile((np.arange(len(grid)) < n).reshape(count, -1), (m, 1))
+        t, h = np.tile(grid.reshape(count, -1), (m, 1)), np.where(real, self.sample_time, 0.0)
+        weight = np.array([1 / self.noise[q.name] if q.name in self.noise else 0.0 for q in self.plant.outputs])
+        u, p = cut[:, :, self._positions([self.command])], parameter_vector(self.plant.parameters, parameters)
+        blank = np.where(real[..., None], 0.0, np.nan) + np.zeros(len(weight))
+        found = self._sensitivities.gram(x, u, p, t, h, blank, np.broadcast_to(weight, blank.shape), substeps=substeps)
+        grams = found.grams[:, :-1, :-1].reshape(m, count, *found.grams[0, :-1, :-1].shape)
+        ends = found.dx_end.reshape(m, count, *found.dx_end.shape[1:])
+        good = np.isfinite(grams).all(axis=(1, 2, 3)) & np.isfinite(ends).all(axis=(1, 2, 3))
+        known = self.plant.parameters | parameters  # by whose sizes numbers of all units meet in one matrix
+        own = np.array([abs(known.value(n)) or 1.0 for n in (*self.per_log, *self.free)])
+        nominal = np.array([q.nominal for q in self.plant.states])
+        scale = np.concatenate([nominal, own])
+        jumps = method.stages[-1].gap * gap_scales(self._segments_about_rest(parameters), LeastSquares().kinematic)
+        out = np.zeros((m, len(self.free), len(self.free)))
+        kept = own[len(self.per_log) :]
+        given = grams[good] * np.outer(scale, scale), ends[good] * scale / nominal[:, None]
+        out[good] = linked_information(*given, jumps, len(self.per_log)) / np.outer(kept, kept)
+        return out
+
+    def stable_substeps(self, parameters: ParameterSet) -> int:
+        """Integration steps a sample that are stable about the rest, at every state's usual size."""
+        if not self.plant.states:
+            return 1
+        segments = self._segments_about_rest(parameters)
+        q = np.array([v.value for v in segments.transcription.parameters.values()])
+        return max(MIN_SUBSTEPS, 2 * stable_substeps(segments, start_nodes(segments), q, RK4_MAX_H_LAMBDA))
+
+    def _segments_about_rest(self, parameters: ParameterSet) -> Segments:
+        x = self.plant.rest_state(self.plant.parameters | parameters, self.start)
+        usual = np.diag([q.nominal for q in self.plant.states])
+        guess = np.concatenate([[x], x + usual, x - usual])
+        n = len(guess)
+        t, h = self.sample_time * np.arange(n, dtype=np.float64), np.full(n, self.sample_time)
+        phase = Phase("rest", t, h, np.zeros((n, 1)), np.arange(n), guess=guess)
+        known = self.plant.parameters | parameters.select(q for q in parameters if q in self.plant.parameters)
+        return segment(Transcription(self.plant.discrete(), known, (phase,)))
+
+    @cached_property
+    def _run(self) -> Rollout:
+        return Rollout((self.loop or self.plant).discrete().pieces)
+
+    @cached_property
+    def _sensitivities(self) -> Rollout:
+        order = list(self.plant.parameters)
+        wrt = [order.index(n) for n in (*self.per_log, *self.free)]
+        return Rollout(self.plant.discrete().pieces, wrt=wrt, start=True)
+
+    def _positions(self, quantities: Sequence[Quantity]) -> Indices:
+        place = {q.name: i for i, q in enumerate(self.channels)}
+        return np.array([place[q.name] for q in quantities], dtype=np.intp)
+
+
+_SEVERAL_INPUTS = "a planned run excites one input, the plant has {}; plan it with a friction model that needs one"
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """The criterion of information matrices."""
+
+    criterion: Criterion
+    free: tuple[str, ...]
+    targets: tuple[str, ...]
+    parameters: ParameterSet
+    worst_case: bool
+
+    @cached_property
+    def sizes(self) -> Array:
+        """What each standard deviation is divided by: the value, or of an offset at zero its range or 1."""
+        return np.array([value_size(self.parameters, n) for n in self.free])
+
+    def covariance(self, information: Array) -> Array:
+        """The covariance of all free parameters, in units of their sizes."""
+        scaled = information * np.outer(self.sizes, self.sizes) + np.eye(len(self.free)) / VAGUE**2
+        return np.asarray(np.linalg.inv(scaled))
+
+    def deviation(self, information: Array) -> Array:
+        """The criterion's figure, over plants along the first axis; shape (plants, ..., k, k) -> (...)."""
+        chosen = [self.free.index(n) for n in self.targets]
+        figures = self.criterion.deviation(self.covariance(information)[..., chosen, :][..., :, chosen])
+        with np.errstate(divide="ignore"):
+            every = np.log(np.where(np.isnan(figures), np.inf, figures))
+        return np.asarray(np.exp(every.max(axis=0) if self.worst_case else every.mean(axis=0)))
+
+
+@dataclass(eq=False)
+class DesignSearch:
+    """The search for the blocks of all runs."""
+
+    run: PlannedRun
+    plants: tuple[ParameterSet, ...]
+    known: Array
+    judge: Judge
+    samples: int
+    runs: int
+    rng: np.random.Generator
+    budget: CpuBudget
+    progress: ProgressReporter
+    repeats: int = 1  # times that the run's information counts
+    _parts: "dict[int, DesignSearch]" = field(default_factory=dict)
+    tried: int = 0
+    substeps: int = MIN_SUBSTEPS
+
+    def design(self) -> ExperimentDesign:
+        """Choose blocks, refine the runs, and predict what they tell."""
+        self.substeps = max(self.run.stable_substeps(p) for p in self.plants)
+        chosen = self._find_blocks()
+        signals = np.stack([self._signal(blocks) for blocks in chosen])
+        nominal, fine = self.plants[0], 2 * self.substeps
+        shown = self.run.simulate(signals, nominal, fine)
+        gained = self.run.information(shown, nominal, fine).sum(axis=0)
+        every = [self.run.violations(self.run.simulate(signals, p, self.substeps), p) for p in self.plants]
+        room = {n: float(max(np.max(v[n]) for v in every)) for n in every[0]}
+        channels = names(self.run.channels)
+        runs = tuple(Trajectory(self._grid, dict(zip(channels, r.T, strict=True))) for r in shown)
+        table = tabulate_design(nominal, self.run.free, self.judge.targets, self.known, gained)
+        origin = self.run.origin
+        steps = tuple(tuple(b.describe(self.run.excited_quantity.unit) for b in blocks) for blocks in chosen)
+        units, tried = {q.name: q.unit for q in self.run.channels}, sum(s.tried for s in (self, *self._parts.values()))
+        before, after = (float(self.judge.deviation(f[None])) for f in (self.known, self.known + gained))
+        figures = {"before": before, "after": after, "tried": float(tried), "origin": origin}
+        figures |= {"plants": float(len(self.plants)), "cpu_seconds": self.budget.seconds}
+        return ExperimentDesign(
+            self.run.excited_quantity.name,
+            runs,
+            steps,
+            table,
+            self.run.all_limits(nominal),
+            room,
+            repr(self.judge.criterion),
+            figures,
+            units,
+        )
+
+    def _find_blocks(self) -> list[list[Block]]:
+        """The blocks of all runs, found in the whole duration or in a part of it, whichever has begun better."""
+        whole = self._begin()
+        search, runs = self, whole
+        if (part := self._part(MOST_REPEATS)) is not self:
+            with suppress(InputError):  # a part may allow no wave, or end where the next one breaks a limit
+                begun = part._begin()
+                if part._figure(begun) < self._figure(whole):
+                    search, runs = part, begun
+        try:
+            while search is not self:
+                runs = search._refine(runs, self.budget.part(PART_SHARE))
+                search = self._part(search.repeats // 2)
+                runs = search._fit_into_limits([blocks * 2 for blocks in runs])
+        except InputError:
+            runs = whole
+        return self._refine(min(runs, whole, key=self._figure), self.budget)
+
+    def _begin(self) -> list[list[Block]]:
+        """Blocks of the library, refined for a while."""
+        return self._refine(self._fit_into_limits(self._choose_blocks()), self.budget.part(BEGIN_SHARE))
+
+    def _part(self, repeats: int) -> "DesignSearch":
+        """The search for runs that are so many times shorter; this one where they would be too short."""
+        samples = self.samples // repeats
+        if repeats == 1 or samples < BLOCKS * MIN_BLOCK_SAMPLES:
+            return self
+        coarse = -(-self.substeps // 2)
+        part = replace(self, samples=samples, repeats=repeats, substeps=coarse, tried=0)
+        return self._parts.setdefault(repeats, part)
+
+    @cached_property
+    def _grid(self) -> Array:
+        return np.asarray(np.arange(self.samples) * self.run.sample_time, dtype=np.float64)
+
+    @property
+    def _blocks(self) -> int:
+        return max(1, min(BLOCKS, self.samples // MIN_BLOCK_SAMPLES))
+
+    @cached_property
+    def _reach(self) -> tuple[float, float]:
+        """How far the excitation may go down and up from the start."""
+        low, high = self.run.excited_limits()
+        origin = self.run.origin
+        return low - origin, high - origin
+
+    @cached_property
+    def _waves(self) -> list[Block]:
+        """Blocks of every kind."""
+        t = self._grid[: self.samples // self._blocks]
+        return library(max(abs(v) for v in self._reach), float(t[-1]) or self.run.sample_time, self.run.sample_time)
+
+    def _choose_blocks(self) -> list[list[Block]]:
+        """The blocks of all runs by exchange: their information adds up."""
+        t = self._grid[: self.samples // self._blocks]
+        waves = self._waves
+        gains, keeps = self._evaluate(np.stack([np.clip(b.samples(t), *self._reach) for b in waves]))
+        if not keeps.any():
+            raise self._infeasible(waves, t)
+        waves = [b for b, good in zip(waves, keeps, strict=True) if good]
+        gains = gains[:, keeps]
+        picked = list[int]()
+        total = np.repeat(self.known[None], len(self.plants), axis=0)
+        for _ in range(self._blocks * self.runs):
+            best = int(np.argmin(self.judge.deviation(total[:, None] + gains)))
+            picked.append(best)
+            total = total + gains[:, best]
+        for _ in range(QUIET_ROUNDS):
+            for k, old in enumerate(picked):
+                rest = total - gains[:, old]
+                picked[k] = int(np.argmin(self.judge.deviation(rest[:, None] + gains)))
+                total = rest + gains[:, picked[k]]
+        ordered = sorted(picked, key=lambda i: waves[i].amplitude)
+        return [[waves[i] for i in ordered[r :: self.runs]] for r in range(self.runs)]
+
+    def _fit_into_limits(self, runs: list[list[Block]]) -> list[list[Block]]:
+        """The blocks of each run in a row, all made smaller until the whole run keeps the limits."""
+        message, fitted = "the blocks of a run, one behind the other, keep no limits; plan a shorter duration", []
+        for blocks in runs:
+            sizes = np.geomspace(1.0, 1e-3, 25).tolist()
+            rows = [[replace(b, amplitude=b.amplitude * size) for b in blocks] for size in sizes]
+            _, keeps = self._evaluate(np.stack([self._signal(row) for row in rows]))
+            require(bool(keeps.any()), message)
+            fitted.append(rows[int(np.argmax(keeps))])
+        return fitted
+
+    def _figure(self, runs: list[list[Block]]) -> float:
+        """The criterion after these runs."""
+        gains = self._evaluate(np.stack([self._signal(blocks) for blocks in runs]))[0]
+        return float(self.judge.deviation(self.known + gains.sum(axis=1)))
+
+    def _refine(self, runs: list[list[Block]], budget: CpuBudget) -> list[list[Block]]:
+        """Change the runs by chance, far and near in turn, and keep what is better within the limits."""
+        every = self._evaluate(np.stack([self._signal(blocks) for blocks in runs]))[0]
+        best = float(self.judge.deviation(self.known + every.sum(axis=1)))
+        fastest = max(CYCLES_A_SAMPLE / self.run.sample_time, 2 / self._grid[-1])
+        ends, quiet = (1 / float(self._grid[-1]), fastest), 0
+        while quiet < QUIET_CYCLES and not budget.is_spent:
+            before = best
+            for r, spread in itertools.product(list(range(self.runs)) * (ROUNDS_A_SPREAD * len(runs[0])), SPREADS):
+                if budget.is_spent:
+                    break
+                others = self.known + every.sum(axis=1) - every[:, r]
+                tried = [vary_run(runs[r], self.rng, spread, self._reach, ends, self._waves) for _ in range(VARIATIONS)]
+                gains, keeps = self._evaluate(np.stack([self._signal(row) for row in tried]))
+                figures = np.where(keeps, self.judge.deviation(others[:, None] + gains), np.inf)
+                winner = int(np.argmin(figures))
+                if figures[winner] < best:
+                    best, runs[r] = float(figures[winner]), tried[winner]
+                    every[:, r] = gains[:, winner]
+                self.progress(f"relative standard deviation {best:.3g}, {self.tried} runs tried")
+            quiet = quiet + 1 if best > (1 - MIN_GAIN) * before else 0
+        return runs
+
+    def _evaluate(self, signals: Array) -> tuple[Array, Array]:
+        """Information of excitations, shape (plants, m, k, k), and whether all plants keep the limits under them."""
+        keeps = np.ones(len(signals), dtype=bool)
+        low, high = self._reach
+        keeps &= (signals.min(axis=1) >= low - 1e-12) & (signals.max(axis=1) <= high + 1e-12)
+        k = len(self.run.free)
+        gains = np.zeros((len(self.plants), len(signals), k, k))
+        self.tried += len(signals)
+        shown = {}
+        for i, plant in enumerate(self.plants):
+            rows = np.flatnonzero(keeps)
+            if not rows.size:
+                break
+            found = self.run.simulate(signals[rows], plant, self.substeps)
+            shown[i] = rows, found
+            for beyond in self.run.violations(found, plant).values():
+                keeps[rows] &= beyond <= 0
+        for i, (rows, found) in shown.items():
+            kept = keeps[rows]
+            gains[i, rows[kept]] = self.run.information(found[kept], self.plants[i], self.substeps)
+        return self.repeats * gains, keeps
+
+    def _signal(self, blocks: Sequence[Block]) -> Array:
+        return np.clip(join_blocks(blocks, self._grid), *self._reach)
+
+    def _infeasible(self, waves: Sequence[Block], t: Array) -> InputError:
+        """Which limit even the gentlest excitation breaks, and what it would need."""
+        gentle = min(waves, key=lambda b: (b.amplitude, b.frequency))
+        signal = np.clip(gentle.samples(t), *self._reach)[None]
+        worst, name, low, high = -math.inf, "", 0.0, 0.0
+        for plant in self.plants:
+            shown = self.run.simulate(signal, plant, self.substeps)
+            for n, beyond in self.run.violations(shown, plant).items():
+                if beyond[0] > worst:
+                    values = shown[0, :, names(self.run.channels).index(n)]
+                    worst, name, low, high = float(beyond[0]), n, float(values.min()), float(values.max())
+        unit = next(q.unit for q in self.run.channels if q.name == name)
+        needs = f"it moves from {write_value(low, unit, 3)} to {write_value(high, unit, 3)}"
+        remedy = "widen that limit, start elsewhere (start=), or close a loop around a plant that runs away"
+        return InputError(f"limits: no excitation keeps {name!r}: under the gentlest one, {needs}; {remedy}")
+
+
+def value_size(parameters: ParameterSet, name: str) -> float:
+    """What a standard deviation of a parameter is compared with [its unit]."""
+    p = parameters[name]
+    width = p.upper - p.lower
+    return abs(p.value) or (width if math.isfinite(width) and width > 0 else 1.0)
 
 
 def next_experiment(
@@ -233,3 +821,120 @@ def _known_names(free: Sequence[str], covariance: "pd.DataFrame") -> list[str]:
     """The free parameters that have an interval."""
     variances = dict(zip(map(str, covariance.index), np.diag(covariance.to_numpy(dtype=float)).tolist(), strict=True))
     return [n for n in free if math.isfinite(variances.get(n, math.nan))]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DesignOutlook(Shown):
+    """A design over the dates of a history, and beyond.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a date: ahead, whether it is extrapolated; each limited or minimised metric, the worst over the
+        references; fails, the limits that are violated and the defects, in words, empty where there are none.
+    """
+
+    table: pd.DataFrame
+
+    @property
+    def fails(self) -> "datetime | None":
+        """The first date from which on the design fails at every later one; None: it holds at the last."""
+        bad = (self.table["fails"] != "").to_numpy()
+        begin = len(bad) - int(np.argmin(bad[::-1])) if not bad.all() else 0
+        return None if begin == len(bad) else self.table.index[begin].to_pydatetime()
+
+    def summary(self) -> Report:
+        """Whether and when to tune again, then a row a date."""
+        last = f"{self.table.index[-1]:%Y-%m-%d}"
+        verdict = Line(f"the tuned loop keeps its requirements until {last}", Tone.GOOD)
+        if (begin := self.fails) is not None:
+            ahead = bool(self.table["ahead"][begin])
+            when = "will fail by" if ahead else "fails since"
+            why = self.table["fails"][begin]
+            verdict = Line(f"tune again: the tuned loop {when} {begin:%Y-%m-%d} ({why})", Tone.BAD)
+        names = [str(n) for n in self.table.columns if n not in ("ahead", "fails")]
+        columns = (Column("date", is_text=True), *map(Column, names), Column("fails", is_text=True))
+        rows = []
+        for row in self.table.reset_index().to_dict(orient="records"):
+            date = f"{row['date']:%Y-%m-%d}" + (" (ahead)" if row["ahead"] else "")
+            rows.append((date, *(format_number(float(row[n]), 4) for n in names), str(row["fails"])))
+        return Report((verdict, Table(columns, tuple(rows))))
+
+
+def predict_loss(
+    tracking: Tracking,
+    loop: ClosedLoop,
+    references: Reference | Sequence[Reference],
+    parameters: ParameterSet,
+    objective: Objective,
+    *,
+    ahead: int = 4,
+) -> DesignOutlook:
+    """Certify a design at the estimates of each log, and along the drift into the future.
+
+    Parameters
+    ----------
+    tracking : Tracking
+        Whose drift moves the plant.
+    loop : ClosedLoop
+        The loop that was tuned, with its gains among the parameters.
+    references : Reference or sequence of Reference
+        As of `tune`.
+    parameters : ParameterSet
+        The design's gains and the plant's other values.
+    objective : Specification, Requirement or mapping
+        What was tuned for, with its limits.
+    ahead : int
+        Dates beyond the last log: they reach as far ahead as the logs reach back. Parameters with an alarm go on along
+        their line there; the others stay at their line's value at the last log.
+
+    Returns
+    -------
+    DesignOutlook
+
+    Raises
+    ------
+    InputError
+        If a tracked parameter is none of the loop's.
+    """
+    spec = objective if isinstance(objective, Specification) else specify(objective)
+    unknown = [n for n in tracking.table.index if n not in loop.plant.parameters]
+    require(not unknown, f"{', '.join(map(str, unknown))}: no parameter of the loop's plant; track what it has")
+    rows = {}
+    for date, is_ahead, values in _plants(tracking, ahead):
+        known = parameters.with_values({n: v for n, v in values.items() if np.isfinite(v)})
+        rows[date] = {"ahead": is_ahead, **_certify(loop, references, known, spec)}
+    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("date")
+    return DesignOutlook(table)
+
+
+def _plants(tracking: Tracking, ahead: int) -> "list[tuple[pd.Timestamp, bool, dict[str, float]]]":
+    """Date, whether it is ahead, and the values of the tracked parameters."""
+    own = {str(n): tracking.history.loc[n].to_dict(orient="list") for n in tracking.table.index}
+    dates = [pd.Timestamp(d) for d in tracking.history.loc[tracking.table.index[0]].index]
+    plants = [(d, False, {n: float(column["value"][k]) for n, column in own.items()}) for k, d in enumerate(dates)]
+    for share in np.arange(1, ahead + 1) / max(ahead, 1):
+        moved = {}
+        for name, column in own.items():
+            first, last = float(column["line"][0]), float(column["line"][-1])
+            moved[name] = last + (share * (last - first) if name in tracking.drifting else 0.0)
+        plants.append((dates[-1] + share * (dates[-1] - dates[0]), True, moved))
+    return plants
+
+
+def _certify(
+    loop: ClosedLoop, references: Reference | Sequence[Reference], parameters: ParameterSet, spec: Specification
+) -> dict[str, float | str]:
+    """The worst metrics of a design, and why it fails."""
+    proof = certificate(loop, references, parameters, band=spec.band, envelope=spec.envelope)
+    failures = list(dict.fromkeys(finding.defect.value for finding in proof.findings))
+    for case in proof.metrics:
+        violated = spec.violations(
+            requirement_values({str(n): float(v) for n, v in proof.metrics[case].items()}), SLACK
+        )
+        failures += [n for n in map(metric_name, violated) if n not in failures]
+    row: dict[str, float | str] = {}
+    for name in (n for n in spec.metric_names if n in proof.metrics.index):
+        worst = np.min if larger_is_better(name) else np.max
+        row[name] = float(worst(proof.metrics.loc[name].to_numpy(dtype=float)))
+    return {**row, "fails": ", ".join(failures)}

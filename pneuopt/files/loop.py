@@ -26,9 +26,9 @@ from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import System
 from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
+from pneuopt.evaluation.limit_cycle import NoHunting
 from pneuopt.evaluation.metric import Band, Requirement, Tolerance
 from pneuopt.evaluation.requirements import REQUIREMENT_KINDS, SettlingTime, StepEnvelope
-from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.scenarios import DISTRIBUTIONS, TOGETHER, Distribution, Sampling, Spread
 from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.tolerances import MAX_CASES, MAX_OPTION, SAMPLE_TIME

@@ -2,16 +2,22 @@
 
 Numbers are in SI units unless a name or a "unit" beside them says otherwise; what is not finite is null; a table is a
 list of records, one a row. Members may be added from version to version; none is renamed without the changelog.
+
+`load_result`: a result as its `save` has written it.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from pathlib import Path
 from types import NoneType
 from typing import Any, get_args
 
-from pneuopt.evaluation.dither import DitherVerdict
-from pneuopt.files.certificate import CertificateCheck
+from pneuopt.evaluation.certificate import Certificate
+from pneuopt.evaluation.dither import CompensatorVerdict, DitherVerdict
+from pneuopt.evaluation.limit_cycle import RestCheck
+from pneuopt.experiments.design import ExperimentDesign
+from pneuopt.files.tuned import CertificateCheck
 from pneuopt.identification.checkup import Assumption
 from pneuopt.identification.result import (
     AgreementRow,
@@ -19,13 +25,18 @@ from pneuopt.identification.result import (
     ChosenWindow,
     EstimateRow,
     IdentifiableRow,
+    IdentificationResult,
     Verdict,
 )
+from pneuopt.identification.select_model import ModelSelection
+from pneuopt.identification.tracking import LogComparison
 from pneuopt.logs.doctor import LogFinding
 from pneuopt.quantities.keys import argument_meanings, first_sentence
 from pneuopt.quantities.parameters import Parameter
+from pneuopt.quantities.results import read_result
 from pneuopt.quantities.status import Status
-from pneuopt.tuning.result import RequirementRow
+from pneuopt.tuning.result import RequirementRow, TuningResult
+from pneuopt.tuning.validation import DesignValidation
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _NUMBER: dict[str, Any] = {"type": ["number", "null"]}
@@ -328,3 +339,33 @@ OUTPUTS: Mapping[str, Member] = {
     ),
 }
 """The outputs by name, and their members."""
+
+
+RESULT_KINDS: dict[str, type] = {
+    kind.__name__: kind
+    for kind in (
+        *(IdentificationResult, ModelSelection, LogComparison, ExperimentDesign),
+        *(TuningResult, DesignValidation, Certificate, RestCheck, DitherVerdict, CompensatorVerdict),
+    )
+}
+
+
+def load_result(path: str | Path) -> Any:
+    """Read a result that was saved: ``fit.save("fit.json")``, then ``load_result("fit.json")``.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    IdentificationResult, TuningResult or another
+        Of the class that was saved, with the same numbers to the last digit. What a model needs of a log's motion
+        (`Verdict.identification_hints.needs`) is not in it.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is no result, or was damaged or changed; nothing in it is ever run as code.
+    """
+    return read_result(path, RESULT_KINDS)

@@ -14,8 +14,8 @@ from pneuopt.dynamics.runnable import command_centre
 from pneuopt.dynamics.system import System
 from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
+from pneuopt.evaluation.limit_cycle import NoHunting
 from pneuopt.evaluation.metric import Requirement
-from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios, corners, further, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.evaluation.tolerances import PLANT_COUNT

@@ -16,15 +16,15 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
-from pneuopt.identification.examination import (
+from pneuopt.identification.identifiability import (
     QUIET_CHECKS,
     accept_remedy,
     axis_from_model,
     find_exchange,
     is_accepted,
     is_refused,
+    verdict_from_sensitivities,
 )
-from pneuopt.identification.identifiability import verdict_from_sensitivities
 from pneuopt.identification.problem import (
     EstimationProblem,
     as_estimation_model,

@@ -17,8 +17,12 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
-from pneuopt.identification.examination import check_content
-from pneuopt.identification.identifiability import foresee_unidentifiable, prior_dominated, prior_influenced
+from pneuopt.identification.identifiability import (
+    check_content,
+    foresee_unidentifiable,
+    prior_dominated,
+    prior_influenced,
+)
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, suspect_widths
 from pneuopt.identification.problem import (
@@ -39,17 +43,19 @@ from pneuopt.identification.problem import (
 from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult
 from pneuopt.identification.review import FixedValueTest, review_fit
 from pneuopt.identification.search import (
+    check_window,
     enforce_ordering,
     fit_fixing_unidentifiable,
     fit_from_profiles,
     fit_from_starts,
+    fit_in_windows,
     fit_logs,
     mark_order,
+    run_freely,
     tighten_gaps,
 )
 from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
 from pneuopt.identification.widths import choose_widths
-from pneuopt.identification.windows import check_window, fit_in_windows, run_freely
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning

@@ -23,7 +23,7 @@ import numpy as np
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.runnable import HasSystem, as_system
 from pneuopt.dynamics.system import System, names
-from pneuopt.identification.examination import pose_problem
+from pneuopt.identification.identifiability import pose_problem
 from pneuopt.identification.identify import check_options, identify, validate
 from pneuopt.identification.problem import EstimationProblem, as_experiments
 from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult, remedy

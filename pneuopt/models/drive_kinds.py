@@ -6,7 +6,7 @@ from typing import Any
 
 from pneuopt.models.declaration import Drive, DriveKind
 from pneuopt.models.drives import FORCE_KIND, MOTION_KIND, ROTARY_KIND
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Karnopp
 from pneuopt.models.linear import LINEAR_KIND
 from pneuopt.models.pneumatic.drive import PNEUMATIC_KIND
 from pneuopt.quantities.errors import ModelError

@@ -14,8 +14,17 @@ import casadi as ca
 from pneuopt.dynamics.hooks import Axis, Log, Rest, Start
 from pneuopt.dynamics.system import Symbols, System, define, names, stack
 from pneuopt.models.declaration import DriveKind, FirstFiles
-from pneuopt.models.friction import LOAD_HINTS, RIG_HINTS, Coulomb, FrictionModel, law_inputs, load_hints
-from pneuopt.models.friction_laws import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
+from pneuopt.models.friction import (
+    FRICTION_KEYS,
+    LOAD_HINTS,
+    RIG_HINTS,
+    STRIBECK_UNKNOWNS,
+    Coulomb,
+    FrictionModel,
+    law_inputs,
+    load_hints,
+    read_friction,
+)
 from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.starts import force_starts, motion_starts
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require

@@ -5,6 +5,16 @@ Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoo
 
 First stand the declarations that a law makes (`FrictionStart`: its start from logs, see `starts`) and what a log must
 show for its parameters; then `FrictionModel`, the laws, the wrappers, and the formulas that they share.
+
+Karnopp's dry friction for simulation: the piston sticks, or slides one way or the other.
+
+`ForceDrive(Karnopp(Stribeck())).system()` is a plant like any other. `simulate` switches its "friction.direction" and
+locates each break-away and standstill; a solver that leaves the direction at zero simulates no dry friction at all.
+
+The registry of friction laws, a row each, for files, model selection (`friction_ladder`) and the table test.
+
+A row is a law's name in files and its class, which declares everything else (see `FrictionModel`). Below the rows stand
+the keys of section [friction] of a drive's file.
 """
 
 import math
@@ -18,6 +28,7 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import DEFAULT_WIDTH, IdentificationHints, Lack, LoggedMotion, Need, SeparatingRun, Width
 from pneuopt.dynamics.system import Symbols
+from pneuopt.models.declaration import DriveSections
 from pneuopt.models.tolerances import (
     BRISTLE_STIFFNESS_RANGE,
     MIN_COULOMB_SHARE,
@@ -35,7 +46,8 @@ from pneuopt.models.tolerances import (
     VISCOUS_SPEED_RATIO,
 )
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.errors import ModelError, check_names, require
+from pneuopt.quantities.keys import Key, Takes, choice, flag
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 
@@ -684,3 +696,134 @@ class LoadDependent:
         """Return the force of the base model with raised levels; see the class."""
         size = ca.sqrt(u["force"] ** 2 + p["load_rounding"] ** 2) - p["load_rounding"]
         return self.base.force(v, z, u, raise_levels(p, p["coulomb_load"] * size))
+
+
+@dataclass(frozen=True)
+class Karnopp:
+    r"""A static friction map without smoothing: the parameter `direction` is sgn(v), and 0 where the piston sticks.
+
+    .. math:: F = g(v) \, d + \sigma_2 v, \quad d = \pm 1; \qquad |F| \le F_s \text{ at rest}
+
+    Asymmetry and pressure dependence use the direction likewise. Source: Karnopp, J. Dyn. Sys. Meas. Control 107(1),
+    1985, but with events in place of his zone of small speeds.
+
+    Parameters
+    ----------
+    base : FrictionModel
+        Coulomb() or Stribeck(), wrapped or not; its parameters, except the smoothing widths, are those of this model.
+
+    Raises
+    ------
+    ModelError
+        If the base has internal states (LuGre has no standstill to locate) or no Coulomb level.
+    """
+
+    base: FrictionModel
+
+    def __post_init__(self) -> None:
+        suited = not self.base.states and "smoothing" in self.base.parameters
+        message = f"Karnopp needs a static map with a Coulomb level, Coulomb() or Stribeck(); {self.base} is not one"
+        require(suited, message, ModelError)
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """No states."""
+        return ()
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """Inputs of the base model."""
+        return self.base.inputs
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Parameters of the base without smoothing widths, and direction [1], which only a simulation sets."""
+        kept = {n: p for n, p in self.base.parameters.items() if n not in ("smoothing", "asymmetry_width")}
+        return ParameterSet({**kept, "direction": Parameter(0.0, "1", -1.0, 1.0, source="switched by simulate")})
+
+    @property
+    def identification_hints(self) -> IdentificationHints:
+        """Those of the base model."""
+        return self.base.identification_hints
+
+    @property
+    def start(self) -> FrictionStart:
+        """Start of the base model."""
+        return self.base.start
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
+        """Return the force of the base model with this direction; see the class."""
+        return self.base.force(v, z, u, p)
+
+
+@dataclass(frozen=True)
+class Wrapper:
+    """A law that wraps another law."""
+
+    wrap: Callable[..., FrictionModel]  # (inner law) or, with options, (inner law, tuple of options) -> law
+    meaning: str
+    option: str = ""  # an option's name in messages, "chamber"
+    options: tuple[str, ...] = ()  # those it takes; all of them where none is given
+
+
+FRICTION_LAWS: Mapping[str, Callable[[], FrictionModel]] = {
+    "viscous": Viscous,
+    "coulomb": Coulomb,
+    "presliding": Presliding,
+    "stribeck": Stribeck,
+    "lugre": LuGre,
+}
+"""Basic laws from the simplest to the richest: `model = "coulomb"` in a file."""
+
+FRICTION_WRAPPERS: Mapping[str, Wrapper] = {
+    "asymmetric": Wrapper(Asymmetric, "whether friction differs between the directions"),
+    "load_dependent": Wrapper(LoadDependent, "whether friction rises with the transmitted force, as a gear's does"),
+    "pressure_dependent": Wrapper(
+        PressureDependent, "whether friction rises with both pressures, or a list of them", "chamber", CHAMBER_PRESSURES
+    ),
+}
+"""Laws that wrap another law, the innermost first: `asymmetric = true` in a file."""
+
+
+def friction_ladder() -> dict[str, FrictionModel]:
+    """Friction laws by name, from the simplest to the richest: candidates for `select_model`.
+
+    Static laws with a Coulomb level are there also with each wrapper that needs no further signal.
+    """
+    ladder: dict[str, FrictionModel] = {}
+    for name, law in FRICTION_LAWS.items():
+        ladder[name] = law()
+        if "coulomb" in law().parameters and not law().states:
+            wrapped = {f"{how} {name}": wrapper.wrap(law()) for how, wrapper in FRICTION_WRAPPERS.items()}
+            ladder |= {n: model for n, model in wrapped.items() if not model.inputs}
+    return ladder
+
+
+def usual_unknowns() -> tuple[str, ...]:
+    """Parameters that a comparison of these laws estimates, as a drive names them."""
+    unknowns = (f"friction.{n}" for law in friction_ladder().values() for n in law.start.unknowns)
+    return tuple(dict.fromkeys(unknowns))
+
+
+FRICTION_KEYS: Mapping[str, Key] = {
+    "model": choice("friction law", FRICTION_LAWS),
+    **{
+        name: replace(flag(wrapper.meaning), takes=Takes.FLAG_OR_LIST if wrapper.options else Takes.FLAG)
+        for name, wrapper in FRICTION_WRAPPERS.items()
+    },
+}
+STRIBECK_UNKNOWNS = tuple(f"friction.{n}" for n in Stribeck().start.unknowns)
+"""Parameters of the usual law that logs give, as a drive names them."""
+
+
+def read_friction(sections: DriveSections) -> FrictionModel:
+    """Build the friction law that [friction] describes."""
+    options = sections.options("friction")
+    law: FrictionModel = options["model"]()
+    for name, wrapper in FRICTION_WRAPPERS.items():
+        if isinstance(options[name], list) and options[name]:
+            check_names(wrapper.option, options[name], wrapper.options, sections.place("friction", name))
+            law = wrapper.wrap(law, tuple(options[name]))
+        elif options[name]:
+            law = wrapper.wrap(law)
+    return law

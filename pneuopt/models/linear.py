@@ -21,8 +21,7 @@ from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drives import FORCE, POSITION, SPEED
-from pneuopt.models.friction import FrictionModel
-from pneuopt.models.friction_laws import FRICTION_KEYS, read_friction
+from pneuopt.models.friction import FRICTION_KEYS, FrictionModel, read_friction
 from pneuopt.models.tolerances import (
     DAMPING_GRID,
     MAX_GRID_SAMPLES,

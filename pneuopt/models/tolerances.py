@@ -122,10 +122,10 @@ MAX_WORSE_LEADS = 2
 """Leads in a row that are worse than the best at which no longer one is tried: residuals rise from the best lead on (28
 drives of problems/identify/random_plants.py, without a line); fewer trust one residual, more take time."""
 # ratio of residuals by which a drop or another zero point must be better to be advised: a smaller one warns of right
-# pressures, a larger one misses wrong ones (tests/models/pneumatic/test_log_checks.py)
+# pressures, a larger one misses wrong ones (tests/models/pneumatic/test_logs.py)
 MIN_RESIDUAL_RATIO = 1.5
 # share of a pressure's squared rates that a zero point may leave without a check of others: a wrong one leaves 0.03 or
-# more (tests/models/pneumatic/test_log_checks.py), a smaller share checks right ones at the cost of time
+# more (tests/models/pneumatic/test_logs.py), a smaller share checks right ones at the cost of time
 MAX_UNQUESTIONED_SHARE = 0.02
 MAX_RESIDUAL_SHARE = 0.2  # largest such share that an advised drop or zero may leave: with more, the model does not fit
 MIN_LOG_DURATION = 1.0  # duration from which a log is checked alone as well [s]; shorter ones hold too little motion

@@ -29,8 +29,14 @@ from pneuopt.plotting.fits import (
 )
 from pneuopt.plotting.logs import plot_finding, plot_logs
 from pneuopt.plotting.loops import Response, plot_bode, plot_steps
-from pneuopt.plotting.plans import plot_experiment, plot_tracking
-from pneuopt.plotting.studies import plot_distribution, plot_front, plot_map, plot_sensitivity
+from pneuopt.plotting.studies import (
+    plot_distribution,
+    plot_experiment,
+    plot_front,
+    plot_map,
+    plot_sensitivity,
+    plot_tracking,
+)
 
 __all__ = [
     "BLUE",

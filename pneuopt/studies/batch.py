@@ -32,9 +32,8 @@ from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_paramete
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.results import Shown
 from pneuopt.quantities.status import Progress, ProgressReporter
-from pneuopt.studies.executors import Processes
+from pneuopt.studies.executors import INTERRUPTED_CASE, Outcome, Processes
 from pneuopt.studies.journal import CaseMarks, Journal
-from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
 from pneuopt.studies.sweep import sweep
 from pneuopt.studies.tolerances import CHUNK_A_CORE, MAX_PROBED, RATE_MARGIN, SAME_START, USUAL_TOLERANCE
 from pneuopt.tuning.space import (

@@ -21,7 +21,7 @@ from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.output import format_cell, write_bytes, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import provenance
-from pneuopt.studies.outcome import CaseValues, Outcome
+from pneuopt.studies.executors import CaseValues, Outcome
 from pneuopt.studies.tolerances import REWRITE_SECONDS, REWRITE_SHARE, SYNC_SECONDS
 
 PARQUET = ".parquet"

@@ -33,9 +33,16 @@ from pneuopt.quantities.output import MAX_REASON, read_source
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Progress, ProgressReporter
 from pneuopt.quantities.units import si_conversion, write_value
-from pneuopt.studies.executors import Processes, run_in_executor, run_in_processes
+from pneuopt.studies.executors import (
+    INTERRUPTED_CASE,
+    CaseFunction,
+    CaseValues,
+    Outcome,
+    Processes,
+    run_in_executor,
+    run_in_processes,
+)
 from pneuopt.studies.journal import CaseMarks, Journal
-from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, CaseValues, Outcome
 from pneuopt.studies.tolerances import MAX_TABLE_BYTES, RATE_AFTER
 
 if TYPE_CHECKING:

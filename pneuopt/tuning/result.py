@@ -11,6 +11,7 @@ import numpy as np
 from pneuopt.control.pid import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.evaluation.certificate import Certificate, report_margins, report_notes
 from pneuopt.evaluation.evaluate import report_metrics
+from pneuopt.evaluation.limit_cycle import RestCheck
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import (
     metric_name,
@@ -20,7 +21,6 @@ from pneuopt.evaluation.requirements import (
     user_limit,
     user_value,
 )
-from pneuopt.evaluation.rest_check import RestCheck
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns

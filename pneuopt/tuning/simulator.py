@@ -23,8 +23,13 @@ from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
 from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
-from pneuopt.evaluation.batch_margins import MarginFunction, batch_margin_function
-from pneuopt.evaluation.margins import first_largest, lowest_noise_frequency, without_ripple
+from pneuopt.evaluation.margins import (
+    MarginFunction,
+    batch_margin_function,
+    first_largest,
+    lowest_noise_frequency,
+    without_ripple,
+)
 from pneuopt.evaluation.metric import Band, Source, move_towards
 from pneuopt.evaluation.metrics import check_channels
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS, larger_is_better, requirement_values

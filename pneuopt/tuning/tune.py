@@ -3,6 +3,8 @@
 A linear loop whose response shooting nodes follow closely is tuned by them (`TwoPhase`); any other, with friction, clip
 or sampling, by compiled simulation (`Racing`). `certify` proves given gains likewise, `certify_on_rig` once more on the
 event-accurate model of the rig. A new method is registered in `METHODS`; the first that suits is chosen.
+
+`tune_without_dither`: the rival with which `judge_dither` compares a dithered design.
 """
 
 import time
@@ -10,10 +12,11 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import check_smooth
@@ -21,6 +24,7 @@ from pneuopt.dynamics.tolerances import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.dither import describe_swing
 from pneuopt.evaluation.evaluate import evaluate, metric_limits, relevant_units
+from pneuopt.evaluation.limit_cycle import NoHunting, RestKind, check_rest
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.plants import ExpectedPlants, expected_plants
 from pneuopt.evaluation.requirements import (
@@ -32,7 +36,6 @@ from pneuopt.evaluation.requirements import (
     user_value,
 )
 from pneuopt.evaluation.response import cases, check_steps
-from pneuopt.evaluation.rest_check import NoHunting, RestKind, check_rest
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify, specify_limits
@@ -51,6 +54,7 @@ from pneuopt.tuning.validation import validate_design
 
 if TYPE_CHECKING:
     import pandas as pd
+
 
 __all__ = ["TuningResult", "certify", "prepare_search", "prepare_task", "tune"]
 # Endings of a search whose limits perhaps no design keeps: `tune` then seeks how far they have to give way.
@@ -498,3 +502,56 @@ METHODS: Mapping[str, type[TwoPhase] | type[Racing]] = MappingProxyType({"two_ph
 def choose_method(task: TuningTask) -> Method:
     """Choose the first method in `METHODS` that suits a task."""
     return next(method for method in (kind() for kind in METHODS.values()) if method.suits(task))
+
+
+def tune_without_dither(
+    loop: ClosedLoop,
+    references: Reference | Sequence[Reference],
+    parameters: ParameterSet,
+    *,
+    minimise: Objective,
+    **options: Any,
+) -> TuningResult:
+    """Tune the same loop with the dither's amplitude fixed at 0: the rival of a dithered design in `judge_dither`.
+
+    It is a whole search, and takes about as long as that for the design with dither; a warm start at the dithered
+    gains alone would favour the dither.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : Reference or sequence of Reference
+    parameters : ParameterSet
+        As given to `tune` for the design with dither; the dither's offset stays free if it is.
+    minimise : Requirement, mapping of Requirement to weight, or Specification
+    **options
+        Those of `tune`: `subject_to`, `scenarios`, `method`, `throw` and so on. `plants` are by default none.
+
+    Raises
+    ------
+    InputError
+        If the loop has no dither, or no gain beside the dither's amplitude and frequency is free.
+    ConvergenceError
+        As `tune`: if no gains without dither keep the limits, for example.
+
+    Examples
+    --------
+    >>> from pneuopt.control.dither import Dither
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
+    >>> from pneuopt.evaluation.requirements import SettlingTime
+    >>> from pneuopt.models.linear import FirstOrder
+    >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False), Dither(50.0))
+    >>> given = loop.parameters.with_values({"dither.amplitude": 0.1})
+    >>> given = given.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
+    >>> rival = tune_without_dither(loop, Step(1.0), given, minimise=SettlingTime())
+    >>> rival.parameters.value("dither.amplitude")
+    0.0
+    """
+    check_closed_loop(loop)
+    check_parameters(parameters)
+    require(loop.dither is not None, "this loop has no dither to leave out: tune it with `tune`")
+    full = loop.complete(parameters)
+    plain = full.with_bounds({DITHER_AMPLITUDE: (0.0, full[DITHER_AMPLITUDE].upper)})
+    plain = plain.with_values({DITHER_AMPLITUDE: 0.0}).fixed(DITHER_AMPLITUDE, DITHER_FREQUENCY)
+    return tune(loop, references, plain, minimise=minimise, **{"plants": {}, **options})

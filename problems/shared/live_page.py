@@ -14,7 +14,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.response import loop_inputs, sample_spacing
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.report.live import live_script, to_script
+from pneuopt.report.tuning_page import live_script, to_script
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 POINTS = 300  # instants at which the two are compared

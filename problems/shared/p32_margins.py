@@ -9,7 +9,7 @@ import numpy as np
 import pneuopt as po
 from pneuopt.control.linear_loop import ComposedLoops
 from pneuopt.dynamics.system import names
-from pneuopt.evaluation.batch_margins import batch_margin_function
+from pneuopt.evaluation.margins import batch_margin_function
 from problems.shared.arrays import Array
 from problems.shared.p32 import RESERVE, SAMPLE_TIME, SPEEDS, STROKE, drive
 

@@ -7,9 +7,9 @@ import tomlkit
 from typer.testing import CliRunner, Result
 
 from pneuopt.cli.app import app
-from pneuopt.files.certificate import checksum_section
 from pneuopt.files.drive import read_fit
 from pneuopt.files.toml import read_toml
+from pneuopt.files.tuned import checksum_section
 
 DRIVE = """
 [drive]

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from pneuopt.cli import info
 from pneuopt.cli.app import app
 from pneuopt.dynamics.compiled.compiler import find_compiler
-from pneuopt.dynamics.compiled.self_check import SelfCheck, check_machine_code
+from pneuopt.dynamics.compiled.rollout import SelfCheck, check_machine_code
 from pneuopt.files.keys import list_keys
 from pneuopt.files.outputs import OUTPUTS
 from tests.cli.test_app import run

@@ -20,8 +20,7 @@ from pneuopt.cli.study import report_cases, tune_cell
 from pneuopt.models.declaration import Drive
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.studies.batch import evaluate_batch
-from pneuopt.studies.neighbours import sweep_from_neighbours
-from pneuopt.studies.sensitivity import sensitivity
+from pneuopt.studies.sensitivity import sensitivity, sweep_from_neighbours
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.front import pareto_front
 from pneuopt.tuning.racing import Racing

@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 from scipy.optimize import brentq
 
-from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.compensators import (
     COMPENSATORS,
     PRESSURES,
@@ -27,15 +26,14 @@ from pneuopt.control.compensators import (
 )
 from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.linear_loop import noise_path, open_loop
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, bumpless_transfer
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.dynamics.simulate import simulate, simulate_stick_slip
 from pneuopt.dynamics.system import System, names
-from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.margins import frequency_response, margins, noise_gain
+from pneuopt.evaluation.margins import batch_margin_function, frequency_response, margins, noise_gain
 from pneuopt.evaluation.requirements import Overshoot, SettlingTime
 from pneuopt.evaluation.response import loop_inputs
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor, record
@@ -44,8 +42,7 @@ from pneuopt.files.tuned import write_tuned
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models import catalog
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Coulomb, Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Coulomb, Karnopp, Stribeck, Viscous
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, ModelError

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.compensators import (
     AccelerationFeedback,
     Compensator,
@@ -21,16 +20,15 @@ from pneuopt.control.compensators import (
 from pneuopt.control.controller import Controller, Feedforward, PlantSignals, PositionLoop
 from pneuopt.control.dither import Dither
 from pneuopt.control.linear_loop import ComposedLoops, _exponentials, noise_path, open_loop
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, bumpless_transfer
 from pneuopt.control.pid import PID, Form
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names
-from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.margins import frequency_response, margins, noise_gain
+from pneuopt.evaluation.margins import batch_margin_function, frequency_response, margins, noise_gain
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.evaluation.specification import specify

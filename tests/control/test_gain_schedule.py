@@ -6,19 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.controller import PositionLoop
 from pneuopt.control.gain_schedule import SCHEDULED_GAINS, GainSchedule
 from pneuopt.control.linear_loop import open_loop
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, bumpless_transfer
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
-from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.margins import frequency_response, margins, sensitivity_terms
+from pneuopt.evaluation.margins import batch_margin_function, frequency_response, margins, sensitivity_terms
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.evaluation.specification import specify

@@ -8,8 +8,7 @@ from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.batch_margins import batch_margin_function
-from pneuopt.evaluation.margins import margins, sensitivity_terms
+from pneuopt.evaluation.margins import batch_margin_function, margins, sensitivity_terms
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.two_phase import is_linear

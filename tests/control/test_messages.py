@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pneuopt.control.averaging import average_dither
-from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.compensators import (
     COMPENSATORS,
     Direction,
@@ -22,7 +21,7 @@ from pneuopt.control.compensators import (
 from pneuopt.control.controller import Feedforward, PositionLoop
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.gain_schedule import GainSchedule
-from pneuopt.control.loop import ClosedLoop, add_disturbances
+from pneuopt.control.loop import ClosedLoop, add_disturbances, bumpless_transfer
 from pneuopt.control.moves import MotionPath, Move, MoveProfile, MoveSequence
 from pneuopt.control.pid import (
     PID,

@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.controller import PositionLoop
 from pneuopt.control.dither import Dither
 from pneuopt.control.linear_loop import open_loop
-from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop import ClosedLoop, bumpless_transfer
 from pneuopt.control.pid import (
     PID,
     AntiWindup,
@@ -32,15 +31,13 @@ from pneuopt.control.pid import (
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate_stick_slip
 from pneuopt.dynamics.system import System, names
-from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.margins import frequency_response, sensitivity_terms
+from pneuopt.evaluation.margins import batch_margin_function, frequency_response, sensitivity_terms
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Karnopp, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array

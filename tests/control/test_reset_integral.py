@@ -17,8 +17,7 @@ from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.margins import margins
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Karnopp, Stribeck, Viscous
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet

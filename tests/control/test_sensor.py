@@ -8,9 +8,8 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import define
-from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate, respond
-from pneuopt.evaluation.margins import frequency_response, margins
+from pneuopt.evaluation.margins import batch_margin_function, frequency_response, margins
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.evaluation.scenarios import Scenarios, corners

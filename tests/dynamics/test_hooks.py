@@ -19,8 +19,7 @@ from pneuopt.identification.identify import identify
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models import starts as friction_starts
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Stribeck
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Karnopp, Stribeck
 from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, ModelError, PhysicsWarning

@@ -20,8 +20,7 @@ from pneuopt.dynamics.system import names, parameter_vector
 from pneuopt.evaluation.rig import Rig, Sensor, record
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Coulomb, LuGre, Stribeck
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Coulomb, Karnopp, LuGre, Stribeck
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array

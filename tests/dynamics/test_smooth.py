@@ -15,8 +15,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.smooth import WorkArrays
 from pneuopt.models.drives import ForceDrive, MotionDrive
-from pneuopt.models.friction import Coulomb, FrictionModel
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Coulomb, FrictionModel, Karnopp
 from pneuopt.quantities.trajectories import Trajectory
 
 SAMPLES = 400

@@ -19,8 +19,16 @@ from pneuopt.dynamics.simulate import StickSlipResult, simulate, simulate_stick_
 from pneuopt.dynamics.stick_slip import EventKind
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, define
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import (
+    Asymmetric,
+    Coulomb,
+    FrictionModel,
+    Karnopp,
+    LuGre,
+    PressureDependent,
+    Stribeck,
+    Viscous,
+)
 from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array

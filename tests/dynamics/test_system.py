@@ -26,8 +26,7 @@ from pneuopt.dynamics.system import (
     slopes,
 )
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Coulomb, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Coulomb, Karnopp, Viscous
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity, usual_intersample

@@ -18,8 +18,7 @@ from pneuopt.evaluation.requirements import IAE
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.models.catalog import r25
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import FrictionModel, Karnopp, LuGre, Stribeck, Viscous
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning

@@ -1,4 +1,7 @@
-"""Margins at the operating points that a step passes; what mutants of them would leave out."""
+"""Margins at the operating points that a step passes; what mutants of them would leave out.
+
+The sensitivity peak from poles is that of python-control's frequency response, resonances included.
+"""
 
 from dataclasses import replace
 
@@ -11,27 +14,30 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from pneuopt.control.averaging import linear_gains
 from pneuopt.control.dither import Dither
-from pneuopt.control.linear_controller import linear_gains
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation, System, define
-from pneuopt.evaluation.batch_margins import _partial_fraction_response, batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.margins import (
+    _partial_fraction_response,
     are_stable,
     batch_frequency_response,
+    batch_margin_function,
     frequency_grid,
     frequency_response,
     margin_rows,
     margins,
     noise_gain,
     operating_points,
+    sensitivity_peaks,
     sensitivity_terms,
     worst_margins,
 )
+from pneuopt.evaluation.tolerances import LOOPS_AT_A_TIME
 from pneuopt.models.catalog import s32
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import LuGre, Stribeck
@@ -513,3 +519,32 @@ def test_a_slow_growth_is_instability(growth: float) -> None:
     loop = ClosedLoop(plant, PID())
     p = loop.parameters.with_values({"pid.Kp": 0.1 - 1e3 * growth, "pid.Ki": 0.0, "pid.Kd": 0.0, "pid.Tf": 1e-3})
     assert margins(open_loop(loop, p)).stable == (growth < 0)
+
+
+@pytest.mark.parametrize("damping", [0.003, 0.05, 0.5])
+def test_peaks_are_those_of_a_dense_frequency_response(damping: float) -> None:
+    rng, s, plants = np.random.default_rng(3), control.tf("s"), []
+    for _ in range(12):
+        w, lag, gain = rng.uniform(5, 80), rng.uniform(0.001, 0.05), damping * 10 ** rng.uniform(-1, 0.5)
+        L = gain * w**2 / (s**2 + 2 * damping * w * s + w**2) / (lag * s + 1) * (1 + damping * rng.uniform(0.1, 20) / s)
+        closed = control.feedback(L, 1).poles()
+        if closed.real.max() < 0:
+            plants.append((L, closed))
+    assert len(plants) >= 6
+    found = sensitivity_peaks(
+        np.array([L.poles() for L, _ in plants]), np.array([q for _, q in plants]), low=1e-3, high=1e5
+    )
+    grid = np.geomspace(1e-3, 1e5, 20000)
+    for (L, closed), peak in zip(plants, found.tolist(), strict=True):
+        near = np.concatenate([abs(q) * np.geomspace(0.9, 1.1, 4001) for q in closed])
+        exact = max(float(np.abs(1 / (1 + L(1j * w))).max()) for w in (grid, near))
+        assert peak == pytest.approx(exact, rel=2e-5)
+
+
+def test_every_loop_has_its_own_peak_however_many_there_are() -> None:
+    """``L = w0^2/(s (s + w0))`` peaks at the same height for every w0, which lies at another frequency."""
+    w0 = np.geomspace(0.1, 1e3, 2 * LOOPS_AT_A_TIME + 7)[:, None]
+    peaks = sensitivity_peaks(w0 * np.array([0j, -1.0]), w0 * np.roots([1.0, 1.0, 1.0]).astype(complex), 1e-4, 1e6)
+    w = np.geomspace(0.01, 100, 200001)
+    exact = np.abs(1j * w * (1j * w + 1) / ((1j * w) ** 2 + 1j * w + 1)).max()
+    assert_allclose(peaks, exact, rtol=1e-6)

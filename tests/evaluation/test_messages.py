@@ -18,7 +18,7 @@ from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.dither import judge_compensators, judge_dither
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.limit_cycle import find_limit_cycle
+from pneuopt.evaluation.limit_cycle import check_rest, find_limit_cycle
 from pneuopt.evaluation.margins import frequency_response, sensitivity_terms
 from pneuopt.evaluation.metric import Tolerance
 from pneuopt.evaluation.metrics import step_metrics
@@ -38,13 +38,11 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.evaluation.rest_check import check_rest
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor, record
 from pneuopt.evaluation.scenarios import Normal, corners, draws, samples
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Coulomb, Stribeck
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Coulomb, Karnopp, Stribeck
 from pneuopt.models.linear import SecondOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError

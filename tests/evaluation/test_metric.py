@@ -41,7 +41,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.report.live import live_script, to_script
+from pneuopt.report.tuning_page import live_script, to_script
 from pneuopt.tuning.gradients import _band_entry_times
 from pneuopt.tuning.space import ReferenceGrid, is_sound, read_metrics
 

@@ -25,8 +25,7 @@ from pneuopt.evaluation.tolerances import GUESSED_SENSITIVITY, LEAST_DWELL, LEAS
 from pneuopt.identification.identify import identify
 from pneuopt.models.catalog import s25, t32
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Coulomb, Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Coulomb, Karnopp, Stribeck, Viscous
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet

@@ -16,8 +16,7 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.rig import Actuator, Recording, Rig, Sensor, record
 from pneuopt.identification.identify import identify
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import FrictionModel, Stribeck
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import FrictionModel, Karnopp, Stribeck
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.parameters import ParameterSet

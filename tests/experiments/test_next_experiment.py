@@ -12,10 +12,10 @@ from scipy.integrate import solve_ivp
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.experiments import search as design_search
+from pneuopt.experiments import next_experiment as design_search
 from pneuopt.experiments.design import AOptimal, DOptimal, ExperimentDesign, Precision, WantedPrecision
 from pneuopt.experiments.next_experiment import next_experiment
-from pneuopt.files.results import load_result
+from pneuopt.files.outputs import load_result
 from pneuopt.identification.identify import identify
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import read_log

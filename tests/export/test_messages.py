@@ -14,8 +14,7 @@ from pneuopt.export.fmu import export_fmu
 from pneuopt.export.languages import Language, export_controller
 from pneuopt.export.makers import Block
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Stribeck
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Karnopp, Stribeck
 from pneuopt.quantities.errors import InputError, ModelError
 
 PLANT, SAMPLED = ForceDrive(Stribeck()).system(), PID(2e-3)

@@ -19,11 +19,11 @@ import tomlkit
 
 from pneuopt.cli.init import run_init
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.files.certificate import check_certificate, checksum_section
 from pneuopt.files.drive import read_drive, read_fit
 from pneuopt.files.loop import bound_units
 from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_pareto, read_study
+from pneuopt.files.tuned import check_certificate, checksum_section
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.models.declaration import Drive
 from pneuopt.quantities.parameters import ParameterSet

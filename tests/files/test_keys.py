@@ -17,8 +17,7 @@ from pneuopt.files.study import read_axes, read_study
 from pneuopt.files.tuning import read_tuning
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Coulomb
-from pneuopt.models.friction_laws import FRICTION_LAWS, FRICTION_WRAPPERS
+from pneuopt.models.friction import FRICTION_LAWS, FRICTION_WRAPPERS, Coulomb
 from pneuopt.quantities.errors import InputError
 
 STRANGER = "qqqq"  # near no key, so that the message lists them all

@@ -20,6 +20,7 @@ from pneuopt.control.moves import MotionPath, Move, MoveProfile, MoveSequence
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import Defect
+from pneuopt.evaluation.limit_cycle import NoHunting
 from pneuopt.evaluation.metric import Tolerance
 from pneuopt.evaluation.requirements import (
     IAE,
@@ -40,7 +41,6 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.files.drive import read_status
 from pneuopt.files.toml import read_toml

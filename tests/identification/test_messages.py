@@ -9,19 +9,19 @@ import pytest
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.identification.compare_logs import compare_logs
 from pneuopt.identification.identify import identify
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.losses import Huber, SoftL1
 from pneuopt.identification.problem import NEEDED, check_logs
-from pneuopt.identification.tracking import track
+from pneuopt.identification.tracking import compare_logs, track
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError, LogError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from tests.identification import test_identify, test_windows
+from tests.identification import test_identify
+from tests.identification import test_search as test_windows
 from tests.identification.test_logged_loop import H, given, logged, loop_of, pressure_fed
 from tests.identification.test_problem import RIG, braked, log_with
 from tests.identification.test_tracking import DATES, fits

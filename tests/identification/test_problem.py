@@ -18,7 +18,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identification.examination import check_content
+from pneuopt.identification.identifiability import check_content
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.losses import Huber

@@ -11,8 +11,7 @@ from pneuopt.identification.identify import identify
 from pneuopt.identification.select_model import ModelSelection, _CandidateRow, _choose, select_model, try_candidate
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive, MotionDrive
-from pneuopt.models.friction import FrictionModel
-from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
+from pneuopt.models.friction import FrictionModel, friction_ladder, usual_unknowns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.quantities.parameters import Intersample, ParameterSet

@@ -20,9 +20,7 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import DRIVE_KINDS, stick_slip_drive
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import LuGre, Stribeck, Viscous
-from pneuopt.models.friction_laws import friction_ladder
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Karnopp, LuGre, Stribeck, Viscous, friction_ladder
 from pneuopt.models.linear import SecondOrder
 from pneuopt.plotting import has_friction_map
 from pneuopt.quantities.errors import InputError, UnknownNameError

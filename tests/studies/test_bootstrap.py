@@ -11,8 +11,7 @@ from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Coulomb
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Coulomb, Karnopp
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.studies.bootstrap import Bootstrap, bootstrap
 

@@ -17,9 +17,9 @@ import pytest
 
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.studies.executors import INTERRUPTED_CASE, Outcome
 from pneuopt.studies.journal import Journal, RowFile, parquet_bytes
-from pneuopt.studies.neighbours import sweep_from_neighbours
-from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
+from pneuopt.studies.sensitivity import sweep_from_neighbours
 from pneuopt.studies.sweep import grid, sweep
 
 RIG = ParameterSet({"mass": Parameter(1.0, "kg"), "gain": Parameter(1.0, "1")})

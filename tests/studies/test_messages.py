@@ -18,7 +18,7 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.studies.bootstrap import bootstrap
 from pneuopt.studies.executors import Processes, open_executor
 from pneuopt.studies.journal import Journal
-from pneuopt.studies.neighbours import search_again, sweep_from_neighbours
+from pneuopt.studies.sensitivity import search_again, sweep_from_neighbours
 from pneuopt.studies.sweep import grid, read_cases, sweep
 from tests.plotting.fits import DRIVE, TRUTH, fit_of, fitted
 

@@ -31,7 +31,7 @@ from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Progress
-from pneuopt.studies.outcome import INTERRUPTED_CASE
+from pneuopt.studies.executors import INTERRUPTED_CASE
 from pneuopt.studies.sweep import grid, read_cases, sweep
 
 RIG = ParameterSet(

@@ -12,6 +12,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.limit_cycle import NoHunting
 from pneuopt.evaluation.metric import Tolerance
 from pneuopt.evaluation.requirements import (
     IAE,
@@ -20,13 +21,11 @@ from pneuopt.evaluation.requirements import (
     Overshoot,
     SettlingTime,
 )
-from pneuopt.evaluation.rest_check import NoHunting
 from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.evaluation.scenarios import Factor, tolerances
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Stribeck
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Karnopp, Stribeck
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, InputError, PneuoptError, UnknownNameError
@@ -34,10 +33,9 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.front import pareto_front
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.space import search_space
-from pneuopt.tuning.tune import certify, tune
+from pneuopt.tuning.tune import certify, tune, tune_without_dither
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuning.validation import validate_design
-from pneuopt.tuning.without_dither import tune_without_dither
 
 Edit = Callable[[ParameterSet], ParameterSet]
 STEP, PAIR = Step(1.0), (SettlingTime(), MaxSensitivity())

@@ -1,10 +1,14 @@
-"""`tune` and `certify`: known answers; every method, requirement, scenario, band and rig; what is said of bad input."""
+"""`tune` and `certify`: known answers; every method, requirement, scenario, band and rig; what is said of bad input.
+
+The rival of a dithered design: tuned like it, with no dither at all.
+"""
 
 import math
 import re
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +23,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.evaluate import evaluate, respond
+from pneuopt.evaluation.limit_cycle import NoHunting, check_rest
 from pneuopt.evaluation.metric import Tolerance, band_share
 from pneuopt.evaluation.requirements import (
     IAE,
@@ -45,15 +50,13 @@ from pneuopt.evaluation.requirements import (
     upper_limit,
 )
 from pneuopt.evaluation.response import cases
-from pneuopt.evaluation.rest_check import NoHunting, check_rest
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.evaluation.scenarios import Factor, apply_scenario, corners, tolerances
 from pneuopt.evaluation.specification import specify
-from pneuopt.files.results import load_result
+from pneuopt.files.outputs import load_result
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Karnopp, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
@@ -74,6 +77,7 @@ from pneuopt.tuning.tune import (
     prepare_search,
     prepare_task,
     tune,
+    tune_without_dither,
 )
 from pneuopt.tuning.two_phase import TwoPhase, is_linear
 from problems.shared.paper2015 import paper_plant
@@ -1119,3 +1123,24 @@ def test_limits_come_first_whatever_the_objective_is_measured_in() -> None:
     assert certified["Overshoot"] <= 2.0
     assert certified["SettlingTime"] <= 0.15
     assert certified["PeakControl"] == pytest.approx(unit * least_peak(0.1, 0.02, 0.15), rel=0.03)
+
+
+RANGES = {"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0), "dither.amplitude": (0.05, 0.1), "dither.offset": (-0.1, 0.1)}
+
+
+def design(*free: str) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False), Dither(50.0))
+    return loop, loop.parameters.with_values({"dither.amplitude": 0.1}).with_bounds(RANGES).freed(*free)
+
+
+def test_the_rival_is_the_tuning_of_a_loop_whose_dither_is_off() -> None:
+    """Even where the range of the dithered design's amplitude excludes 0; what else was free is."""
+    loop, given = design("pid.Kp", "pid.Ki", "dither.amplitude")
+    asked: dict[str, Any] = {"minimise": SettlingTime(), "subject_to": [Overshoot(0.05)]}
+    rival = tune_without_dither(loop, Step(1.0), given, **asked)
+    off = given.with_bounds({"dither.amplitude": (0.0, 0.1)}).with_values({"dither.amplitude": 0.0})
+    same = tune(loop, Step(1.0), off.fixed("dither.*"), plants={}, **asked)
+    assert rival.parameters.value("dither.amplitude") == 0
+    assert rival.parameters.free_names == ("pid.Kp", "pid.Ki")
+    assert [rival.parameters.value(n) for n in RANGES] == [same.parameters.value(n) for n in RANGES]
+    assert rival.validation is None

@@ -29,8 +29,15 @@ from pneuopt.dynamics.hooks import (
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.models.declaration import Alias, DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drives import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
-from pneuopt.models.friction import LOAD_HINTS, FrictionModel, Stribeck, law_inputs
-from pneuopt.models.friction_laws import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
+from pneuopt.models.friction import (
+    FRICTION_KEYS,
+    LOAD_HINTS,
+    STRIBECK_UNKNOWNS,
+    FrictionModel,
+    Stribeck,
+    law_inputs,
+    read_friction,
+)
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import LOAD_FORCE, LOAD_KEYS, Load
 from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings, Thermal
@@ -43,8 +50,7 @@ from pneuopt.models.pneumatic.gas import (
     Smoothing,
     conductance_of_nominal_flow,
 )
-from pneuopt.models.pneumatic.log_checks import LinePressureCheck, PressureZeroCheck
-from pneuopt.models.pneumatic.starts import PneumaticStarts
+from pneuopt.models.pneumatic.logs import LinePressureCheck, PneumaticStarts, PressureZeroCheck
 from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve, Spool
 from pneuopt.models.tolerances import (
     EMPTY_CHAMBER_RATIO,

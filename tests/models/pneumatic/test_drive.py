@@ -12,8 +12,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names, parameter_vector
-from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.friction import Coulomb, FrictionModel, Karnopp, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
 from pneuopt.models.pneumatic.cylinder import Cylinder
