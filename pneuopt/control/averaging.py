@@ -9,7 +9,7 @@ What a slow signal sees of the plant (`AveragedPlant`) is the mean over theta of
 controller's reaction to the ripple included; a sampled wave is held from sample to sample. At amplitude zero it is the
 plant's own linearisation. Zames & Shneydor, IEEE Trans. Autom. Control 21, 1976.
 
-The controller of a loop linearised: its continuous gains, and its response with dead time and sensor.
+`controller_response` is the controller's own frequency response, with dead time and sensor, which both views share.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

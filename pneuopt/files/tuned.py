@@ -1,6 +1,4 @@
-"""tuned.toml: a tuning's file with the gains found and their certificate.
-
-What a tuned.toml's certificate is about, and whether it still holds.
+"""tuned.toml: a tuning's file with the gains found and their certificate, and whether that certificate still holds.
 
 Section [checksum] holds what the certificate is about, as it was parsed: the controller with its gains, the plant, the
 references, limits and scenarios, and a hash of all that, of the certificate's figures and of its status. Comments, the

@@ -1,8 +1,7 @@
 """Studies: metrics over one axis as lines, over two as maps; Pareto fronts; distributions over cases without axes.
 
-Which tolerances matter is drawn as bars: Sobol's indices, and a design's derivatives beside them.
-
-Experiments over time: a planned one, within its limits, and estimates tracked over the dates of their logs.
+Which tolerances matter is drawn as bars: Sobol's indices, and a design's derivatives beside them. Experiments are drawn
+over time: a planned one, within its limits, and estimates tracked over the dates of their logs.
 """
 
 from collections.abc import Mapping
