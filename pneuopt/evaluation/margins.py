@@ -17,9 +17,10 @@ can grow. Under dither the points are those of the response without its ripple, 
 there. A mean over the dither's period alone would smooth a fast command, even under a dither of a picovolt. A plant
 whose Jacobian is the same everywhere has one point, its end.
 
-Searches read the margins and sensitivity peaks of many loops at once (`sensitivity_peaks`). The sensitivity of a loop whose open loop rolls off is ``S(s) = prod (s - p)/prod (s - q)`` over the poles p of the open
-and q of the closed loop. So it takes no frequency response of the plant, and the resonances are known
-beforehand: they lie near the closed loop's poles.
+Searches read the margins and sensitivity peaks of many loops at once (`sensitivity_peaks`). The sensitivity of a loop
+whose open loop rolls off is ``S(s) = prod (s - p)/prod (s - q)`` over the poles p of the open and q of the closed loop.
+So it takes no frequency response of the plant, and the resonances are known beforehand: they lie near the closed loop's
+poles.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
