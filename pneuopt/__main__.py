@@ -9,7 +9,7 @@ def main() -> NoReturn:
     """Run the command line and end the process."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # until somebody listens, Ctrl-C ends this without a traceback
-    from pneuopt.cli.shared import run_guarded
+    from pneuopt.cli.run import run_guarded
 
     run_guarded(_load_app)
 

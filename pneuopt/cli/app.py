@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 import typer
 from typer.models import CommandFunctionType
 
-from pneuopt.cli.shared import ExitStatus, interruption_status, run_guarded
+from pneuopt.cli.run import ExitStatus, interruption_status, run_guarded
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
 from pneuopt.quantities.output import read_once
 

@@ -7,16 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.cli.init import write_files
-from pneuopt.cli.shared import (
-    ExitStatus,
-    Outputs,
-    file_hashes,
-    finish,
-    make_console,
-    show_output_files,
-    show_report,
-    show_sentence,
-)
+from pneuopt.cli.run import ExitStatus
+from pneuopt.cli.shared import Outputs, file_hashes, finish, make_console, show_output_files, show_report, show_sentence
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check, finding_line

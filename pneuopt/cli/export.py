@@ -8,7 +8,8 @@ from typing import Any
 import typer
 
 from pneuopt.cli.init import write_files
-from pneuopt.cli.shared import ExitStatus, make_console, read_fit_and_tuning, show_output_files, warn
+from pneuopt.cli.run import ExitStatus
+from pneuopt.cli.shared import make_console, read_fit_and_tuning, show_output_files, warn
 from pneuopt.export.blocks import export_settings
 from pneuopt.export.fmu import export_fmu
 from pneuopt.export.languages import Language, export_controller

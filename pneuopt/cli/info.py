@@ -13,7 +13,8 @@ from itertools import groupby
 import numpy as np
 import typer
 
-from pneuopt.cli.shared import ExitStatus, make_console, show_pairs
+from pneuopt.cli.run import ExitStatus
+from pneuopt.cli.shared import make_console, show_pairs
 from pneuopt.dynamics.compiled.compiler import COMPILER_FLAGS, cache_directory, cached_libraries, find_compiler
 from pneuopt.dynamics.compiled.rollout import check_machine_code
 from pneuopt.dynamics.system import discretise, parameter_vector

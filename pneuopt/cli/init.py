@@ -10,7 +10,7 @@ from pathlib import Path
 
 import typer
 
-from pneuopt.cli.shared import ExitStatus
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.tolerances import SAMPLE_TIMES
 from pneuopt.evaluation.moves import excitation_run
 from pneuopt.files.drive import read_drive

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
-    ExitStatus,
     Outputs,
     add_to_stem,
     describe_status,

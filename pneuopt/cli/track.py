@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.cli.identify import read_experiments, read_free_drive
+from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
-    ExitStatus,
     Outputs,
     Writers,
     file_hashes,

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pneuopt.cli.run import interruption_status
 from pneuopt.cli.shared import (
     BEST_STEM,
     Outputs,
@@ -14,7 +15,6 @@ from pneuopt.cli.shared import (
     describe_status,
     file_hashes,
     finish,
-    interruption_status,
     make_console,
     progress,
     read_fit_and_tuning,

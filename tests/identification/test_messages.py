@@ -20,8 +20,7 @@ from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError, LogError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from tests.identification import test_identify
-from tests.identification import test_search as test_windows
+from tests.identification import test_identify, test_search
 from tests.identification.test_logged_loop import H, given, logged, loop_of, pressure_fed
 from tests.identification.test_problem import RIG, braked, log_with
 from tests.identification.test_tracking import DATES, fits
@@ -54,14 +53,14 @@ def fit_without_pressures() -> None:
 
 
 def fit_loop_in_windows() -> None:
-    drive = test_windows.DRIVE.system()
-    loop, pushed = ClosedLoop(drive, PID(sample_time=test_windows.STEP)), test_windows.pushed()
+    drive = test_search.DRIVE.system()
+    loop, pushed = ClosedLoop(drive, PID(sample_time=test_search.STEP_WINDOWS)), test_search.pushed()
     columns = {
-        "speed_reference": np.sign(test_windows.FORCE) * 0.1,
-        "position": test_windows.y_centred(pushed),
+        "speed_reference": np.sign(test_search.FORCE_WINDOWS) * 0.1,
+        "position": test_search.y_centred(pushed),
     }
-    log = Experiment(Trajectory(test_windows.TIME, columns))
-    identify(loop, log, loop.parameters.freed(*test_windows.FREE), window=0.5)
+    log = Experiment(Trajectory(test_search.TIME_WINDOWS, columns))
+    identify(loop, log, loop.parameters.freed(*test_search.FREE_WINDOWS), window=0.5)
 
 
 def with_the_command(log: Experiment, run: Trajectory) -> Experiment:

@@ -197,7 +197,7 @@ def test_a_sidecar_accepts_checks_by_name(tmp_path: Path) -> None:
     (tmp_path / "run.toml").write_text('accept = ["work"]\n', encoding="utf-8")
     assert read_log(tmp_path / "run.csv").accept == ("work",)
     (tmp_path / "run.toml").write_text('accept = "work"\n', encoding="utf-8")
-    with pytest.raises(LogError, match=r'accept must list checks, as accept = \["work"\]; got \'work\''):
+    with pytest.raises(InputError, match=r"run.toml: accept must be a list"):
         read_log(tmp_path / "run.csv")
 
 

@@ -1224,6 +1224,7 @@ def test_ctrl_c_in_the_fit_of_a_part_is_no_answer(monkeypatch: pytest.MonkeyPatc
 
 STEP_WINDOWS = 2e-3  # [s]
 TIME_WINDOWS = np.arange(0, 5.0, STEP_WINDOWS)
+FORCE_WINDOWS = 150 * np.sin(2 * np.pi * 1.3 * TIME_WINDOWS) + 60 * np.sin(2 * np.pi * 3.1 * TIME_WINDOWS + 1)
 NOISE_WINDOWS = 1e-6  # of the position [m]
 FREE_WINDOWS = ("load.mass", "friction.coulomb", "friction.viscous")
 TRUTH_WINDOWS = DRIVE.parameters.with_values({"load.mass": 8.0, "friction.coulomb": 30.0, "friction.viscous": 80.0})
@@ -1238,7 +1239,7 @@ def slow_force(seed: int) -> Array:
 @cache
 def pushed(seed: int | None = 1) -> Experiment:
     """The drive's position over five seconds; with a seed a force acts on it that is not in the log."""
-    force = FORCE if seed is None else FORCE + slow_force(seed)
+    force = FORCE_WINDOWS if seed is None else FORCE_WINDOWS + slow_force(seed)
     run = simulate(
         DRIVE.system(),
         Trajectory(TIME_WINDOWS, {"force": force}),
@@ -1246,7 +1247,7 @@ def pushed(seed: int | None = 1) -> Experiment:
         intersample={"force": Intersample.LINEAR},
     )
     noisy = run["position"] + NOISE_WINDOWS * np.random.default_rng(0).standard_normal(TIME_WINDOWS.size)
-    log = Experiment(Trajectory(TIME_WINDOWS, {"force": FORCE, "position": noisy}), name="run")
+    log = Experiment(Trajectory(TIME_WINDOWS, {"force": FORCE_WINDOWS, "position": noisy}), name="run")
     return log.with_intersample({"force": Intersample.LINEAR})
 
 
