@@ -257,6 +257,7 @@ class ForceBalance(NamedTuple):
     with_stated_mass: float  # the same with the stated mass
     without_offset: float  # the same without an offset
     spread: float  # standard deviation of the force
+    rows: "_Rows"  # the windows
 
     def holds(self) -> bool:
         """Whether the balance explains the forces, with friction that brakes."""
@@ -284,9 +285,25 @@ def check_mass(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]
         message += f"stated {axis.inertia_name} of {axis.inertia:.3g} {axis.inertia_unit}"
         message += f" (of the force {left[0]} remain unexplained with the one, {left[1]} with the other)"
         remedy = f"correct {axis.inertia_name}, or the unit of the force, or free {axis.inertia_name}"
-        yield LogFinding(
-            axis.inertia_name, f"{message}: {remedy}", True, evidence=_accelerations(experiment, axis, found)
-        )
+        shown = _accelerations(experiment, axis, found)
+        yield LogFinding(axis.inertia_name, f"{message}: {remedy}", True, evidence=shown)
+
+
+def _accelerations(experiment: Experiment, axis: StatedAxis, found: ForceBalance) -> Evidence:
+    """What the force leaves behind friction, beside the stated mass times the acceleration."""
+    rows = found.rows
+    A = np.column_stack([rows.direction, rows.speed, np.ones(rows.t.size)])
+    used = (rows.direction != 0) & np.isfinite(A).all(axis=1) & np.isfinite(rows.force)
+    rest = rows.force - found.mass * rows.acceleration
+    left = rows.force - A @ np.linalg.lstsq(A[used], rest[used])[0]
+    needed = axis.inertia * rows.acceleration
+    curves = {"force without friction": left, f"stated {axis.inertia_name} times acceleration": needed}
+    shown = {n: np.where(used, curve, np.nan) for n, curve in curves.items()}
+    differs = used & (np.abs(left - needed) > LARGE_SHARE * np.nanmax(np.abs(needed[used])))
+    part = Experiment(Trajectory(rows.t, shown), name=experiment.name)
+    at = int(np.nanargmax(np.abs(shown["force without friction"])))
+    speed = Panel(experiment.unit(axis.speed), {"mean speed": rows.speed})
+    return evidence(part, Panel(axis.force_unit, shown), speed, where=differs, at=at, motion=rows.speed)
 
 
 def check_offset(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -312,7 +329,14 @@ def check_offset(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFindin
             f"the drive pushes with {abs(found.offset):.3g} {axis.force_unit} {more} than the motion needs both ways"
         )
         message += f" (friction is {found.friction:.3g} {axis.force_unit}), as where {cause}"
-        yield LogFinding(axis.push, message, False, evidence=_forces(experiment, axis, found))
+        rows, centre = found.rows, np.full(found.rows.t.size, found.offset)
+        # friction makes the force opposite in either direction
+        curves = {"force of the drive": rows.force, "middle between both directions": centre}
+        forces = Panel(axis.force_unit, {**curves, "where it should be": 0 * centre})
+        part = Experiment(Trajectory(rows.t, {"force": rows.force}), name=experiment.name)
+        speed, at = Panel(experiment.unit(axis.speed), {"mean speed": rows.speed}), int(np.argmax(np.abs(rows.speed)))
+        shown = evidence(part, forces, speed, at=at, motion=rows.speed)
+        yield LogFinding(axis.push, message, False, evidence=shown)
 
 
 def force_balance(experiment: Experiment, axis: StatedAxis) -> ForceBalance | None:
@@ -337,7 +361,13 @@ def _fit_balance(experiment: Experiment, axis: StatedAxis) -> ForceBalance | Non
     rows = _weigh(experiment, axis)
     if rows is None:
         return None
-    lags = [(lag, *_columns(rows, lag)) for lag in sensor_lags(rows.t, LAG_STEPS)]
+    lags, n = [], rows.t.size  # each lag with what holds for it in the windows that move one way
+    for lag in sensor_lags(rows.t, LAG_STEPS):
+        late, early = slice(max(lag, 0), n + min(lag, 0)), slice(max(-lag, 0), n - max(lag, 0))
+        a, s, v, f = rows.acceleration[late], rows.direction[late], rows.speed[late], rows.force[early]
+        used = np.flatnonzero((s != 0) & np.isfinite(a) & np.isfinite(v) & np.isfinite(f))
+        used = used[:: max(1, used.size // MAX_HATS)]
+        lags.append((lag, a[used], s[used], v[used], f[used]))
     if min(min(int((s > 0).sum()), int((s < 0).sum())) for _, _, s, _, _ in lags) < MIN_HATS:
         return None
     if _rms(rows.acceleration) * (rows.t[1] - rows.t[0]) > MAX_PHASE_STEP * _rms(rows.speed):
@@ -354,7 +384,7 @@ def _fit_balance(experiment: Experiment, axis: StatedAxis) -> ForceBalance | Non
     stated = min(math.hypot(R[3, 4] - mass * R[3, 3], R[4, 4]) for R in one)
     fits = ((R[:, [0, 1, 3]], R[:, 4]) for R in one)
     centred = min(float(np.linalg.norm(f - A @ np.linalg.lstsq(A, f)[0])) for A, f in fits)
-    return ForceBalance(own_mass, offset, friction, left[chosen], stated, centred, float(lags[chosen][4].std()))
+    return ForceBalance(own_mass, offset, friction, left[chosen], stated, centred, float(lags[chosen][4].std()), rows)
 
 
 class _Rows(NamedTuple):
@@ -383,13 +413,10 @@ def _weigh(experiment: Experiment, axis: StatedAxis) -> _Rows | None:
     while 8 * half < t.size:
         a = (x[2 * half :] - 2 * x[half:-half] + x[: -2 * half]) / (half * step) ** 2
         if 6 * (noise / (half * step) ** 2) ** 2 < MAX_NOISE_SHARE * float(np.nanmean(a**2)):
-            return _rows(t, x, a, force, half)
+            break
         half *= 2
-    return None
-
-
-def _rows(t: Array, x: Array, a: Array, force: Array, half: int) -> _Rows:
-    step = float(t[1] - t[0])
+    else:
+        return None
     hat = (half - np.abs(np.arange(1 - half, half))) / half**2
     speed = (x[2 * half :] - x[: -2 * half]) / (2 * half * step)
     # by quarters: where a part of a window rests, friction is what holds the body there, and looks like a mass
@@ -398,54 +425,11 @@ def _rows(t: Array, x: Array, a: Array, force: Array, half: int) -> _Rows:
     parts = np.array([x[k + each : k + each + count] - x[k : k + count] for k in edges]) / (each * step)
     least = LARGE_SHARE * float(np.nanquantile(np.abs(speed), 0.99))
     direction = np.where((parts > least).all(axis=0), 1.0, np.where((parts < -least).all(axis=0), -1.0, 0.0))
-    mean = np.convolve(force, hat, "same")[half:-half]
-    return _Rows(t[half:-half], a, speed, mean, direction)
-
-
-def _columns(rows: _Rows, lag: int) -> tuple[Array, Array, Array, Array]:
-    """Acceleration, direction, speed, and the force earlier by a lag, of the windows that move one way."""
-    n = rows.t.size
-    late, early = slice(max(lag, 0), n + min(lag, 0)), slice(max(-lag, 0), n - max(lag, 0))
-    a, s, v, f = rows.acceleration[late], rows.direction[late], rows.speed[late], rows.force[early]
-    used = np.flatnonzero((s != 0) & np.isfinite(a) & np.isfinite(v) & np.isfinite(f))
-    used = used[:: max(1, used.size // MAX_HATS)]
-    return a[used], s[used], v[used], f[used]
+    return _Rows(t[half:-half], a, speed, np.convolve(force, hat, "same")[half:-half], direction)
 
 
 def _rms(e: Array) -> float:
     return math.sqrt(float(np.nanmean(e**2)))
-
-
-def _accelerations(experiment: Experiment, axis: StatedAxis, found: ForceBalance) -> Evidence | None:
-    """What the force leaves behind friction, beside the stated mass times the acceleration."""
-    rows = _weigh(experiment, axis)
-    if rows is None:
-        return None
-    A = np.column_stack([rows.direction, rows.speed, np.ones(rows.t.size)])
-    used = (rows.direction != 0) & np.isfinite(A).all(axis=1) & np.isfinite(rows.force)
-    rest = rows.force - found.mass * rows.acceleration
-    left = rows.force - A @ np.linalg.lstsq(A[used], rest[used])[0]
-    needed = axis.inertia * rows.acceleration
-    curves = {"force without friction": left, f"stated {axis.inertia_name} times acceleration": needed}
-    shown = {n: np.where(used, curve, np.nan) for n, curve in curves.items()}
-    differs = used & (np.abs(left - needed) > LARGE_SHARE * np.nanmax(np.abs(needed[used])))
-    part = Experiment(Trajectory(rows.t, shown), name=experiment.name)
-    at = int(np.nanargmax(np.abs(shown["force without friction"])))
-    speed = Panel(experiment.unit(axis.speed), {"mean speed": rows.speed})
-    return evidence(part, Panel(axis.force_unit, shown), speed, where=differs, at=at, motion=rows.speed)
-
-
-def _forces(experiment: Experiment, axis: StatedAxis, found: ForceBalance) -> Evidence | None:
-    """The force beside its mean in either direction, which friction makes opposite."""
-    rows = _weigh(experiment, axis)
-    if rows is None:
-        return None
-    force, centre = rows.force, np.full(rows.t.size, found.offset)
-    curves = {"force of the drive": force, "middle between both directions": centre, "where it should be": 0 * centre}
-    part = Experiment(Trajectory(rows.t, {"force": force}), name=experiment.name)
-    at = int(np.argmax(np.abs(rows.speed)))
-    speed = Panel(experiment.unit(axis.speed), {"mean speed": rows.speed})
-    return evidence(part, Panel(axis.force_unit, curves), speed, at=at, motion=rows.speed)
 
 
 def check_dwells(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -497,7 +481,15 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
     middle, level = _usual_push(inside, motion, push)
     for side, end in ((1, float(np.nanmax(x))), (-1, float(np.nanmin(x)))):
         held = (np.abs(x - end) < width) & (side * (push - middle) > MIN_STOP_FORCE_RATIO * level)
-        begin, last = _longest_run(held)
+        edges = np.flatnonzero(
+            np.diff(np.pad(held.astype(int), 1))
+        )  # first samples of runs, and those after their last
+        if not edges.size:
+            continue
+        begin, behind = max(
+            zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True), key=lambda run: run[1] - run[0]
+        )
+        last = behind - 1
         is_long = last - begin >= MIN_SAMPLES and log.t[last] - log.t[begin] >= SHORTEST_REST
         if not is_long or any(abs(end - stop) < STATED_STOP_SHARE * float(np.ptp(axis.stops)) for stop in axis.stops):
             continue
@@ -526,15 +518,6 @@ def _usual_push(inside: Mask, motion: Array, push: Array) -> tuple[float, float]
     held = np.abs(push[(np.abs(motion) < fast) & inside] - middle)
     holding = float(np.nanquantile(held, 0.99)) if held.size >= MIN_SAMPLES else 0.0
     return middle, max(float(np.nanmedian(pushes)), holding)
-
-
-def _longest_run(mask: Mask) -> tuple[int, int]:
-    """First and last sample of the longest run; (0, 0) without one."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    if not edges.size:
-        return 0, 0
-    longest = int(np.argmax(edges[1::2] - edges[::2]))
-    return int(edges[2 * longest]), int(edges[2 * longest + 1]) - 1
 
 
 def check_jumps(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
@@ -816,8 +799,15 @@ def check_command(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFindi
             shown = evidence(part, "valve_voltage", speed_panel(experiment, axis, motion))
             yield LogFinding("valve_voltage", message, True, evidence=shown)
         return
-    lowest, highest = _command_correlations(t, command, motion)
-    if lowest < WRONG_SIGN_CORRELATIONS[0] and highest < WRONG_SIGN_CORRELATIONS[1]:
+    grid = np.linspace(t[0], t[-1], t.size)
+    u, v = np.interp(grid, t, command), np.interp(grid, t, motion)
+    most = min(round(MAX_COMMAND_LAG / float(grid[1] - grid[0])), t.size // 4)
+    lags = range(0, most + 1, max(1, most // MEAN_BLOCKS))
+    if np.ptp(v) == 0 or any(np.ptp(u[: u.size - k]) == 0 for k in lags):
+        return
+    correlations = [float(np.corrcoef(u[: u.size - k], v[k:])[0, 1]) for k in lags]
+    lowest = min(correlations)
+    if lowest < WRONG_SIGN_CORRELATIONS[0] and max(correlations) < WRONG_SIGN_CORRELATIONS[1]:
         at = int(np.argmax(np.abs(motion)))
         seen = f"correlation {lowest:.2f}; {motion[at]:.3g} m/s at {t[at]:.4g} s under {command[at]:.3g} V"
         message = f"the piston runs against the valve's command ({seen}): change the sign of "
@@ -843,18 +833,6 @@ def _work_shares(t: Array, pushes: Array, motion: Array, lag: int) -> Array:
     known = pushes[:, at]
     work, total = known @ travel, np.abs(known) @ np.abs(travel)
     return np.asarray(np.divide(work, total, out=unknown, where=total > 0))
-
-
-def _command_correlations(t: Array, command: Array, motion: Array) -> tuple[float, float]:
-    """Least and largest correlation of a speed with the command up to `MAX_COMMAND_LAG` before; NaN at rest."""
-    grid = np.linspace(t[0], t[-1], t.size)
-    u, v = np.interp(grid, t, command), np.interp(grid, t, motion)
-    most = min(round(MAX_COMMAND_LAG / float(grid[1] - grid[0])), t.size // 4)
-    lags = range(0, most + 1, max(1, most // MEAN_BLOCKS))
-    if np.ptp(v) == 0 or any(np.ptp(u[: u.size - k]) == 0 for k in lags):
-        return math.nan, math.nan
-    found = [float(np.corrcoef(u[: u.size - k], v[k:])[0, 1]) for k in lags]
-    return min(found), max(found)
 
 
 def check_has_motion(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
