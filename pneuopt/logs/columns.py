@@ -225,23 +225,18 @@ def _column_scaling(unit: str, scale: str | float | None, target: str, where: st
         f'{where} scale: {scale!r} does not say from where the pressure counts; write "2 bar(g)/V" or "2 bar(a)/V"',
         UnitError,
     )
-    bare, bare_target = (re.sub(r"\([ag]\)", "", text) for text in (unit, target))
-    gain = _read_gain(re.sub(r"\([ag]\)", "", str(scale)), bare, bare_target, f"{where} scale")
-    return gain, si_conversion(bare_target + (level[0] if level else ""), target, where=f"{where} scale")[1]
-
-
-def _read_gain(scale: str, unit: str, target: str, where: str) -> float:
-    """A sensor's "35 N/V", or its inverse, as data sheets of encoders have it: "8192 count/rev"."""
-    try:
-        return read_value(scale, f"({target})/({unit})", where=where)
+    bare, bare_target, said = (re.sub(r"\([ag]\)", "", str(text)) for text in (unit, target, scale))
+    try:  # a sensor's "35 N/V", or its inverse, as data sheets of encoders have it: "8192 count/rev"
+        gain = read_value(said, f"({bare_target})/({bare})", where=f"{where} scale")
     except UnitError:
         try:
-            inverse = read_value(scale, f"({unit})/({target})")
+            inverse = read_value(said, f"({bare})/({bare_target})")
         except UnitError:
             inverse = 0.0
         if not inverse:
             raise
-        return 1 / inverse
+        gain = 1 / inverse
+    return gain, si_conversion(bare_target + (level[0] if level else ""), target, where=f"{where} scale")[1]
 
 
 def _check_samples(table: LogTable, found: Mapping[str, ChannelColumn], values: Mapping[str, Array]) -> None:
@@ -260,11 +255,6 @@ def _check_samples(table: LogTable, found: Mapping[str, ChannelColumn], values: 
             require(
                 not missing.any(), f"{table.path}: row {row}, {where}: the time is missing; delete the row", LogError
             )
-    _check_order(table, t)
-
-
-def _check_order(table: LogTable, t: Array) -> None:
-    """Refuse a time that does not increase, and name all rows where it does not."""
     steps = np.diff(t)
     if (steps > 0).all():
         return
@@ -440,7 +430,9 @@ def _guess_column(
     require(enough or channel != "time", few, LogError)
     if name in table.stamps:
         return [ColumnGuess(channel, name, "")]
-    stated = split_unit(name)[1] or table.units.get(name, "") or _unit_suffix(name, target)
+    stated, last = split_unit(name)[1] or table.units.get(name, ""), re.split(r"[ _]", name.strip())[-1]
+    if not stated and last != name.strip() and not last.isdigit():  # the end of "t_ms" is a unit
+        stated = last if _measures(last, target) or _measures(f"{last}(a)", target) else ""
     unit = _settle_unit(channel, name, stated, target, values, ask)
     if not unit:
         return []
@@ -490,13 +482,6 @@ def _measures(unit: str, target: str) -> bool:
     except UnitError:
         return False
     return True
-
-
-def _unit_suffix(name: str, target: str) -> str:
-    """The unit at the end of a name, "t_ms" for example."""
-    last = re.split(r"[ _]", name.strip())[-1]
-    is_unit = last != name.strip() and (_measures(last, target) or _measures(f"{last}(a)", target))
-    return last if is_unit and not last.isdigit() else ""
 
 
 def _steps(stamps: Array) -> Array:

@@ -80,7 +80,10 @@ def read_lvm(path: Path, raw: bytes) -> LogTable:
     delimiter = next((d for d in "\t,;" if d in lines[0]), "\t")
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines[: head + 1]]
     keys = {row[0]: row[1:] for row in rows}
-    names = _names(rows[head])
+    # the first X_Value is the time, further ones are those of the channels behind them
+    names = ["" if name == _TIME else name for name in rows[head]]
+    names[names.index("") if "" in names else 0] = "time"
+    names = names[: names.index("Comment") if "Comment" in names else len(names) - (not names[-1])]
     require(_TIME in rows[head], f"{path}: row {head + 1} names no {_TIME}; save the log again", LogError)
     labels = zip([name for name in names[1:] if name], keys.get("Y_Unit_Label", []), strict=False)
     units = {**{name: plain_unit(label) or label for name, label in labels if label}, "time": "s"}
@@ -89,13 +92,6 @@ def read_lvm(path: Path, raw: bytes) -> LogTable:
     grid = _lvm_grid(path, keys) if keys.get("X_Columns", [""])[0] == "No" else None
     remark = f"rows 1 to {head} are read as the head of a LabVIEW measurement file"
     return LogTable(path, names, head + 2, partial(_lvm_columns, block, grid), units, frozenset(), (remark,))
-
-
-def _names(row: Sequence[str]) -> list[str]:
-    """Of the columns: the first X_Value is the time, further ones are those of the channels behind them."""
-    names = ["" if name == _TIME else name for name in row]
-    names[names.index("") if "" in names else 0] = "time"
-    return names[: names.index("Comment")] if "Comment" in names else names[: len(names) - (not names[-1])]
 
 
 def _lvm_grid(path: Path, keys: Mapping[str, Sequence[str]]) -> tuple[float, float]:
@@ -320,7 +316,16 @@ def read_mdf(path: Path, raw: bytes) -> LogTable:
     log = run_apart(_read_mdf_channels, path, raw, kind="MDF")
     names = ["time", *(name for name in log.columns if name.casefold() != "time")]
     units = {name: plain_unit(unit) or unit for name, unit in log.units.items() if unit}
-    return LogTable(path, names, 1, partial(_mdf_columns, path, log), {**units, "time": "s"})
+
+    def read(names: Sequence[str]) -> dict[str, Array]:
+        channels = [name for name in names if name != "time"]
+        times = [log.times[log.groups[name]] for name in channels]
+        text = f"{path}: channels {', '.join(channels)} are of groups with different times; export them at one rate"
+        require(all(np.array_equal(t, times[0], equal_nan=True) for t in times), text, LogError)
+        columns = {"time": times[0], **{name: log.columns[name] for name in channels}}
+        return dict(array_table(path, columns, {}).read(names))
+
+    return LogTable(path, names, 1, read, {**units, "time": "s"})
 
 
 class _Log(NamedTuple):
@@ -358,15 +363,6 @@ def _read_mdf_channels(path: Path, raw: bytes) -> _Log:
     return log
 
 
-def _mdf_columns(path: Path, log: _Log, names: Sequence[str]) -> dict[str, Array]:
-    channels = [name for name in names if name != "time"]
-    times = [log.times[log.groups[name]] for name in channels]
-    text = f"{path}: channels {', '.join(channels)} are of groups with different times; export them at one rate"
-    require(all(np.array_equal(t, times[0], equal_nan=True) for t in times), text, LogError)
-    columns = {"time": times[0], **{name: log.columns[name] for name in channels}}
-    return dict(array_table(path, columns, {}).read(names))
-
-
 def read_parquet(path: Path, raw: bytes) -> LogTable:
     """Read a Parquet file; its first sample is row 1.
 
@@ -379,7 +375,14 @@ def read_parquet(path: Path, raw: bytes) -> LogTable:
     stamps = frozenset(field.name for field in fields if _is_time(field.type))
     texts = {f.name: {k.decode(): v.decode(errors="replace") for k, v in (f.metadata or {}).items()} for f in fields}
     units = {name: unit for name, said in texts.items() if (unit := _unit(said))}
-    return LogTable(path, [field.name for field in fields], 1, partial(_parquet_columns, path, raw), units, stamps)
+    every = [field.name for field in fields]
+
+    def read(names: Sequence[str]) -> dict[str, Array]:
+        with _parquet_file(path, raw) as file:
+            columns = file.read()
+            return {name: _parquet_numbers(path, name, columns.column(every.index(name))) for name in names}
+
+    return LogTable(path, every, 1, read, units, stamps)
 
 
 _UNIT_KEYS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "units")
@@ -399,13 +402,6 @@ def _parquet_file(path: Path, raw: bytes) -> "Iterator[pq.ParquetFile]":
 
     with foreign_code(path, "Parquet"), pq.ParquetFile(pa.BufferReader(raw)) as file:
         yield file
-
-
-def _parquet_columns(path: Path, raw: bytes, names: Sequence[str]) -> dict[str, Array]:
-    with _parquet_file(path, raw) as file:
-        places = [file.schema_arrow.names.index(name) for name in names]
-        columns = file.read()
-        return {name: _parquet_numbers(path, name, columns.column(i)) for name, i in zip(names, places, strict=True)}
 
 
 def _is_time(kind: "pa.DataType") -> bool:
@@ -455,20 +451,18 @@ def read_tdms(path: Path, raw: bytes) -> LogTable:
     if not grids or any(name.casefold() == "time" for name in columns):
         return array_table(path, columns, units)
     table = array_table(path, {"time": np.zeros(0), **columns}, {**units, "time": "s"})
-    return LogTable(path, table.names, 1, partial(_read_waveforms, table, grids), table.units, table.stamps)
 
+    def read(names: Sequence[str]) -> dict[str, Array]:
+        named = [name for name in names if name != "time"]
+        rates = {grids.get(name) for name in named}
+        text = f"{path}: the waveforms of {', '.join(named)} differ in start or step; export them at one rate"
+        require(len(rates) == 1 and None not in rates, text, LogError)
+        numbers = dict(table.read(named))
+        _, start, step = next(grid for grid in rates if grid is not None)
+        time = np.asarray(start + step * np.arange(len(numbers[named[0]])), dtype=np.float64)
+        return {name: time if name == "time" else numbers[name] for name in names}
 
-def _read_waveforms(
-    table: LogTable, grids: dict[str, tuple[str, float, float]], names: Sequence[str]
-) -> dict[str, Array]:
-    channels = [name for name in names if name != "time"]
-    columns = dict(table.read(channels))
-    rates = {grids.get(name) for name in channels}
-    text = f"{table.path}: the waveforms of {', '.join(channels)} differ in start or step; export them at one rate"
-    require(len(rates) == 1 and None not in rates, text, LogError)
-    _, start, step = next(grid for grid in rates if grid is not None)
-    time = np.asarray(start + step * np.arange(len(columns[channels[0]])), dtype=np.float64)
-    return {name: time if name == "time" else columns[name] for name in names}
+    return LogTable(path, table.names, 1, read, table.units, table.stamps)
 
 
 _SHOWN_DATE = "0:00:00"  # what a date looks like where only its being one counts

@@ -1,7 +1,7 @@
 """A log read in spite of rows and cells that no reader takes, with what was done to them, row by row."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,8 +40,7 @@ def mend_log(path: str | Path, *, plant: Plant | None = None, ambient_pressure: 
     path = Path(path)
     raw, beside = read_bytes(path), read_sidecar(path, None, None)
     channels = {**CHANNELS, **({} if plant is None else plant_channels(plant))}
-    make = _table_maker(path, raw)
-    table = make(())[0]
+    table = parse_log(path, raw)
     names, entries = list[str](), dict[str, Any]()  # entries for columns whose names nearly are channels
     taken = {n for n in channels if n in beside.columns}
     for name in table.names:
@@ -52,23 +51,14 @@ def mend_log(path: str | Path, *, plant: Plant | None = None, ambient_pressure: 
             names.append(f"column {name!r} is read as the channel {channel!r}")
     beside = beside._replace(columns={**entries, **beside.columns}) if entries else beside
     found, _ = find_columns(table, beside.columns, beside.columns_from, channels)
-    table, changes = make([column.name for column in found.values()])
+    changes = dict[str, list[int]]()
+    if READERS[path.suffix.lower()] is read_delimited:
+        block, layout = find_block(path, decode(path, raw))
+        block, changes = mend_cells(block, [column.name for column in found.values()])
+        table = block_table(block, layout)
     table, rows = _mend_rows(table, found, changes)
     log = assemble_log(path, raw, table, beside, plant, ambient_pressure)
     return MendedLog(log, rows, (*names, *(f"{list_rows(r)}: {what}" for what, r in changes.items())))
-
-
-def _table_maker(path: Path, raw: bytes) -> Callable[[Sequence[str]], tuple[LogTable, dict[str, list[int]]]]:
-    """A function from the columns that have to be numbers to the table, and what was mended in its cells."""
-    if READERS.get(path.suffix.lower()) is not read_delimited:
-        return lambda _: (parse_log(path, raw), {})
-    block, layout = find_block(path, decode(path, raw))
-
-    def make(used: Sequence[str]) -> tuple[LogTable, dict[str, list[int]]]:
-        mended, changes = mend_cells(block, used)
-        return block_table(mended, layout), changes
-
-    return make
 
 
 def _mend_rows(

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -139,17 +138,17 @@ def run_apart(read: Callable[[Path, bytes], Result], path: Path, raw: bytes, kin
 def array_table(path: Path | str, columns: Mapping[str, Any], units: Mapping[str, str]) -> LogTable:
     """A table of arrays, each (n,), its first sample in row 1; dates or durations count in seconds from the first."""
     stamps = frozenset(name for name, column in columns.items() if np.asarray(column).dtype.kind in "Mm")
-    return LogTable(path, list(columns), 1, partial(_read_columns, path, columns), units, stamps)
 
+    def read(names: Sequence[str]) -> dict[str, Array]:
+        arrays = {name: np.asarray(columns[name]) for name in names}
+        for name, array in arrays.items():
+            n, first = array.size, arrays[names[0]].size
+            text = f"{path}: column {name!r} has {n} samples, column {names[0]!r} has {first}; export them at one rate"
+            require(n == first and array.ndim == 1, text, LogError)
+            check_cells(path, n, len(names))
+        return {name: _floats(path, name, array) for name, array in arrays.items()}
 
-def _read_columns(path: Path | str, columns: Mapping[str, Any], names: Sequence[str]) -> dict[str, Array]:
-    arrays = {name: np.asarray(columns[name]) for name in names}
-    for name, array in arrays.items():
-        n, first = array.size, arrays[names[0]].size
-        text = f"{path}: column {name!r} has {n} samples, column {names[0]!r} has {first}; export them at one rate"
-        require(n == first and array.ndim == 1, text, LogError)
-        check_cells(path, n, len(names))
-    return {name: _floats(path, name, array) for name, array in arrays.items()}
+    return LogTable(path, list(columns), 1, read, units, stamps)
 
 
 def _floats(path: Path | str, name: str, column: Any) -> Array:
