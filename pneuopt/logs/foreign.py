@@ -558,20 +558,21 @@ def _xlsx_columns(sheet: _Sheet, names: Sequence[str]) -> dict[str, Array]:
             place = f"{sheet.path}: row {k + sheet.first_row}, column {name!r}"
             require(is_number, f"{place}: {str(cell)[:40]!r} is not a number; {EMPTY_CELL}", LogError)
             numbers[k] = float(cell) if not abs(cell) > MAX_MAGNITUDE else np.inf  # which is refused
-        columns[name] = _seconds(sheet, name, numbers) if name in sheet.stamps else numbers
+        columns[name] = numbers
+        if name not in sheet.stamps:
+            continue
+        # days become seconds from the first; a time of day leaps back at midnight, and a double holds a date to 0.6 us
+        wrong = np.flatnonzero(np.abs(numbers) > MAX_DAYS)
+        if wrong.size:
+            place = f"{sheet.path}: row {wrong[0] + sheet.first_row}, column {name!r}"
+            remedy = "write a date with its time, or a number"
+            raise LogError(f"{place}: {numbers[wrong[0]]:.6g} is no date of Excel; {remedy}")
+        known = numbers[np.isfinite(numbers)]
+        days = numbers
+        if known.max(initial=0.0) <= 1:
+            days = numbers + np.cumsum(np.diff(numbers, prepend=numbers[:1]) < -0.5)
+        columns[name] = np.asarray(np.round((days - (known[0] if known.size else 0.0)) * 86400, 6))
     return columns
-
-
-def _seconds(sheet: _Sheet, name: str, days: Array) -> Array:
-    """Seconds from the first; a time of day leaps back at midnight. A double holds today's date to 0.6 us."""
-    wrong = np.flatnonzero(np.abs(days) > MAX_DAYS)
-    if wrong.size:
-        place = f"{sheet.path}: row {wrong[0] + sheet.first_row}, column {name!r}"
-        raise LogError(f"{place}: {days[wrong[0]]:.6g} is no date of Excel; write a date with its time, or a number")
-    known = days[np.isfinite(days)]
-    if known.max(initial=0.0) <= 1:
-        days = days + np.cumsum(np.diff(days, prepend=days[:1]) < -0.5)
-    return np.asarray(np.round((days - (known[0] if known.size else 0.0)) * 86400, 6))
 
 
 READERS: Mapping[str, Callable[[Path, bytes], LogTable]] = {

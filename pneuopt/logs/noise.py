@@ -75,7 +75,14 @@ def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstima
     least = min(level.value for level in levels)
     chosen = next(level for level in levels if level.value <= (1 + level.uncertainty) * least)
     random = math.sqrt(max(chosen.value**2 - resolution**2 / 12, 0.0))
-    return NoiseEstimate(random, resolution, _is_white(chosen))
+    # white: its differences are uncorrelated beyond their own length
+    finite, order = np.isfinite(chosen.off), chosen.order
+    e = np.where(finite, np.clip(chosen.off, -4 * chosen.value, 4 * chosen.value), 0.0)
+    lags = range(order + 1, min(order + 1 + WHITE_LAGS, e.size - 1))
+    correlation = max((abs(float(e[k:] @ e[:-k])) for k in lags), default=0.0)
+    chance = 4 * (1 + order) ** 0.25 / math.sqrt(max(1, int(finite.sum())))
+    is_white = correlation <= min(MAX_CORRELATION + chance, 0.5) * float(e @ e)
+    return NoiseEstimate(random, resolution, is_white)
 
 
 def find_resolution(values: ArrayLike) -> float:
@@ -115,16 +122,6 @@ class _Level(NamedTuple):
     uncertainty: float
     order: int
     off: Array
-
-
-def _is_white(level: _Level) -> bool:
-    """Whether differences are uncorrelated beyond their own length."""
-    known = np.isfinite(level.off)
-    e = np.where(known, np.clip(level.off, -4 * level.value, 4 * level.value), 0.0)
-    lags = range(level.order + 1, min(level.order + 1 + WHITE_LAGS, e.size - 1))
-    correlations = [abs(float(e[k:] @ e[:-k])) for k in lags]
-    chance = 4 * (1 + level.order) ** 0.25 / math.sqrt(max(1, int(known.sum())))
-    return bool(max(correlations, default=0.0) <= min(MAX_CORRELATION + chance, 0.5) * float(e @ e))
 
 
 def _levels(t: Array, y: Array) -> list[_Level]:

@@ -438,7 +438,7 @@ def seconds_from_first(cells: Sequence[str], path: Path | str, name: str, first_
     moments: list[int | None] = []
     for k, match in enumerate(matches):
         moments.append(_nanoseconds(match, days, month_first, places[k]) if match else None)
-    if not any(days):
+    if not days:
         day, shift, last = 86400 * 10**9, 0, None
         for k, moment in enumerate(moments):
             if moment is not None:
@@ -461,9 +461,20 @@ def _month_first(matches: Sequence[re.Match[str]], place: str) -> bool:
 
 
 def _nanoseconds(match: re.Match[str], days: dict[str, int], month_first: bool, place: str) -> int:
+    """The moment of a stamp; `days` holds the numbers of the dates that were read."""
     text = match["date"] or ""
-    if text not in days:
-        days[text] = _day_number(text, month_first, place)
+    if text and text not in days:
+        parts = [int(part) for part in re.split("[-/.]", text)]
+        if re.match(r"\d{4}", text):
+            year, month, day = parts
+        elif "." in text or not month_first:
+            day, month, year = parts
+        else:
+            month, day, year = parts
+        try:
+            days[text] = date(year + 2000 * (year < 100), month, day).toordinal()
+        except ValueError:
+            raise LogError(f"{place}: {text!r} is no date; write it as 2026-03-12") from None
     hour, minute, second = int(match["h"]), int(match["m"]), int(match["s"] or 0)
     half = (match["half"] or "").lower()
     fits = hour < (13 if half else 25) and minute < 60 and second < 61
@@ -472,20 +483,4 @@ def _nanoseconds(match: re.Match[str], days: dict[str, int], month_first: bool, 
     zone = (match["zone"] or "Z").replace(":", "").replace("Z", "+0000").ljust(5, "0")
     shift = (int(zone[1:3]) * 60 + int(zone[3:5])) * (-1 if zone[0] == "-" else 1)
     fraction = int((match["f"] or "0").ljust(9, "0"))
-    return (((days[text] * 24 + hour) * 60 + minute - shift) * 60 + second) * 10**9 + fraction
-
-
-def _day_number(text: str, month_first: bool, place: str) -> int:
-    if not text:
-        return 0
-    parts = [int(part) for part in re.split("[-/.]", text)]
-    if re.match(r"\d{4}", text):
-        year, month, day = parts
-    elif "." in text or not month_first:
-        day, month, year = parts
-    else:
-        month, day, year = parts
-    try:
-        return date(year + 2000 * (year < 100), month, day).toordinal()
-    except ValueError:
-        raise LogError(f"{place}: {text!r} is no date; write it as 2026-03-12") from None
+    return (((days.get(text, 0) * 24 + hour) * 60 + minute - shift) * 60 + second) * 10**9 + fraction

@@ -71,7 +71,12 @@ class ForceDrive:
         starts = partial(force_starts, self.friction)
         system = define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, starts)
         hints = self.friction.identification_hints.with_prefix("friction") | LOAD_HINTS
-        return with_rest(replace(system, identification_hints=hints, meter=_power_meter(system)), FORCE, Axis())
+        # the power that the motor draws [W], zero where it brakes: it cannot feed back
+        arguments = [ca.SX.sym(n, system.ode.size1_in(i)) for i, n in enumerate("txup")]
+        force = arguments[2][names(system.inputs).index("force")]
+        speed = arguments[1][names(system.states).index("speed")]
+        meter = ca.Function("meter", arguments, [ca.fmax(force * speed, 0)], [*"txup"], ["power"])
+        return with_rest(replace(system, identification_hints=hints, meter=meter), FORCE, Axis())
 
 
 @dataclass(frozen=True)
@@ -184,13 +189,6 @@ AMBIENT_PARAMETERS = ParameterSet(
 _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
 
 
-def _power_meter(system: System) -> ca.Function:
-    """Function ``(t, x, u, p)`` for the power that the motor draws [W], zero where it brakes: it cannot feed back."""
-    t, x, u, p = (ca.SX.sym(n, system.ode.size1_in(i)) for i, n in enumerate("txup"))
-    force, speed = (u[names(system.inputs).index("force")], x[names(system.states).index("speed")])
-    return ca.Function("meter", [t, x, u, p], [ca.fmax(force * speed, 0)], ["t", "x", "u", "p"], ["power"])
-
-
 def _ambient_parameters(friction: FrictionModel) -> ParameterSet:
     return AMBIENT_PARAMETERS if _pressure_inputs(friction) else ParameterSet()
 
@@ -301,20 +299,19 @@ class _RotaryStarts:
             parameters = ParameterSet({n: _scale(known[own], unit, 1 / f) for own, (n, unit, f) in factors.items()})
             sliding[name] = Log(Trajectory(measured.t, columns), parameters)
         turning = {n: (own, f) for own, (n, _, f) in factors.items()}
-        return [self._turning_start(start, turning) for start in force_starts(self.friction, sliding)]
-
-    def _turning_start(self, start: Start, turning: Mapping[str, tuple[str, float]]) -> Start:
-        """The start of the shaft, from that of the sliding mass; `turning` gives name and factor by the mass's name."""
-        values = {}
-        for whole, value in start.parameters.items():
-            base, bracket, log = whole.partition("[")
-            name, factor = turning[base]
-            values[name + bracket + log] = factor * value
-        states = {
-            log: Trajectory(run.t, {"angle" if n == "position" else n: run[n] / RADIUS for n in run})
-            for log, run in start.states.items()
-        }
-        return replace(start, states=states, parameters=values)
+        turned = []
+        for start in force_starts(self.friction, sliding):
+            values = {}
+            for whole, value in start.parameters.items():
+                base, bracket, log = whole.partition("[")
+                name, factor = turning[base]
+                values[name + bracket + log] = factor * value
+            states = {
+                log: Trajectory(run.t, {"angle" if n == "position" else n: run[n] / RADIUS for n in run})
+                for log, run in start.states.items()
+            }
+            turned.append(replace(start, states=states, parameters=values))
+        return turned
 
 
 def _turning_unit(unit: str) -> tuple[str, float]:

@@ -345,8 +345,13 @@ class Stribeck:
     @property
     def start(self) -> FrictionStart:
         """Regression that is linear in all parameters but the Stribeck velocity, which is scanned."""
+
+        def columns(s: FrictionSamples) -> dict[str, Array]:
+            peak = np.exp(-((s.level_speed / s.values["stribeck_velocity"]) ** 2))
+            return {"coulomb": s.side, "static": s.side * peak, "viscous": s.speed}
+
         unknowns = ("coulomb", "viscous", "static", "stribeck_velocity")
-        return FrictionStart(_stribeck_columns, unknowns, _FLOORS, {"static": "coulomb"}, _STRIBECK_SCAN)
+        return FrictionStart(columns, unknowns, _FLOORS, {"static": "coulomb"}, _STRIBECK_SCAN)
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """Return the force and the rates of the states; see the class."""
@@ -392,7 +397,13 @@ class LuGre:
     def start(self) -> FrictionStart:
         """Regression on a Stribeck curve while sliding, and on a spring in presliding."""
         sliding = Stribeck().start
-        bristles = Bristles("bristle_stiffness", "coulomb", BRISTLE_STIFFNESS_RANGE, _bristle_deflection)
+
+        def deflection(force: Array, speed: Array, values: Mapping[str, float]) -> dict[str, Array]:
+            limit = values["static"] / values["bristle_stiffness"]  # the deflection at break-away
+            bent = (force - values["viscous"] * speed) / values["bristle_stiffness"]
+            return {"bristle": np.clip(bent, -limit, limit)}
+
+        bristles = Bristles("bristle_stiffness", "coulomb", BRISTLE_STIFFNESS_RANGE, deflection)
         return replace(sliding, unknowns=(*sliding.unknowns, "bristle_stiffness", "bristle_damping"), bristles=bristles)
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
@@ -541,18 +552,6 @@ def stribeck_curve(v: ca.SX, coulomb: ca.SX, static: ca.SX, stribeck_velocity: c
     51.0364
     """
     return coulomb + (static - coulomb) * ca.exp(-((v / stribeck_velocity) ** 2))
-
-
-def _stribeck_columns(s: FrictionSamples) -> dict[str, Array]:
-    peak = np.exp(-((s.level_speed / s.values["stribeck_velocity"]) ** 2))
-    return {"coulomb": s.side, "static": s.side * peak, "viscous": s.speed}
-
-
-def _bristle_deflection(force: Array, speed: Array, values: Mapping[str, float]) -> dict[str, Array]:
-    """Bristle deflection that gives the force, at most that at break-away."""
-    limit = values["static"] / values["bristle_stiffness"]
-    deflection = (force - values["viscous"] * speed) / values["bristle_stiffness"]
-    return {"bristle": np.clip(deflection, -limit, limit)}
 
 
 _FLOORS = {"coulomb": MIN_COULOMB_SHARE, "viscous": 0.0}

@@ -444,24 +444,21 @@ class LinearStarts:
         for n in (n for n in estimates if n in parameters and parameters[n].free):
             value = float(np.clip(estimates[n], parameters[n].lower, parameters[n].upper))
             values |= {f"{n}[{log}]": value for log in logs} if parameters[n].per_log else {n: value}
-        states = {
-            name: self._state_trajectory(fit, record, error).interpolate(log.measured.t)
-            for (name, log), record, error in zip(logs.items(), records, fit.errors, strict=True)
-        }
+        states = {}
+        for (name, log), record, error in zip(logs.items(), records, fit.errors, strict=True):
+            response = record.y - error
+            drive = np.gradient(response, record.t)
+            if self.shape.friction_polynomials is not None:
+                lead = self.shape.friction_polynomials(*fit.values[: len(self.shape.names)])[0][0]
+                drive = drive + lead * fit.gain * fit.coulomb * record.sign
+            columns = {n: np.zeros(len(record.t)) for n in (*self.zero_states, *self.delay_line)}
+            if self.delay_line:
+                dead_time = fit.values[len(self.shape.names)]
+                line = delay_states(record.u, float(record.t[1] - record.t[0]), len(self.delay_line), dead_time)
+                columns |= dict(zip(self.delay_line, line.T, strict=True))
+            run = Trajectory(record.t + record.start_time, columns | {self.output: response, "drive": drive})
+            states[name] = run.interpolate(log.measured.t)
         return Start(states, values, ", ".join(f"{n.removeprefix('plant.')} {v:.3g}" for n, v in estimates.items()))
-
-    def _state_trajectory(self, fit: "_Fit", record: "_EvenLog", error: Array) -> Trajectory:
-        response = record.y - error
-        drive = np.gradient(response, record.t)
-        if self.shape.friction_polynomials is not None:
-            lead = self.shape.friction_polynomials(*fit.values[: len(self.shape.names)])[0][0]
-            drive = drive + lead * fit.gain * fit.coulomb * record.sign
-        columns = {n: np.zeros(len(record.t)) for n in (*self.zero_states, *self.delay_line)}
-        if self.delay_line:
-            dead_time = fit.values[len(self.shape.names)]
-            line = delay_states(record.u, float(record.t[1] - record.t[0]), len(self.delay_line), dead_time)
-            columns |= dict(zip(self.delay_line, line.T, strict=True))
-        return Trajectory(record.t + record.start_time, columns | {self.output: response, "drive": drive})
 
 
 @dataclass(frozen=True, eq=False)

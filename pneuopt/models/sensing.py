@@ -6,6 +6,7 @@ Only differences of delays are identifiable, unless the time of the inputs is ex
 others delays.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -183,7 +184,16 @@ class _Sensors:
 
     def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Candidates of the plant, from logs corrected for delays and offsets, with settled sensors."""
-        guessed = {name: self._guess_delays(log) for name, log in logs.items()}
+        guessed: dict[str, dict[str, float]] = {name: {} for name in logs}
+        # free delays by cross-correlation of position and speed, where both are logged
+        for (name, log), (late, other) in itertools.product(
+            logs.items(), itertools.permutations(("position", "speed"))
+        ):
+            key = f"sensor.{late}.delay"
+            free = late in self.delay and log.parameters[key].free
+            if free and other not in self.delay and late in log.measured and other in log.measured:
+                p = log.parameters[key]
+                guessed[name][key] = float(np.clip(coarse_delay(log.measured, late, other), p.lower, p.upper))
         plant = {name: self._correct_log(log, guessed[name]) for name, log in logs.items()}
         delays: dict[str, float] = {}
         for name in dict.fromkeys(n for guess in guessed.values() for n in guess):
@@ -197,17 +207,6 @@ class _Sensors:
             states = {name: self._complete_states(start, name, log, guessed[name]) for name, log in logs.items()}
             out.append(replace(start, states=states, parameters={**start.parameters, **delays}))
         return out
-
-    def _guess_delays(self, log: Log) -> dict[str, float]:
-        """Free delays of a log by cross-correlation of position and speed, where both are logged."""
-        delays = {}
-        for late, other in (("position", "speed"), ("speed", "position")):
-            name = f"sensor.{late}.delay"
-            free = late in self.delay and log.parameters[name].free
-            if free and other not in self.delay and late in log.measured and other in log.measured:
-                p = log.parameters[name]
-                delays[name] = float(np.clip(coarse_delay(log.measured, late, other), p.lower, p.upper))
-        return delays
 
     def _correct_log(self, log: Log, guessed: Mapping[str, float]) -> Log:
         """Log without the sensors' delays, lags and offsets, for the plant's starts."""

@@ -94,25 +94,19 @@ def friction_candidates(friction: FrictionModel, logs: Mapping[str, RegressionRo
     free = {n: parameters[f"friction.{n}"] for n in scanned if f"friction.{n}" in parameters.free_names}
     tried = [dict.fromkeys(np.clip(scanned[n], p.lower, p.upper).tolist()) for n, p in free.items()]
     sets = [dict(zip(free, values, strict=True)) for values in itertools.product(*tried)]
-    return Starts([functools.partial(_candidate, friction, logs, parameters, values) for values in sets])
 
+    def candidate(tried: dict[str, float]) -> Start:
+        values = _regress(friction, logs, parameters, tried)[0]
+        guess: dict[str, float] = {}
+        for name, value in tried.items():
+            guess |= per_log_values(f"friction.{name}", value, {n: rows.parameters for n, rows in logs.items()})
+        values |= guess
+        words = [f"{n.replace('_', ' ')} {v:g} {parameters[f'friction.{n}'].unit}" for n, v in tried.items()]
+        bristles = _bristle_deflections(friction, logs, values)
+        states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
+        return Start(states, values, ", ".join(words) or "equation error", tuple(guess))
 
-def _candidate(
-    friction: FrictionModel,
-    logs: Mapping[str, RegressionRows],
-    parameters: ParameterSet,
-    tried: Mapping[str, float],
-) -> Start:
-    """The start with these values of the scanned parameters."""
-    values = _regress(friction, logs, parameters, dict(tried))[0]
-    guess: dict[str, float] = {}
-    for name, value in tried.items():
-        guess |= per_log_values(f"friction.{name}", value, {n: rows.parameters for n, rows in logs.items()})
-    values |= guess
-    words = [f"{n.replace('_', ' ')} {v:g} {parameters[f'friction.{n}'].unit}" for n, v in tried.items()]
-    bristles = _bristle_deflections(friction, logs, values)
-    states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
-    return Start(states, values, ", ".join(words) or "equation error", tuple(guess))
+    return Starts([functools.partial(candidate, values) for values in sets])
 
 
 def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:

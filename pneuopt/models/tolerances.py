@@ -127,5 +127,6 @@ MIN_RESIDUAL_RATIO = 1.5
 # share of a pressure's squared rates that a zero point may leave without a check of others: a wrong one leaves 0.03 or
 # more (tests/models/pneumatic/test_logs.py), a smaller share checks right ones at the cost of time
 MAX_UNQUESTIONED_SHARE = 0.02
-MAX_RESIDUAL_SHARE = 0.2  # largest such share that an advised drop or zero may leave: with more, the model does not fit
+MAX_RESIDUAL_SHARE = 0.2  # largest such share that an advised zero point may leave: with more, the model does not fit
+MAX_LINE_RESIDUAL_SHARE = 0.25  # the same of a line's drop
 MIN_LOG_DURATION = 1.0  # duration from which a log is checked alone as well [s]; shorter ones hold too little motion

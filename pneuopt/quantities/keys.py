@@ -157,7 +157,10 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
     if key.takes is Takes.NUMBER:
         return _in_bounds(key, read_value(entry, key.unit.format_map(units), where=where), entry, where)
     if key.takes is Takes.SAMPLES:
-        return _read_samples(entry, where)
+        match = re.fullmatch(r"\s*(\d+)\s*samples?\s*", entry) if isinstance(entry, str) else None
+        told = f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"'
+        require(match is not None or type(entry) is int, told)
+        return int(match[1]) if match else int(entry)
     proper = type(entry) in key.takes.types
     require(proper, f"{where} must be {key.takes.value}, got {repr(entry)[:MAX_SHOWN]}{_remedy(key, where)}")
     if key.takes is Takes.COUNT:
@@ -209,15 +212,6 @@ def _read_list(key: Key, entries: list[Any], where: str, units: Mapping[str, str
         return tuple(entries)
     spots = (f"{where} {k}" if isinstance(entry, dict) else where for k, entry in enumerate(entries, 1))
     return tuple(read_entry(item, entry, spot, units) for spot, entry in zip(spots, entries, strict=True))
-
-
-def _read_samples(entry: Any, where: str) -> int:
-    """A number of samples, "1 sample" or 1."""
-    match = re.fullmatch(r"\s*(\d+)\s*samples?\s*", entry) if isinstance(entry, str) else None
-    whole = type(entry) is int
-    told = f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"'
-    require(match is not None or whole, told)
-    return int(match[1]) if match else int(entry)
 
 
 def _remedy(key: Key, where: str) -> str:

@@ -124,7 +124,17 @@ class Report:
 
     def to_html(self) -> str:
         """A fragment of HTML, as a notebook shows it."""
-        return f"<div>{''.join(map(_part_to_html, self.parts))}</div>"
+        parts = []
+        for part in self.parts:
+            if isinstance(part, Line):
+                weight = "" if part.tone is Tone.PLAIN else f"font-weight:bold;{_HTML_COLOURS.get(part.tone.name, '')}"
+                parts.append(f'<p style="margin:0 0 0 {part.indent}ch;{weight}">{html.escape(part.text)}</p>')
+                continue
+            head = "".join(_cell_to_html("th", c.heading, c) for c in part.columns)
+            rows = (zip(row, part.columns, strict=True) for row in part.rows)
+            body = "".join(f"<tr>{''.join(_cell_to_html('td', t, c) for t, c in row)}</tr>" for row in rows)
+            parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+        return f"<div>{''.join(parts)}</div>"
 
 
 def text_columns(*headings: str) -> tuple[Column, ...]:
@@ -170,9 +180,16 @@ def _table_lines(table: Table, width: int | None) -> Iterator[tuple[str, Tone]]:
     elif below is not None:
         yield from _below_lines(table, apart, below, width)
     else:
-        for number, panel in enumerate(_split_into_panels(table, width)):
+        least = _least_widths(table)
+        panels: list[list[int]] = [[0]]
+        for k in range(1, len(least)):
+            if len(panels[-1]) > 1 and _total([least[i] for i in (*panels[-1], k)]) > width:
+                panels.append([0])
+            panels[-1].append(k)
+        for number, chosen in enumerate(panels):
             if number:
                 yield "", Tone.PLAIN
+            panel = _select_columns(table, chosen)
             yield from _beside_lines(panel, _narrow(panel, width) or _least_widths(panel))
 
 
@@ -194,16 +211,6 @@ def _below_lines(table: Table, apart: Table, widths: Sequence[int], width: int) 
         yield from ((_INDENT + text, Tone.PLAIN) for text in _row_lines(apart, row, widths))
 
 
-def _split_into_panels(table: Table, width: int) -> list[Table]:
-    least = _least_widths(table)
-    panels: list[list[int]] = [[0]]
-    for k in range(1, len(least)):
-        if len(panels[-1]) > 1 and _total([least[i] for i in (*panels[-1], k)]) > width:
-            panels.append([0])
-        panels[-1].append(k)
-    return [_select_columns(table, chosen) for chosen in panels]
-
-
 def _select_columns(table: Table, chosen: Sequence[int]) -> Table:
     rows = tuple(tuple(row[k] for k in chosen) for row in table.rows)
     return Table(tuple(table.columns[k] for k in chosen), rows)
@@ -215,17 +222,14 @@ def _narrow(table: Table, width: int) -> list[int] | None:
     if not widths or _total(least) > width:
         return None
     while _total(widths) > width:
-        tried = [_with_width(table, widths, k) for k in range(len(widths)) if widths[k] > least[k]]
+        tried = []  # the widths with one column narrower by the least that is possible
+        for k in (k for k in range(len(widths)) if widths[k] > least[k]):
+            texts = (line for cell in _column_texts(table, k) for line in cell.split("\n"))
+            own = max(len(line) for text in texts for line in wrap_words(text, widths[k] - 1))
+            tried.append([*widths[:k], own, *widths[k + 1 :]])
         lines, before = _height(table, widths), _total(widths)
         widths = min(tried, key=lambda w: (_height(table, w) - lines) / (before - _total(w)))
     return widths
-
-
-def _with_width(table: Table, widths: Sequence[int], k: int) -> list[int]:
-    """The widths with column k narrower by the least that is possible."""
-    texts = (line for cell in _column_texts(table, k) for line in cell.split("\n"))
-    own = max(len(line) for text in texts for line in wrap_words(text, widths[k] - 1))
-    return [*widths[:k], own, *widths[k + 1 :]]
 
 
 def _height(table: Table, widths: Sequence[int]) -> int:
@@ -281,16 +285,6 @@ def _total(widths: Sequence[int]) -> int:
 
 def _plain(text: str) -> str:
     return text.replace(TIED, " ")
-
-
-def _part_to_html(part: Line | Table) -> str:
-    if isinstance(part, Line):
-        weight = "" if part.tone is Tone.PLAIN else f"font-weight:bold;{_HTML_COLOURS.get(part.tone.name, '')}"
-        return f'<p style="margin:0 0 0 {part.indent}ch;{weight}">{html.escape(part.text)}</p>'
-    head = "".join(_cell_to_html("th", c.heading, c) for c in part.columns)
-    rows = ("".join(_cell_to_html("td", t, c) for t, c in zip(row, part.columns, strict=True)) for row in part.rows)
-    body = "".join(f"<tr>{row}</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _cell_to_html(tag: str, text: str, column: Column) -> str:

@@ -252,7 +252,16 @@ class PneumaticDrive:
             identification_hints=self.friction.identification_hints.with_prefix("friction") | LOAD_HINTS | _FLOW_HINTS,
             axis=_AXIS,
         )
-        return replace(declared, meter=self._meter_function())
+        # air from the supply [kg/s], spool position [half travels], and air power [W]: the work of this air in an
+        # isothermal expansion to ambient pressure, m' R T ln(p_s/p_o)
+        x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
+        through = self._edge_flows(x, u, p)
+        air, expansion = through.supply_a + through.supply_b, ca.log(p["supply.pressure"] / p["ambient.pressure"])
+        power = air * p["gas.constant"] * p["ambient.temperature"] * expansion
+        drawn = [air, self._spool_position(x, u, p), power]
+        arguments = [ca.SX.sym("t"), *map(stack, (x, u, p))]
+        meter = ca.Function("meter", arguments, drawn, ["t", "x", "u", "p"], ["air", "spool", "power"])
+        return replace(declared, meter=meter)
 
     def _rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG002 - no time in it
         y, v, a, b = (x[n] for n in ("position", "speed", "pressure_a", "pressure_b"))
@@ -305,19 +314,6 @@ class PneumaticDrive:
 
     def _spool_position(self, x: Symbols, u: Symbols, p: Symbols) -> ca.SX:
         return self.valve.position(u["valve_voltage"], without_prefix(x, "valve"), without_prefix(p, "valve"))
-
-    def _meter_function(self) -> ca.Function:
-        """Function ``(t, x, u, p)`` for air from the supply [kg/s], spool position [half travels], air power [W].
-
-        Air power is the work of this air in an isothermal expansion to ambient pressure, ``m' R T ln(p_s/p_o)``.
-        """
-        x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
-        through = self._edge_flows(x, u, p)
-        air, expansion = through.supply_a + through.supply_b, ca.log(p["supply.pressure"] / p["ambient.pressure"])
-        power = air * p["gas.constant"] * p["ambient.temperature"] * expansion
-        drawn = [air, self._spool_position(x, u, p), power]
-        arguments = [ca.SX.sym("t"), *map(stack, (x, u, p))]
-        return ca.Function("meter", arguments, drawn, ["t", "x", "u", "p"], ["air", "spool", "power"])
 
     @cached_property
     def _balance_function(self) -> ca.Function:
@@ -617,8 +613,8 @@ def cylinder_limits(stops: bool) -> tuple[ValidityLimit, ...]:
     meaning = "the response is the stop's" if stops else "the model, which has no stops, means nothing"
     margin = STOP_ROUNDING if stops else 0.0
     ends = [
-        ValidityLimit("position", partial(limit, margin), way, f"the piston {what.format(end)}", meaning)
-        for limit, way, end in ((_rear_limit, -1, "rear"), (_front_limit, 1, "front"))
+        ValidityLimit("position", partial(_stroke_limit, margin, way), way, f"the piston {what.format(end)}", meaning)
+        for way, end in ((-1, "rear"), (1, "front"))
     ]
     meaning = "real seals let air in, the model does not"
     chambers = [
@@ -629,12 +625,8 @@ def cylinder_limits(stops: bool) -> tuple[ValidityLimit, ...]:
 
 
 # These limits are functions of the module, not lambdas: a system goes to other processes (pickle).
-def _front_limit(margin: float, p: ParameterSet) -> float:
-    return p.value("cylinder.stroke") - margin
-
-
-def _rear_limit(margin: float, p: ParameterSet) -> float:  # noqa: ARG001 - as `_front_limit`
-    return margin
+def _stroke_limit(margin: float, way: int, p: ParameterSet) -> float:
+    return p.value("cylinder.stroke") - margin if way > 0 else margin
 
 
 def _empty_chamber_pressure(p: ParameterSet) -> float:

@@ -53,6 +53,7 @@ from pneuopt.models.tolerances import (
     LEADS,
     LEAK_GRID,
     MAX_INTEGRATION_STEP,
+    MAX_LINE_RESIDUAL_SHARE,
     MAX_RESIDUAL_SHARE,
     MAX_START_SAMPLES,
     MAX_UNQUESTIONED_SHARE,
@@ -167,7 +168,12 @@ class PneumaticStarts:
         valve_values: dict[str, float] = {}
         for name, value in valve.items():
             valve_values |= per_log_values(name, value, {n: log.parameters for n, log in logs.items()})
-        return Starts([functools.partial(_with_valve, starts, i, valve_values) for i in range(len(starts))])
+
+        def with_valve(index: int) -> Start:
+            start = starts[index]
+            return replace(start, parameters={**start.parameters, **valve_values})
+
+        return Starts([functools.partial(with_valve, i) for i in range(len(starts))])
 
     def prepare_logs(self, logs: Mapping[str, Log], window: float = FILTER_TIMES[0]) -> dict[str, "PneumaticLog"]:
         """Logs with the motion and the air of this drive, filtered with a window [s]."""
@@ -179,11 +185,6 @@ class PneumaticStarts:
 def _air_simulator(system: System, given_states: tuple[str, ...]) -> AirSimulator:
     """The air of a drive, which the checks of a log and its starts ask for in turn."""
     return AirSimulator(system, given_states)
-
-
-def _with_valve(starts: Sequence[Start], index: int, valve: ValveValues) -> Start:
-    start = starts[index]
-    return replace(start, parameters={**start.parameters, **valve})
 
 
 class PneumaticLog:
@@ -359,27 +360,29 @@ class LinePressureCheck:
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """Return a sentence for each log whose chambers' equations hold better behind a line's drop."""
         active = {name: most_active_part(log) for name, log in logs.items() if is_informative(log)}
-        return [sentence for name, log in active.items() if (sentence := self._examine(name, log))]
-
-    def _examine(self, name: str, log: Log) -> str:
-        measured_balance = min(
-            (self._balance(log, shape) for shape in trial_shapes(log)), key=lambda balance: balance.residual
-        )
-        if measured_balance.residual < MAX_UNQUESTIONED_SHARE * measured_balance.total:
-            return ""
-        lead, best, worse = 0.0, measured_balance, 0
-        for tried in LEADS:
-            balance = self._behind_line(log, measured_balance, tried)
-            lead, best, worse = (tried, balance, 0) if balance.residual < best.residual else (lead, best, worse + 1)
-            if worse == MAX_WORSE_LEADS:
-                break
-        if best.residual > min(measured_balance.residual / MIN_RESIDUAL_RATIO**2, MAX_RESIDUAL_SHARE * best.total):
-            return ""
-        drop = lead * max(float(np.quantile(np.abs(flow), 0.999)) for flow in best.flows)
-        ratio = np.sqrt(measured_balance.residual / best.residual)
-        message = f"{name}: the pressures lead the chambers by {1e3 * lead:.2g} ms, as before a line that drops up to "
-        message += f"{drop / 1e5:.2g} bar (their mass balance then leaves {ratio:.1f} times smaller residuals)"
-        return f"{message}: put the sensors at the cylinder, or leave them out; else raise valve.bandwidth"
+        sentences = []
+        for name, log in active.items():
+            measured = min((self._balance(log, shape) for shape in trial_shapes(log)), key=lambda each: each.residual)
+            if measured.residual < MAX_UNQUESTIONED_SHARE * measured.total:
+                continue
+            lead, best, worse = 0.0, measured, 0
+            for tried in LEADS:
+                balance = self._behind_line(log, measured, tried)
+                lead, best, worse = (tried, balance, 0) if balance.residual < best.residual else (lead, best, worse + 1)
+                if worse == MAX_WORSE_LEADS:
+                    break
+            if best.residual > min(measured.residual / MIN_RESIDUAL_RATIO**2, MAX_LINE_RESIDUAL_SHARE * best.total):
+                continue
+            drop = lead * max(float(np.quantile(np.abs(flow), 0.999)) for flow in best.flows)
+            ratio = np.sqrt(measured.residual / best.residual)
+            message = (
+                f"{name}: the pressures lead the chambers by {1e3 * lead:.2g} ms, as before a line that drops up to "
+            )
+            message += f"{drop / 1e5:.2g} bar (their mass balance then leaves {ratio:.1f} times smaller residuals)"
+            sentences.append(
+                f"{message}: put the sensors at the cylinder, or leave them out; else raise valve.bandwidth"
+            )
+        return sentences
 
     def _behind_line(self, log: Log, uncorrected: "Balance", lead: float) -> "Balance":
         """The balance of the pressures behind a line that leads so much, with its own flow."""
