@@ -272,7 +272,7 @@ def _check_samples(table: LogTable, found: Mapping[str, ChannelColumn], values: 
 
 
 class Plant(Protocol):
-    """What a log's reader asks of a plant, say a `System`."""
+    """The signals of a plant, say a `System`, that may be channels of a log."""
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:

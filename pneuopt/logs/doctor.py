@@ -25,13 +25,14 @@ from pneuopt.logs.tolerances import (
     LEAST_WAY_SHARE,
     MAX_ATMOSPHERE_ERROR,
     MAX_COMMAND_LAG,
-    MAX_HATS,
     MAX_MASS_FACTOR,
     MAX_NET_TRAVEL_SHARE,
     MAX_NOISE_SHARE,
     MAX_PHASE_STEP,
     MAX_PISTON_SPEED,
+    MAX_POSITION_ZERO_ERROR,
     MAX_PRESSURE,
+    MAX_REGRESSION_ROWS,
     MAX_SENSOR_LAG,
     MAX_SLOPE_NOISE_SHARE,
     MAX_STEPS_BETWEEN,
@@ -48,7 +49,6 @@ from pneuopt.logs.tolerances import (
     MIN_SAMPLES,
     MIN_SPEED_CORRELATION,
     MIN_STOP_FORCE_RATIO,
-    MIN_VIEW_SAMPLES,
     MIN_WORK_SHARE,
     MOST_MOTION,
     NEIGHBOURS,
@@ -57,7 +57,6 @@ from pneuopt.logs.tolerances import (
     ROD_AREA_RATIOS,
     SHORTEST_REST,
     SPEED_SLOPE_RATIOS,
-    STATED_STOP_SHARE,
     STILL_STEPS,
     STOP_WIDTH,
     WHITE_LAGS,
@@ -80,7 +79,7 @@ class StatedAxis(NamedTuple):
     inertia_name: str = "mass"
     inertia_unit: str = "kg"
     force_unit: str = "N"
-    offset_parameter: str = ""  # takes a constant force
+    offset_parameter: str = ""  # of a constant force; empty where there is none
     stops: tuple[float, ...] = ()  # positions at which the model has end stops
 
     def net_force(self, channels: Mapping[str, Array]) -> Array:
@@ -243,14 +242,19 @@ def view_about(t: Array, at: int, motion: Array | None = None) -> tuple[float, f
         level = LARGE_SHARE * float(np.nanmax(np.abs(motion)))
         side = np.sign(motion[np.abs(motion) > level])
         half = duration / (1 + int(np.count_nonzero(np.diff(side))))
-    half = max(half, MIN_VIEW_SAMPLES * float(np.median(np.diff(t))))
-    return max(float(t[0]), float(t[at]) - half), min(float(t[-1]), float(t[at]) + half)
+    return _view_around(t, float(t[at]), float(t[at]), half)
+
+
+def _view_around(t: Array, begin: float, end: float, margin: float, least: int = 25) -> tuple[float, float]:
+    """Begin and end of a span with a margin [s] to either side, of `least` samples or more; fewer look like noise."""
+    margin = max(margin, least * float(np.median(np.diff(t))))
+    return max(float(t[0]), begin - margin), min(float(t[-1]), end + margin)
 
 
 class ForceBalance(NamedTuple):
-    """What windows of a log say of its forces, in SI units."""
+    """The balance of forces over windows of a log, in SI units."""
 
-    mass: float  # as the log itself shows, and so the offset
+    mass: float  # as estimated from the log, and so the offset
     offset: float
     friction: float  # Coulomb's part
     residual: float  # root mean square of what is left
@@ -366,7 +370,7 @@ def _fit_balance(experiment: Experiment, axis: StatedAxis) -> ForceBalance | Non
         late, early = slice(max(lag, 0), n + min(lag, 0)), slice(max(-lag, 0), n - max(lag, 0))
         a, s, v, f = rows.acceleration[late], rows.direction[late], rows.speed[late], rows.force[early]
         used = np.flatnonzero((s != 0) & np.isfinite(a) & np.isfinite(v) & np.isfinite(f))
-        used = used[:: max(1, used.size // MAX_HATS)]
+        used = used[:: max(1, used.size // MAX_REGRESSION_ROWS)]
         lags.append((lag, a[used], s[used], v[used], f[used]))
     if min(min(int((s > 0).sum()), int((s < 0).sum())) for _, _, s, _, _ in lags) < MIN_HATS:
         return None
@@ -377,9 +381,9 @@ def _fit_balance(experiment: Experiment, axis: StatedAxis) -> ForceBalance | Non
     # the triangular factor over the root of the length: root mean squares of regressions stand in it
     one = [np.asarray(np.linalg.qr(each, mode="r"), dtype=float) / math.sqrt(len(each)) for each in columns]
     left = [abs(R[4, 4]) for R in one]
-    # a lag turns speed into acceleration: where the log hardly tells lags apart, the least one is assumed
-    told = [k for k in range(len(one)) if left[k] <= MIN_RESIDUAL_FACTOR * min(left)]
-    chosen = min(told, key=lambda k: (abs(lags[k][0]), left[k]))
+    # a lag turns speed into acceleration: of lags that leave about the same residual, the least one is assumed
+    alike = [k for k in range(len(one)) if left[k] <= MIN_RESIDUAL_FACTOR * min(left)]
+    chosen = min(alike, key=lambda k: (abs(lags[k][0]), left[k]))
     friction, _, offset, own_mass = np.linalg.lstsq(one[chosen][:, :4], one[chosen][:, 4])[0].tolist()
     stated = min(math.hypot(R[3, 4] - mass * R[3, 3], R[4, 4]) for R in one)
     fits = ((R[:, [0, 1, 3]], R[:, 4]) for R in one)
@@ -446,12 +450,12 @@ def check_dwells(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFindin
     if len(moves) < 2 or share > MOST_MOTION:
         return
     signal, whole = axis.position if axis.position in experiment.trajectory else axis.speed, float(t[-1] - t[0])
-    told = f"{signal!r} moves in {share:.0%} of the log, {share * whole:.3g} of {whole:.3g} s, in {len(moves)} moves"
+    shares = f"{signal!r} moves in {share:.0%} of the log, {share * whole:.3g} of {whole:.3g} s, in {len(moves)} moves"
     these = "mass, Coulomb and viscous friction are identified from these moves, static friction from how each begins"
     still = np.zeros(len(t), dtype=bool)
     still[known] = ~moving
     shown = evidence(experiment, signal, where=still, label="it stands still")
-    yield LogFinding(signal, f"{told}, and stands still between them: {these}", False, evidence=shown)
+    yield LogFinding(signal, f"{shares}, and stands still between them: {these}", False, evidence=shown)
 
 
 def _find_moves(t: Array, size: Array) -> list[tuple[int, int]]:
@@ -491,7 +495,9 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
         )
         last = behind - 1
         is_long = last - begin >= MIN_SAMPLES and log.t[last] - log.t[begin] >= SHORTEST_REST
-        if not is_long or any(abs(end - stop) < STATED_STOP_SHARE * float(np.ptp(axis.stops)) for stop in axis.stops):
+        if not is_long or any(
+            abs(end - stop) < MAX_POSITION_ZERO_ERROR * float(np.ptp(axis.stops)) for stop in axis.stops
+        ):
             continue
         force = float(np.median(push[begin : last + 1]))
         times = f"from {log.t[begin]:.4g} s to {log.t[last]:.4g} s"
@@ -560,13 +566,12 @@ def _jump_evidence(experiment: Experiment, axis: StatedAxis, known: Indices, jum
     t, speed = log.t, np.full(len(log), np.nan)
     speed[known[1:]] = np.diff(log[axis.position][known]) / np.diff(t[known])
     begin, end = t[known[jumps[0]]], t[known[jumps[min(1, jumps.size - 1)] + 1]]
-    margin = max(end - begin, MIN_VIEW_SAMPLES * float(np.median(np.diff(t))))
     where = np.zeros(len(log), dtype=bool)
     for jump in jumps:
         where[known[jump] : known[jump + 1] + 1] = True
     needed = Panel("m/s", {f"slope of the {axis.position}": speed})
     shown = evidence(experiment, axis.position, needed, where=where, label="jump")
-    return replace(shown, view=(max(float(t[0]), begin - margin), min(float(t[-1]), end + margin)))
+    return replace(shown, view=_view_around(t, begin, end, end - begin))
 
 
 def motion_speed(experiment: Experiment, axis: StatedAxis) -> Array | None:

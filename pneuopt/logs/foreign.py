@@ -12,6 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
+from datetime import date
 from enum import IntEnum
 from functools import partial
 from pathlib import Path
@@ -44,7 +45,6 @@ from pneuopt.logs.text import (
 from pneuopt.logs.tolerances import (
     MAX_BYTES,
     MAX_COLUMNS,
-    MAX_DAYS,
     MAX_DEPTH,
     MAX_EMPTY_ROWS,
     MAX_HEAD_ROWS,
@@ -193,7 +193,7 @@ _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f
 _ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 
 
-class _Kind(IntEnum):
+class _ElementType(IntEnum):
     """Types of elements, and classes of arrays."""
 
     MATRIX = 14
@@ -223,7 +223,7 @@ def read_elements(raw: bytes) -> list[tuple[str, Any]]:
     order = "<" if raw[126:128] == b"IM" else ">"
     budget, found = MAX_BYTES, []
     for element in _elements(memoryview(raw)[128:], order):
-        if element.kind == _Kind.COMPRESSED:
+        if element.kind == _ElementType.COMPRESSED:
             unpacked = zlib.decompressobj().decompress(element.data, budget)
             budget -= len(unpacked)
             require(budget > 0, "it unpacks to more than a log's size")
@@ -245,11 +245,11 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
             require(size <= 4, "a short element is too long")
         require(start + size <= len(data), "an element is longer than what holds it")
         yield _Element(kind, data[start : start + size])
-        at = start + size if kind == _Kind.COMPRESSED else at + 8 * math.ceil((start + size - at) / 8)
+        at = start + size if kind == _ElementType.COMPRESSED else at + 8 * math.ceil((start + size - at) / 8)
 
 
 def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
-    require(element.kind == _Kind.MATRIX, f"an element of type {element.kind} stands where a variable should")
+    require(element.kind == _ElementType.MATRIX, f"an element of type {element.kind} stands where a variable should")
     require(level < MAX_LEVELS, "it is nested too deep")
     parts = _elements(element.data, order)
     flags = next(parts, None)
@@ -258,7 +258,7 @@ def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
     require(len(flags.data) == 8, "a variable has no flags")
     word = struct.unpack_from(order + "I", flags.data)[0]
     kind, is_complex = word & 0xFF, bool(word & 0x800)
-    if kind not in {_Kind.STRUCTURE_ARRAY, _Kind.CHARACTER_ARRAY, *range(6, 16)} or is_complex:
+    if kind not in {_ElementType.STRUCTURE_ARRAY, _ElementType.CHARACTER_ARRAY, *range(6, 16)} or is_complex:
         return "", None
     dims = _next(parts)
     n = len(dims.data) // 4
@@ -266,10 +266,10 @@ def _variable(element: _Element, order: str, level: int) -> tuple[str, Any]:
     shape = struct.unpack_from(f"{order}{n}i", dims.data)
     require(min(shape) >= 0 and math.prod(shape) <= MAX_BYTES, "an array has an impossible size")
     name = _text(_next(parts), order)
-    if kind == _Kind.STRUCTURE_ARRAY:
+    if kind == _ElementType.STRUCTURE_ARRAY:
         return name, _structure(parts, math.prod(shape), order, level)
     part = _next(parts)
-    if kind == _Kind.CHARACTER_ARRAY:
+    if kind == _ElementType.CHARACTER_ARRAY:
         return name, _text(part, order)
     require(part.kind in _NUMBERS, "numbers are none")
     dtype = np.dtype(order + _NUMBERS[part.kind])
@@ -465,6 +465,7 @@ def read_tdms(path: Path, raw: bytes) -> LogTable:
     return LogTable(path, table.names, 1, read, table.units, table.stamps)
 
 
+_MAX_DAYS = (date.max - date(1899, 12, 30)).days + 1  # below it a number is a date of Excel, to the end of 9999-12-31
 _SHOWN_DATE = "0:00:00"  # what a date looks like where only its being one counts
 
 
@@ -562,7 +563,7 @@ def _xlsx_columns(sheet: _Sheet, names: Sequence[str]) -> dict[str, Array]:
         if name not in sheet.stamps:
             continue
         # days become seconds from the first; a time of day leaps back at midnight, and a double holds a date to 0.6 us
-        wrong = np.flatnonzero(np.abs(numbers) > MAX_DAYS)
+        wrong = np.flatnonzero(np.abs(numbers) > _MAX_DAYS)
         if wrong.size:
             place = f"{sheet.path}: row {wrong[0] + sheet.first_row}, column {name!r}"
             remedy = "write a date with its time, or a number"

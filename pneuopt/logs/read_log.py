@@ -13,7 +13,6 @@ from pneuopt.logs.columns import CHANNELS, COLUMN_KEYS, Plant
 from pneuopt.logs.experiment import Experiment, experiment_from_table
 from pneuopt.logs.foreign import parse_log
 from pneuopt.logs.table import LogTable, read_bytes
-from pneuopt.logs.tolerances import STAMP_BYTES
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.keys import Key, Takes, check_sections, read_named, read_table, table
 from pneuopt.quantities.output import MAX_TOML_BYTES, check_nesting
@@ -163,11 +162,11 @@ def _date_in_sidecar(side: Path) -> datetime | None:
     return _read_date(sections[DATE], f"{side}: {DATE}", {}) if DATE in sections else None
 
 
-def _stamp(path: Path) -> datetime | None:
-    """The first stamp with a date in a text."""
+def _stamp(path: Path, most: int = 20_000) -> datetime | None:
+    """The first stamp with a date in the first bytes of a text, so many that no head is longer."""
     try:
         with path.open("rb") as file:
-            head = file.read(STAMP_BYTES)
+            head = file.read(most)
     except OSError:
         return None
     match = None if b"\0" in head else _IN_TEXT.search(head.decode("utf-8", "replace"))

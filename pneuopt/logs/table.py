@@ -19,7 +19,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from pneuopt.logs.tolerances import MAX_BYTES, MAX_CELLS, MAX_COLUMNS, MAX_NAME, MAX_ROWS_LISTED, MAX_SECONDS
+from pneuopt.logs.tolerances import MAX_BYTES, MAX_CELLS, MAX_COLUMNS, MAX_NAME, MAX_SECONDS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, require
 from pneuopt.quantities.output import MAX_REASON, read_source
@@ -71,8 +71,8 @@ def check_cells(path: Path | str, rows: int, columns: int) -> None:
     )
 
 
-def list_rows(rows: Sequence[int]) -> str:
-    """As in "row 14", or "rows 14 to 20, 31, ... (57 in all)".
+def list_rows(rows: Sequence[int], most: int = 8) -> str:
+    """List rows in at most so many runs, as in "row 14", or "rows 14 to 20, 31, ... (57 in all)".
 
     Examples
     --------
@@ -83,8 +83,8 @@ def list_rows(rows: Sequence[int]) -> str:
         return f"row {rows[0]}"
     ends = np.flatnonzero(np.diff(rows) > 1).tolist()
     runs = list(zip([rows[0], *(rows[k + 1] for k in ends)], [*(rows[k] for k in ends), rows[-1]], strict=True))
-    shown = ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in runs[:MAX_ROWS_LISTED])
-    more = ", ..." if len(runs) > MAX_ROWS_LISTED else ""
+    shown = ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in runs[:most])
+    more = ", ..." if len(runs) > most else ""
     return f"rows {shown}{more}" + (f" ({len(rows)} in all)" if more or len(runs) < len(rows) else "")
 
 
@@ -102,7 +102,7 @@ def import_extra(module: str, package: str, path: Path | str, kind: str, extra: 
 
 @contextmanager
 def foreign_code(path: Path, kind: str) -> Iterator[None]:
-    """Run a library on a file that may be damaged: it stays silent, and whatever it raises becomes a `LogError`."""
+    """Run a library on a file that may be damaged, its warnings and log off; its error becomes a `LogError`."""
     said, logging.root.manager.disable = logging.root.manager.disable, logging.CRITICAL
     unraisable, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
@@ -113,7 +113,7 @@ def foreign_code(path: Path, kind: str) -> Iterator[None]:
     except Exception as error:
         name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
         reason = " ".join(f"{name}{error}".split())[:MAX_REASON]
-        traceback.clear_frames(error.__traceback__)  # so that half-made objects die while nobody listens
+        traceback.clear_frames(error.__traceback__)  # half-made objects are deleted while warnings are off
         text = f"{path}: cannot be read as {kind} ({reason}); save the log again, or export it as CSV"
         raise LogError(text) from None
     finally:

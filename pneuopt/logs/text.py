@@ -198,7 +198,7 @@ def _find_names(rows: Sequence[Sequence[str]], first: int, width: int, downwards
     last = may_name[-1]
     plain = [i for i in may_name if not _COMMENT.match(rows[i][0])]
     units = {i: sum(bool(_BRACKETS.search(cell)) for cell in rows[i]) for i in (last, *plain[-1:])}
-    if plain and units[last] <= units[plain[-1]]:  # a comment names the columns only if it says more units
+    if plain and units[last] <= units[plain[-1]]:  # a comment is the row of names only if it has more units
         last = plain[-1]
     above = last - 1
     named_above = above >= 0 and abs(len(rows[above]) - len(rows[last])) < 2 and not _is_value(rows[above][0])

@@ -6,19 +6,16 @@ MAX_COLUMNS = 4096  # more are rows and columns mistaken for each other; fewer r
 MAX_CELLS = 50_000_000  # samples of all channels, 400 MB: more fill a small machine; fewer refuse an hour at 1 kHz
 MAX_NAME = 256  # length of a column's name [character]: a longer one is none, and makes messages that nobody can read
 MAX_SECONDS = 120.0  # time for a library in its own process [s]: more looks like a hang; less refuses logs of 100 MB
-STAMP_BYTES = 20_000  # of a log in which its first time stamp is looked for [byte]: no head is longer
 MAX_HEAD_ROWS = 1000  # rows above the samples: more take seconds to look through; data loggers write a few hundred
 MAX_DEPTH = 4  # structures in structures that are columns: dSPACE's have 2; in deeper ones numbers are settings
 MAX_LEVELS = 8  # structures in each other that are read: more overflow a stack
 MAX_EMPTY_ROWS = 10_000  # of a sheet, in a row: a single stray cell far below makes a million, which take seconds
-MAX_DAYS = 2958466  # of a date: Excel's last, in the year 9999; more overflow as seconds
 
 # What counts as a sample, a row, a column.
 MIN_SAMPLES = 10  # of a log, or of a part whose median says something: fewer are noise; a higher bound misses bounces
 MAX_MAGNITUDE = 1e30  # of a sample in the file's unit: more is an instrument's overload (9.91e37); less refuses counts
 MIN_BLOCK_ROWS = 4  # of numbers above the names that count as samples: fewer refuse metadata, more lose samples
 MAX_ROWS_OUT = 0.05  # share of rows that mending may leave out: with more what is left misleads; fewer help no logger
-MAX_ROWS_LISTED = 8  # runs of rows that a message lists: more fill the screen, fewer leave short lists open
 
 # What the columns of a foreign log are.
 VACUUM_LIMIT = 0.9e5  # [Pa]: a chamber between supply and surroundings is never below; what is, counts from ambient
@@ -39,7 +36,6 @@ LARGE_SHARE = 0.1  # of a signal's largest value, beyond which it counts: lower 
 MEAN_BLOCKS = 20  # of a log whose means separate motion from noise: more have noisy means, fewer hide motion
 MAX_SENSOR_LAG = 0.02  # [s] of one sensor behind another: shorter blames filters in fast motion, longer misses signs
 MAX_SLOPE_NOISE_SHARE = 0.1  # of a slope's variance that is noise: higher drowns the work, lower blurs fast motion
-MIN_VIEW_SAMPLES = 25  # to either side of an instant that its figure shows: fewer look like noise
 MAX_STEPS_BETWEEN = 5.0  # usual steps between two samples of a channel that are a hole: nobody knows what was there
 FAST_QUANTILE = 0.98  # of the speeds that is fast motion: higher counts jumps of a sensor as such
 SHORTEST_REST = 0.05  # [s]: shorter counts a move that sticks as two, and reversals as stops; longer misses a bounce
@@ -56,17 +52,19 @@ MIN_OFFSET_SHARE = 0.2  # of friction, an offset worth a word: lower speaks of e
 MAX_ATMOSPHERE_ERROR = 0.2  # by which an offset may miss an atmosphere on the rod's area: lower forgets gauge
 MAX_NOISE_SHARE = 2e-3  # of the accelerations' variance: higher makes masses small, lower blurs fast motion
 MIN_HATS = 30  # windows each way that a balance needs: fewer fit any mass
-MAX_HATS = 2000  # windows that are used of a log: more cost time and say the same
+MAX_REGRESSION_ROWS = 2000  # windows or samples of a log in a regression: more cost time and say the same
 MAX_PHASE_STEP = 0.25  # of the motion from sample to sample [rad]: higher leaves lags, which look like a mass
 LAG_STEPS = 20  # lags each way that are tried: fewer leave a lag of milliseconds, which looks like a mass
 
 # Moves, stops, jumps.
+# share of the stroke by which a position sensor's zero may be off: lower blames usual mounting, higher misses a wrong
+# unit or stroke
+MAX_POSITION_ZERO_ERROR = 0.05
 MOST_MOTION = 0.5  # share of a log in motion below which it is one of moves and dwells: higher notes logs that pause
 LEAST_SPEED = 0.01  # over the log's fast motion, of a move: lower counts flicker
 NOISE_WIDTHS = 4.0  # standard deviations of noise beyond which a speed is motion: fewer find moves in noise
 MIN_STOP_FORCE_RATIO = 2.5  # push at a stop over that elsewhere: lower takes static friction for a stop
 STOP_WIDTH = 6.0  # of the noise, positions at a stop: lower cuts a stop in pieces, higher takes slow reversals for one
-STATED_STOP_SHARE = 0.05  # of the way by which a stated stop may be off: lower blames a sensor's zero
 MIN_JUMP_NOISE = 30.0  # jump over noise: lower takes outliers and steps of an encoder for jumps
 MIN_JUMP_SPEED_RATIO = 5.0  # speed of a jump over that around it and over fast motion: lower blames coarse logs
 MIN_JUMP_ACCELERATION = 500.0  # [m/s^2] to start and stop within a sample: short-stroke cylinders reach less

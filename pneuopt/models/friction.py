@@ -27,15 +27,12 @@ from pneuopt.models.tolerances import (
     MIN_COULOMB_SHARE,
     MIN_DIRECTION_SHARE,
     MIN_INERTIA_SHARE,
-    MIN_PRESLIDING_SPEED,
     MIN_REVERSALS,
-    MIN_SLOW_SAMPLES,
+    MIN_SAMPLES,
     MIN_SPEED_RATIO,
     SMOOTHING_FACTOR,
     STICKING_SPEED,
     STRIBECK_VELOCITIES,
-    USUAL_SMOOTHING,
-    USUAL_STRIBECK_VELOCITY,
     VISCOUS_SPEED_RATIO,
 )
 from pneuopt.quantities.arrays import Array
@@ -93,7 +90,9 @@ ALIKE_AT_EVERY_SPEED = (
 
 def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
     """Lack of the slow and fast speeds that a Stribeck curve needs, if any."""
-    stribeck = _largest_known("friction.stribeck_velocity", USUAL_STRIBECK_VELOCITY, seen.values)
+    stribeck = _largest_known(
+        "friction.stribeck_velocity", _STRIBECK_PARAMETERS["stribeck_velocity"].value, seen.values
+    )
     speed = np.abs(seen.speed)
     below = int(np.count_nonzero((speed > 0.1 * stribeck) & (speed < stribeck)))
     slowest, fastest = 0.1 * stribeck, VISCOUS_SPEED_RATIO * stribeck
@@ -102,7 +101,7 @@ def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
     if seen.fast < MIN_SPEED_RATIO * seen.slow:
         speeds = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}"
         return Lack(f"{speeds}, where friction is one level", f"log {run}")
-    if below < MIN_SLOW_SAMPLES:
+    if below < MIN_SAMPLES:
         message = f"only {below} samples are slower than the Stribeck velocity, {stribeck:.2g} {unit}"
         return Lack(message, f"log {run}")
     return None
@@ -315,7 +314,7 @@ class Coulomb:
     def parameters(self) -> ParameterSet:
         """Parameters: coulomb [N], viscous [N*s/m], smoothing [m/s]."""
         return ParameterSet(
-            {"coulomb": _COULOMB_PARAMETER, "viscous": _VISCOUS_PARAMETER, "smoothing": _SMOOTHING_PARAMETER}
+            {"coulomb": _COULOMB_PARAMETER, "viscous": _VISCOUS_PARAMETER, "smoothing": SMOOTHING_PARAMETER}
         )
 
     @property
@@ -340,7 +339,7 @@ class Stribeck:
     @property
     def parameters(self) -> ParameterSet:
         """Parameters: coulomb, static [N], stribeck_velocity [m/s], viscous [N*s/m], smoothing [m/s]."""
-        return ParameterSet({**_STRIBECK_PARAMETERS, "viscous": _VISCOUS_PARAMETER, "smoothing": _SMOOTHING_PARAMETER})
+        return ParameterSet({**_STRIBECK_PARAMETERS, "viscous": _VISCOUS_PARAMETER, "smoothing": SMOOTHING_PARAMETER})
 
     @property
     def start(self) -> FrictionStart:
@@ -441,7 +440,7 @@ class Asymmetric:
             Parameter(0.0, "1", lower=-0.95, upper=0.95, meaning=f"{what} more forwards, less backwards, a fraction")
             for what in ("Coulomb and static friction", "viscous friction")
         )
-        width = replace(_SMOOTHING_PARAMETER, meaning="speed over which one direction's levels become the other's")
+        width = replace(SMOOTHING_PARAMETER, meaning="speed over which one direction's levels become the other's")
         added = {"viscous_asymmetry": slope, "asymmetry_width": width}
         coulomb = {"coulomb_asymmetry": levels} if "coulomb" in self.base.parameters else {}
         return self.base.parameters | ParameterSet({**coulomb, **added})
@@ -558,8 +557,8 @@ _FLOORS = {"coulomb": MIN_COULOMB_SHARE, "viscous": 0.0}
 _STRIBECK_SCAN = {"stribeck_velocity": STRIBECK_VELOCITIES}
 _VISCOUS_PARAMETER = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5, meaning="friction per speed")
 _COULOMB_PARAMETER = Parameter(30.0, "N", lower=0.0, upper=1e5, meaning="Coulomb friction: the level while sliding")
-_SMOOTHING_PARAMETER = Parameter(
-    USUAL_SMOOTHING,
+SMOOTHING_PARAMETER = Parameter(
+    1e-3,
     "m/s",
     lower=1e-6,
     upper=1.0,
@@ -571,7 +570,7 @@ _STRIBECK_PARAMETERS = {
     "coulomb": _COULOMB_PARAMETER,
     "static": Parameter(45.0, "N", lower=0.0, upper=1e5, meaning="static friction: the level at break-away"),
     "stribeck_velocity": Parameter(
-        USUAL_STRIBECK_VELOCITY,
+        0.02,
         "m/s",
         lower=1e-4,
         upper=1.0,
@@ -605,9 +604,9 @@ class Presliding:
     def parameters(self) -> ParameterSet:
         """Parameters: coulomb [N], viscous [N*s/m], presliding_speed [m/s]."""
         base = Coulomb().parameters
-        speed = Parameter(
-            3e-3, "m/s", lower=MIN_PRESLIDING_SPEED, upper=0.1, log=True, meaning="speed over which friction builds up"
-        )
+        # below the least one friction is as sharp as that of `Coulomb`, and takes many integration steps; above it the
+        # yielding of stiff drives is missed
+        speed = Parameter(3e-3, "m/s", lower=3e-4, upper=0.1, log=True, meaning="speed over which friction builds up")
         return base.select(n for n in base if n != "smoothing") | ParameterSet({"presliding_speed": speed})
 
     @property

@@ -17,13 +17,15 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Log, Rest, RestHook, Start
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack
-from pneuopt.models.tolerances import DEFAULT_SENSOR_DELAY, MAX_SENSOR_DELAY, MIN_SENSOR_DELAY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 Channels = tuple[str, ...]
+# A sensor's delay or lag: a shorter one makes the ODE stiff and does not show in logs at 1 kHz, a longer delay is not
+# followed by a Padé form of second order.
+_DELAY = Parameter(1e-3, "s", lower=2e-4, upper=0.05)
 
 
 def with_sensors(
@@ -81,7 +83,7 @@ def with_sensors(
     )
 
 
-def coarse_delay(log: Trajectory, late: str, other: str, longest: float = MAX_SENSOR_DELAY) -> float:
+def coarse_delay(log: Trajectory, late: str, other: str, longest: float = _DELAY.upper) -> float:
     """Delay of one of two related channels against the other by cross-correlation: a start value for its parameter.
 
     Parameters
@@ -144,9 +146,8 @@ class _Sensors:
     @property
     def parameters(self) -> ParameterSet:
         units = {q.name: q.unit.partition("(")[0] for q in self.plant.outputs}
-        time = Parameter(DEFAULT_SENSOR_DELAY, "s", lower=MIN_SENSOR_DELAY, upper=MAX_SENSOR_DELAY)
         out = {f"sensor.{n}.offset": Parameter(0.0, units[n]) for n in self.offset}
-        out |= {f"sensor.{n}.delay": time for n in self.delay} | {f"sensor.{n}.lag": time for n in self.lag}
+        out |= {f"sensor.{n}.delay": _DELAY for n in self.delay} | {f"sensor.{n}.lag": _DELAY for n in self.lag}
         return ParameterSet(out)
 
     def rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:

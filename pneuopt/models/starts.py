@@ -16,12 +16,12 @@ from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
 from pneuopt.dynamics.hooks import Log, Start, Starts
-from pneuopt.models.friction import FrictionModel, FrictionSamples, FrictionStart, law_inputs
+from pneuopt.logs.tolerances import MAX_REGRESSION_ROWS
+from pneuopt.models.friction import SMOOTHING_PARAMETER, FrictionModel, FrictionSamples, FrictionStart, law_inputs
 from pneuopt.models.load import GRAVITY
 from pneuopt.models.tolerances import (
     FILTER_TIMES,
     MAX_JITTER,
-    MAX_START_SAMPLES,
     MIN_BALANCE_GAIN,
     MIN_LEVEL_EXCESS,
     PRESLIDING_DEFLECTIONS,
@@ -31,7 +31,6 @@ from pneuopt.models.tolerances import (
     STATIC_QUANTILE,
     STATIC_WEIGHT,
     STUCK_WEIGHT,
-    USUAL_SMOOTHING,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
@@ -113,7 +112,7 @@ def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) ->
     """Mean absolute force in sliding samples that friction does not explain [N]; of long logs, some samples tell."""
     thinned = {}
     for name, rows in logs.items():
-        every = slice(None, None, max(1, len(rows.measured) // MAX_START_SAMPLES))
+        every = slice(None, None, max(1, len(rows.measured) // MAX_REGRESSION_ROWS))
         measured = Trajectory(rows.measured.t[every], {n: rows.measured[n][every] for n in rows.measured})
         columns, states = ({n: c[every] for n, c in part.items()} for part in (rows.columns, rows.states))
         speed, force = rows.speed[every], rows.force[every]
@@ -232,7 +231,9 @@ def _log_columns(
     values = {n: p.value(f"friction.{n}") for n in friction.parameters} | dict(tried)
     signals = {**{n: rows.measured[n] for n in rows.measured}, "force": rows.force}
     inputs = law_inputs(friction, signals, {n: p.value(n) for n in p if n.startswith("ambient.")})
-    samples = FrictionSamples(speed, np.tanh(speed / values.get("smoothing", USUAL_SMOOTHING)), speed, inputs, values)
+    samples = FrictionSamples(
+        speed, np.tanh(speed / values.get("smoothing", SMOOTHING_PARAMETER.value)), speed, inputs, values
+    )
     if stuck is not None:
         samples = replace(samples, side=stuck, level_speed=np.zeros_like(speed))
     columns = {n: c for n, c in rows.columns.items() if n in p}

@@ -6,14 +6,9 @@ Constants of physics and of standards stand beside their formulas.
 # Friction: what a law needs to be smooth, and what a log must show
 
 STICKING_SPEED = 1e-6  # rounding of |v| in LuGre [m/s]: a larger one creeps visibly, a smaller one needs finer steps
-# least presliding speed [m/s]: below it friction is as sharp as that of `Coulomb`, and takes many integration steps;
-# above it the yielding of stiff drives is missed
-MIN_PRESLIDING_SPEED = 3e-4
-USUAL_SMOOTHING = 1e-3  # speed over which friction turns its sign [m/s], before logs tell another
-USUAL_STRIBECK_VELOCITY = 0.02  # speed over which friction falls from static to Coulomb [m/s], before logs tell another
 MIN_SPEED_RATIO = 3.0  # fast over slow speed [1]: less shows one point of the curve, a larger bound refuses good logs
 VISCOUS_SPEED_RATIO = 5.0  # speed over the Stribeck velocity [1] beyond which the static peak hides no viscous friction
-MIN_SLOW_SAMPLES = 20  # samples below the Stribeck velocity: fewer are noise, a larger bound refuses good logs
+MIN_SAMPLES = 20  # samples of a log, or below its Stribeck velocity: fewer are noise, a larger bound refuses good logs
 MIN_DIRECTION_SHARE = 0.05  # share of the moving samples in the rarer direction [1]: fewer are accidental
 MIN_REVERSALS = 2  # reversals of the motion: one alone does not show that presliding repeats
 MIN_INERTIA_SHARE = 0.02  # inertia force over the friction level [1]: less is lost in the model's error
@@ -41,7 +36,6 @@ RIDGE_WEIGHT = 1e-2
 # least excess of a level (static) over the one below it (Coulomb), as a fraction of that one: with less, a search
 # starts without a Stribeck curve and finds none
 MIN_LEVEL_EXCESS = 0.03
-MAX_START_SAMPLES = 2000  # approximate samples of a log from which a valve is estimated or checked; more only cost time
 # travel since the last reversal within which bristles still bend, in bristle deflections: with a smaller one presliding
 # counts as sliding, a larger one drops sliding samples
 PRESLIDING_DEFLECTIONS = 3.0
@@ -60,15 +54,11 @@ FILTER_TIMES = (0.031, 0.021, 0.015, 0.011, 0.007)
 USUAL_PADE_ORDER = 3  # of a dead time in a file: it follows the delay up to 4.6 rad of phase, with three states
 # samples of all logs together in the grid search and in the refinement: fewer hide fast plants, more cost time
 MAX_GRID_SAMPLES, MAX_REFINEMENT_SAMPLES = 600, 4000
-MIN_START_SAMPLES = 20  # samples that a log needs: fewer than a few for each parameter fit anything
 # least dead time that is tried where its bound is 0, over two samples [1]: at 0 the model of a delay divides by it, and
 # further below the delay line is needlessly stiff
 MIN_DEAD_TIME = 0.05
 MAX_STARTS = 4  # candidates that are refined and returned: fewer miss the right one, each costs a refinement
 DAMPING_GRID = (0.1, 0.3, 0.7, 1.5, 4.0)  # damping ratios of the grid [1], from ringing to two separate lags
-MIN_SENSOR_DELAY = 2e-4  # least delay or lag [s]: shorter ones make the ODE stiff and do not show in logs at 1 kHz
-MAX_SENSOR_DELAY = 0.05  # greatest delay or lag [s]: longer delays are not followed by a Padé form of second order
-DEFAULT_SENSOR_DELAY = 1e-3  # delay or lag before an identification [s]
 
 # Pneumatic drives: where the model is smooth, and where it ends
 
@@ -84,9 +74,6 @@ MAX_COMPRESSION_RATIO = 20.0  # largest chamber pressure over supply pressure [1
 # a larger ratio warns of chambers that just exhaust
 EMPTY_CHAMBER_RATIO = 0.5
 MAX_STOP_TRAVEL = 0.01  # share of the stroke by which a piston that presses on a stop may be outside
-# share of the stroke by which a position sensor's zero may be off: a smaller one warns of usual mounting errors, a
-# larger one overlooks a wrong unit or stroke
-MAX_POSITION_ZERO_ERROR = 0.05
 
 # Starts of pneumatic drives
 
@@ -96,9 +83,12 @@ MAX_INTEGRATION_STEP = 5e-5
 # usual steps [1] of a log that the air is followed over from sample to sample: more cost a hole of seconds thousands of
 # integration steps at every sample, fewer cut short a log that lost some samples
 MAX_USUAL_STEPS = 20
-# values of the valve's shape that are tried where they are free [1], and of its centre [half travels]
-VALVE_SHAPE_GRID = {"valve.critical_ratio": (0.15, 0.3, 0.45), "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2)}
-CENTRE_SHIFTS = (-0.02, 0.0, 0.02)
+# values of the valve's shape that are tried where they are free [1], and shifts of its centre [half travels]
+VALVE_SHAPE_GRID = {
+    "valve.critical_ratio": (0.15, 0.3, 0.45),
+    "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2),
+    "valve.centre": (-0.02, 0.0, 0.02),
+}
 # leaks [1], and conductances over `PneumaticLog.min_conductance` [1], that are tried where no pressure is logged
 LEAK_GRID, CONDUCTANCE_FACTORS = (0.003, 0.01, 0.03, 0.1), (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 MIN_LEAK = 1e-4  # least leak of a start [1]: at zero the search would begin on a bound

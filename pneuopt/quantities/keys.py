@@ -158,8 +158,8 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
         return _in_bounds(key, read_value(entry, key.unit.format_map(units), where=where), entry, where)
     if key.takes is Takes.SAMPLES:
         match = re.fullmatch(r"\s*(\d+)\s*samples?\s*", entry) if isinstance(entry, str) else None
-        told = f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"'
-        require(match is not None or type(entry) is int, told)
+        message = f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"'
+        require(match is not None or type(entry) is int, message)
         return int(match[1]) if match else int(entry)
     proper = type(entry) in key.takes.types
     require(proper, f"{where} must be {key.takes.value}, got {repr(entry)[:MAX_SHOWN]}{_remedy(key, where)}")

@@ -27,6 +27,7 @@ from pneuopt.dynamics.hooks import (
     Width,
 )
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
+from pneuopt.logs.tolerances import MAX_POSITION_ZERO_ERROR
 from pneuopt.models.declaration import Alias, DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drives import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
 from pneuopt.models.friction import (
@@ -55,7 +56,6 @@ from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve, Spool
 from pneuopt.models.tolerances import (
     EMPTY_CHAMBER_RATIO,
     MAX_COMPRESSION_RATIO,
-    MAX_POSITION_ZERO_ERROR,
     MAX_STOP_TRAVEL,
     MIN_CHAMBER_PRESSURE,
     ROUNDING_FACTOR,

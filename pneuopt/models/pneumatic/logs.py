@@ -32,6 +32,7 @@ import numpy as np
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector, stack
+from pneuopt.logs.tolerances import MAX_REGRESSION_ROWS
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.pneumatic.cylinder import volumes
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
@@ -46,7 +47,6 @@ from pneuopt.models.starts import (
     per_log_values,
 )
 from pneuopt.models.tolerances import (
-    CENTRE_SHIFTS,
     CONDUCTANCE_FACTORS,
     FILTER_TIMES,
     GRID_REFINEMENTS,
@@ -55,7 +55,6 @@ from pneuopt.models.tolerances import (
     MAX_INTEGRATION_STEP,
     MAX_LINE_RESIDUAL_SHARE,
     MAX_RESIDUAL_SHARE,
-    MAX_START_SAMPLES,
     MAX_UNQUESTIONED_SHARE,
     MAX_USUAL_STEPS,
     MAX_WORSE_LEADS,
@@ -268,8 +267,10 @@ class PneumaticLog:
 
 def valve_shapes(parameters: ParameterSet, free: Collection[str]) -> dict[str, tuple[float, ...]]:
     """Values to try of what is free of the valve's shape: critical ratio, dead zone and centre."""
-    around = tuple(parameters.value(CENTRE) + shift * parameters.value(SPAN) for shift in CENTRE_SHIFTS)
-    return {n: tried for n, tried in {**VALVE_SHAPE_GRID, CENTRE: around}.items() if n in free}
+    tried = {n: values for n, values in VALVE_SHAPE_GRID.items() if n in free}
+    if CENTRE in tried:
+        tried[CENTRE] = tuple(parameters.value(CENTRE) + shift * parameters.value(SPAN) for shift in tried[CENTRE])
+    return tried
 
 
 def _estimate_valve(friction: FrictionModel, runs: Mapping[str, PneumaticLog]) -> dict[str, float]:
@@ -277,7 +278,7 @@ def _estimate_valve(friction: FrictionModel, runs: Mapping[str, PneumaticLog]) -
     parameters = next(iter(runs.values())).parameters
     free = [
         n
-        for n in (VALVE_CONDUCTANCE, VALVE_LEAK, *VALVE_SHAPE_GRID, CENTRE)
+        for n in (VALVE_CONDUCTANCE, VALVE_LEAK, *VALVE_SHAPE_GRID)
         if any(n in run.parameters.free_names for run in runs.values())
     ]
     if not free:
@@ -503,14 +504,14 @@ def is_informative(log: Log) -> bool:
 def most_active_part(log: Log) -> Log:
     """Part of a long log in which the pressures change most, which is enough for the check and cheap."""
     data = log.measured
-    if len(data) <= MAX_START_SAMPLES:
+    if len(data) <= MAX_REGRESSION_ROWS:
         return log
     path = np.sum(
         [np.abs(filter_channel(data, n, 1)) / float(np.nanmean(data[n])) for n in _pressure_channels(log)], axis=0
     )
-    within = np.convolve(path, np.ones(MAX_START_SAMPLES), "valid")
+    within = np.convolve(path, np.ones(MAX_REGRESSION_ROWS), "valid")
     first = int(np.argmax(within))
-    return log._replace(measured=data.rows(first, first + MAX_START_SAMPLES))
+    return log._replace(measured=data.rows(first, first + MAX_REGRESSION_ROWS))
 
 
 def _pressure_channels(log: Log) -> list[str]:
