@@ -11,7 +11,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from pneuopt.control.pid import ParallelForm
-from pneuopt.export.tolerances import OPEN_LIMIT, TIME_GRAIN, USUAL_UPDATE
+from pneuopt.export.tolerances import LARGEST_LITERAL, TIME_GRAIN, USUAL_UPDATE
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.units import difference_unit, write_value
 
@@ -418,7 +418,7 @@ def _codesys_settings(d: BlockNumbers) -> list[Setting]:
     direction(d, UTIL_PID)  # typed in with their sign, which must be one
     name, unit = ("PID_FIXCYCLE" if d.integrates else "PD"), d.command_unit
     is_open = math.isinf(d.low) and math.isinf(d.high)
-    low, high = (0.0, 0.0) if is_open else (max(d.low, -OPEN_LIMIT), min(d.high, OPEN_LIMIT))
+    low, high = (0.0, 0.0) if is_open else (max(d.low, -LARGEST_LITERAL), min(d.high, LARGEST_LITERAL))
     limits = "both 0: no limit" if is_open else d.goes
     integral = [("TN", number(Ti), "Kp/Ki [s]")] if d.integrates else []
     clock = [("CYCLE", number(d.sample_time), "sample time [s], the period of the task")]
@@ -487,7 +487,7 @@ def _beckhoff_settings(d: BlockNumbers) -> list[Setting]:
     shown = write_value(Ti, "s") if math.isfinite(Ti) else ""
     told = f"{FB_CTRL_PID} counts its times in whole milliseconds, and Ti = {shown} would be 0: no integral at all"
     require(math.isinf(Ti) or round(abs(Ti) / TIME_GRAIN) > 0, f"{told}; use --to st")
-    low, high = (-OPEN_LIMIT, OPEN_LIMIT) if d.is_open else d.limits
+    low, high = (-LARGEST_LITERAL, LARGEST_LITERAL) if d.is_open else d.limits
     off = "T#0ms switches the integral off"
     behind = "open: the sum behind the block is limited" if d.is_open else f"about {d.zero}"
     return [
@@ -495,8 +495,8 @@ def _beckhoff_settings(d: BlockNumbers) -> list[Setting]:
         Setting("tTn", _time(Ti), "Kp/Ki" if math.isfinite(Ti) else off),
         Setting("tTv", _time(Td), "Kd/Kp; T#0ms switches the derivative off"),
         Setting("tTd", _time(d.gains.Tf if d.differentiates else 0.0), "Tf"),
-        Setting("fOutMinLimit", number(max(low, -OPEN_LIMIT)), f"[{d.command_unit}] {behind}"),
-        Setting("fOutMaxLimit", number(min(high, OPEN_LIMIT)), f"[{d.command_unit}] {behind}"),
+        Setting("fOutMinLimit", number(max(low, -LARGEST_LITERAL)), f"[{d.command_unit}] {behind}"),
+        Setting("fOutMaxLimit", number(min(high, LARGEST_LITERAL)), f"[{d.command_unit}] {behind}"),
         Setting("bPInTheFeedbackPath", flag(nearest_weight(d.b) < 1), "b = 0"),
         Setting("bDInTheFeedbackPath", flag(nearest_weight(d.c) < 1), "c = 0"),
         Setting("bARWOnIPartOnly", "FALSE", "the anti-reset windup as delivered"),
