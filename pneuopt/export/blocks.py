@@ -143,7 +143,8 @@ def run_as_block(
     clamps = maker_block.clamps and loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
     kind = AntiWindup.CLAMPING if clamps else loop.pid.anti_windup
     found += ["its integral is clamped at a limit, the design's unwinds by back-calculation"] * (clamps and integrates)
-    behind = integrates and maker_block.added is None and block_numbers(acting, parameters, 0.0).is_added_to
+    numbers = block_numbers(acting, parameters, 0.0)
+    behind = integrates and maker_block.sum_input(numbers) is None and numbers.is_added_to
     found += [f"{BLIND_LIMITS} (simulated as if they saw it)"] if behind and loop.pid.limits else []
     found += ["it has no dead band of the integral"] if acting.pid.dead_band else []
     found += ["it has no reset of the integral"] if loop.pid.reset else []
@@ -450,7 +451,7 @@ def _added_lines(
         terms += [write_value(value["dither.offset"], unit, 9)] if value["dither.offset"] else []
         terms += [size] if not controller.dither.analogue and value["dither.amplitude"] else []
     if terms:
-        where = maker_block.added(inner) if maker_block.added else "a sum behind the block, before the limits"
+        where = maker_block.sum_input(inner) or "a sum behind the block, before the limits"
         yield f"Sum: {' + '.join(terms)}; in your program once a sample, 0 while the block is not in automatic."
         yield f"Where it goes: {where}."
 
@@ -459,7 +460,7 @@ def _limit_words(d: BlockNumbers, maker_block: MakerBlock) -> str:
     if not (math.isfinite(d.low) or math.isfinite(d.high)):
         return "the design has none; the output stage has its own"
     ends = [write_value(v, d.command_unit) if math.isfinite(v) else "none" for v in (d.low, d.high)]
-    if not d.is_added_to or maker_block.added is not None:
+    if not d.is_added_to or maker_block.sum_input(d) is not None:
         return f"{ends[0]} to {ends[1]} on the wire, in the block"
     own = "; the block has the same, for its integral" if d.integrates else ""
     return f"{ends[0]} to {ends[1]} on the wire, behind that sum, in your program{own}"
