@@ -27,6 +27,7 @@ from pneuopt.control.loop import ClosedLoop, find_rest
 from pneuopt.control.tolerances import (
     BALANCE_TOLERANCE,
     MAX_NEWTON_STEPS,
+    MAX_RIPPLE_STEPS,
     MIN_NEWTON_FRACTION,
     NEWTON_TOLERANCE,
     RIPPLE_PHASES,
@@ -302,7 +303,7 @@ def _newton_root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: 
         return left.full().ravel() / scale, slope.full() * scale / scale[:, None]
 
     left, slope = residual_and_slope(z)
-    for _ in range(MAX_NEWTON_STEPS):
+    for _ in range(MAX_RIPPLE_STEPS):
         step, size, part = np.linalg.solve(slope, -left), np.abs(left).max(), 1.0
         while not np.abs(residual_and_slope(z + part * step)[0]).max() < size and part > MIN_NEWTON_FRACTION:
             part /= 2
@@ -462,24 +463,24 @@ class AveragedPlant:
         return RippleMoments(self.loop, self.compiled)
 
     def _balances(self, p: Array, x: Array, u: Array) -> Iterator[tuple[Mask, Moments]]:
-        """Rows of one frequency, and their moments along the swing that balances."""
-        for rows, waves in self._waves(p):
-            yield rows, self._balance(p[rows], x[rows], u[rows], waves)
+        """Rows of one frequency, and their moments along the swing that balances.
 
-    def _waves(self, p: Array) -> Iterator[tuple[Mask, Waves]]:
-        """Rows of one frequency, and their waves; one phase is enough where nothing swings, or a swing does nothing."""
+        One phase is enough where nothing swings, or a swing does nothing.
+        """
         order, dither = list(self.loop.parameters), self.loop.dither
         amplitudes = np.zeros(len(p)) if dither is None else p[:, order.index(DITHER_AMPLITUDE)]
         moving = np.logical_and(amplitudes != 0, not is_affine(self.loop.plant))
         if not moving.all():
             still, count = (np.zeros(1), np.ones(1), np.zeros(1)), int((~moving).sum())
-            yield ~moving, Waves(0.0, np.zeros(count), *still, np.zeros(count, dtype=np.complex128))
+            waves = Waves(0.0, np.zeros(count), *still, np.zeros(count, dtype=np.complex128))
+            yield ~moving, self._balance(p[~moving], x[~moving], u[~moving], waves)
         if dither is None or not moving.any():
             return
         rates = p[:, order.index(DITHER_FREQUENCY)]
         for rate in np.unique(rates[moving]).tolist():
             rows, w = moving & (rates == rate), 2 * pi * rate
-            yield rows, Waves(w, amplitudes[rows], *self._phases(dither, rate), np.zeros(int(rows.sum()), complex))
+            waves = Waves(w, amplitudes[rows], *self._phases(dither, rate), np.zeros(int(rows.sum()), complex))
+            yield rows, self._balance(p[rows], x[rows], u[rows], waves)
 
     def _phases(self, dither: Dither, rate: float) -> tuple[Array, Array, Array]:
         """Phases of the swing, their weights, and the wave there, which is held over whole periods and samples."""

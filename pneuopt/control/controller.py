@@ -210,7 +210,13 @@ class Controller:
         with what takes a difference or filters counting the time since the last good one; else it begins anew as at a
         start, from the output that was sent last. Time, and a dither with it, goes on.
         """
-        signals = tuple(zip((x, u, y), self._read_names(), strict=True))
+        states_read, outputs_read = set[str](), set(self.readings)
+        if isinstance(self.sensor, SensorLag):
+            states_read.add("sensor.reading")
+        else:
+            outputs_read.add(self.sensor.position if self.sensor else self.pid_signal.name)
+        inputs_read = {"reference", REFERENCE_SPEED, REFERENCE_ACCELERATION}
+        signals = (x, states_read), (u, inputs_read), (y, outputs_read)
         is_good = signals_are_good([v for group, read in signals for n, v in group.items() if n in read])
         count = ca.if_else(is_good, 0, x[_COUNT] + 1)
         good = count <= 0  # read where it is needed; the condition above is computed once
@@ -224,19 +230,18 @@ class Controller:
         states = _choose(good, law.states, held) | {_COUNT: count}
         return ControllerUpdate(states, {f"{n}_read": v for n, v in (*u_read.items(), *y_read.items())} | law.terms)
 
-    def _read_names(self) -> tuple[set[str], set[str], set[str]]:
-        """Which states, inputs and outputs of the plant are signals that the controller reads."""
-        inputs = {"reference", REFERENCE_SPEED, REFERENCE_ACCELERATION}
-        if isinstance(self.sensor, SensorLag):
-            return {"sensor.reading"}, inputs, set(self.readings)
-        return set(), inputs, {*self.readings, self.sensor.position if self.sensor else self.pid_signal.name}
-
     def _sampled_law(self, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols) -> ControllerUpdate:
         """The law at a good sample, along the signals' way."""
         anew = x[_COUNT] >= p["pid.fault_samples"]
 
-        # What the controller sees of the plant.
-        x, seen = self._read_sensor(anew, x, y, p)
+        # What the controller sees of the plant; an encoder that begins anew stands still.
+        x, seen = {**x}, Signals()
+        if self.sensor is not None:
+            reading = y, self.sensed_signal, without_prefix(p, "sensor")
+            if isinstance(self.sensor, Encoder):
+                x |= _choose(anew, with_prefix(self.sensor.rest(*reading), "sensor"), x)
+            elapsed = self.pid.elapsed_time(without_prefix(x, "pid"))
+            seen = self.sensor.update(without_prefix(x, "sensor"), *reading, elapsed)
         measured = seen["reading"] if seen else y[self.pid_signal.name]
         position = measured if self.outer is None else seen["count"] if "count" in seen else y[self.feedback.name]
 
@@ -264,16 +269,6 @@ class Controller:
             for n, gain in zip(Form.PARALLEL.gains, parallel_gains(self.pid.form, gains), strict=True)
         }
         return ControllerUpdate(states, terms | {"unlimited": self.pid.output(*pid, gains) + added})
-
-    def _read_sensor(self, anew: ca.SX, x: Symbols, y: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        """The loop's states, those of an encoder at rest where it begins anew; and the sensor's after the sample."""
-        if self.sensor is None:
-            return {**x}, {}
-        signal, sensor_p = self.sensed_signal, without_prefix(p, "sensor")
-        if isinstance(self.sensor, Encoder):
-            x = {**x, **_choose(anew, with_prefix(self.sensor.rest(y, signal, sensor_p), "sensor"), x)}
-        elapsed = self.pid.elapsed_time(without_prefix(x, "pid"))
-        return {**x}, self.sensor.update(without_prefix(x, "sensor"), y, signal, sensor_p, elapsed)
 
     def _added_to_command(
         self, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols

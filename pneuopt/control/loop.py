@@ -378,21 +378,15 @@ def check_closed_loop(loop: object) -> None:
 def add_disturbances(loop: ClosedLoop, references: Iterable[Reference]) -> ClosedLoop:
     """Give the plant an input for each disturbance of the references; it adds to that parameter or input."""
     wanted = dict.fromkeys(n for reference in references for n in reference.disturbance)
-    new = [n for n in wanted if disturbance_input(n) not in names(loop.plant.inputs)]
-    known = [*names(loop.plant.inputs), *loop.plant.parameters]
-    check_names("parameter or input of the plant", new, known, "disturbance")
+    plant, inputs, parameters = loop.plant, list(names(loop.plant.inputs)), list(loop.plant.parameters)
+    new = [n for n in wanted if disturbance_input(n) not in inputs]
+    check_names("parameter or input of the plant", new, [*inputs, *parameters], "disturbance")
     if not new:
         return loop
-    plant = _add_plant_disturbances(loop.plant, new)
-    return replace(loop, plant=plant, actuated=loop.command.name, measured=loop.feedback.name)
-
-
-def _add_plant_disturbances(plant: System, wanted: list[str]) -> System:
     u, p = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in ((2, "u"), (3, "p")))
-    t, x, d = ca.SX.sym("t"), ca.SX.sym("x", plant.ode.size1_in(1)), ca.SX.sym("d", len(wanted))
-    inputs, parameters = list(names(plant.inputs)), list(plant.parameters)
+    t, x, d = ca.SX.sym("t"), ca.SX.sym("x", plant.ode.size1_in(1)), ca.SX.sym("d", len(new))
     us, ps = ca.SX(u), ca.SX(p)
-    for k, n in enumerate(wanted):
+    for k, n in enumerate(new):
         if n in inputs:
             us[inputs.index(n)] += d[k]
         else:
@@ -404,9 +398,10 @@ def _add_plant_disturbances(plant: System, wanted: list[str]) -> System:
         return ca.Function(function.name(), arguments, found, given, list(function.name_out()))
 
     units = {q.name: q.unit for q in plant.inputs} | {n: q.unit for n, q in plant.parameters.items()}
-    more = tuple(Quantity(disturbance_input(n), units[n]) for n in wanted)
+    more = tuple(Quantity(disturbance_input(n), units[n]) for n in new)
     meter = None if plant.meter is None else wrap(plant.meter)
-    return replace(plant, inputs=(*plant.inputs, *more), ode=wrap(plant.ode), meter=meter)
+    disturbed = replace(plant, inputs=(*plant.inputs, *more), ode=wrap(plant.ode), meter=meter)
+    return replace(loop, plant=disturbed, actuated=loop.command.name, measured=loop.feedback.name)
 
 
 def select_signal(kind: str, name: str | None, known: Sequence[Quantity], usual: str | None) -> Quantity:
@@ -569,8 +564,15 @@ def bumpless_transfer(
         state[remembered] += (c_new - c) * reference
     integral = order.index("pid.integral")
     if loop.pid.sample_time is not None and integrates(loop.parallel_form(new).Ki):
-        shares = [_distance_share(loop, state, p, reference) for p in (old, new)]
-        state[order.index("pid.transfer")] += shares[0] - shares[1]
+        # the part of the next command that is due to the distance from the set point, as the PID sees it
+        t, x_now, u = ca.SX.sym("t"), symbols(loop.states), symbols(loop.inputs)
+        p: Signals = {n: ca.SX.sym(n) for n in loop.parameters}
+        terms = loop.controller.update(t, x_now, u, loop.evaluate_plant(t, x_now, u, p, ca.SX(0))[1], p).terms
+        due = terms["Kp_parallel"] * p["pid.b"] * terms["error"]
+        share = ca.Function("share", [t, *map(stack, (x_now, u, p))], [due])
+        given = [reference] + [0.0] * (len(loop.inputs) - 1)
+        before, after = (float(share(0.0, state, given, loop.parameter_vector(each))) for each in (old, new))
+        state[order.index("pid.transfer")] += before - after
     state[integral] += wanted - _next_command(loop, state, new, reference)
     if loop.compensators:  # they bend the command: the integral is sought that gives the one wanted
         is_integral, x_new = np.array(order) == "pid.integral", state.copy()
@@ -580,18 +582,6 @@ def bumpless_transfer(
 
         state[integral] = invert_increasing(commands, np.array([wanted]))[0]
     return state
-
-
-def _distance_share(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:
-    """The part of the next command that is due to the distance from the set point, Kp b (r - y) as the PID sees it."""
-    t, state, u = ca.SX.sym("t"), symbols(loop.states), symbols(loop.inputs)
-    p: Signals = {n: ca.SX.sym(n) for n in loop.parameters}
-    y = loop.evaluate_plant(t, state, u, p, ca.SX(0))[1]
-    terms = loop.controller.update(t, state, u, y, p).terms
-    of = ca.Function("share", [t, *map(stack, (state, u, p))], [terms["Kp_parallel"] * p["pid.b"] * terms["error"]])
-    given = np.zeros(len(loop.inputs))
-    given[0] = reference
-    return float(of(0.0, x, given, loop.parameter_vector(parameters)))
 
 
 def _next_command(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:

@@ -498,31 +498,27 @@ class SCurve:
 
     def motion(self, t: Array) -> tuple[Array, Array, Array]:
         """See `PlannedMotion`; the second half is the first, mirrored, so that the end is met exactly."""
-        T = self.duration
-        late = t > T / 2
-        s, v, a = self._speeding_up(np.clip(np.where(late, T - t, t), 0.0, None))
-        moves = (t >= 0) & (t < T)
+        T, Tj, Ta, peak = self.duration, self.jerk_time, self.acceleration_time, self.peak_speed
+        top = peak / (Ta - Tj)
+        jerk = top / Tj if Tj else 0.0
+        late, moves = t > T / 2, (t >= 0) & (t < T)
+        since = np.clip(np.where(late, T - t, t), 0.0, None)
+        when, left = [since < Tj, since < Ta - Tj, since < Ta], Ta - since
+        s = np.select(
+            when,
+            [
+                jerk * since**3 / 6,
+                top * (since * (since - Tj) / 2 + Tj**2 / 6),
+                peak * (since - Ta / 2) + jerk * left**3 / 6,
+            ],
+            peak * (since - Ta / 2),
+        )
+        v = np.select(when, [jerk * since**2 / 2, top * (since - Tj / 2), peak - jerk * left**2 / 2], peak)
+        a = np.select(when, [jerk * since, np.full_like(since, top), jerk * left], 0.0)
         return (
             np.where(late, self.distance - s, s),
             np.where(moves, v, 0.0),
             np.where(moves, np.where(late, -a, a), 0.0),
-        )
-
-    def _speeding_up(self, t: Array) -> tuple[Array, Array, Array]:
-        """Motion in the first half, segment by segment."""
-        Tj, Ta, v = self.jerk_time, self.acceleration_time, self.peak_speed
-        a = v / (Ta - Tj)
-        jerk = a / Tj if Tj else 0.0
-        left = Ta - t
-        when = [t < Tj, t < Ta - Tj, t < Ta]
-        return (
-            np.select(
-                when,
-                [jerk * t**3 / 6, a * (t * (t - Tj) / 2 + Tj**2 / 6), v * (t - Ta / 2) + jerk * left**3 / 6],
-                v * (t - Ta / 2),
-            ),
-            np.select(when, [jerk * t**2 / 2, a * (t - Tj / 2), v - jerk * left**2 / 2], v),
-            np.select(when, [jerk * t, np.full_like(t, a), jerk * left], 0.0),
         )
 
 

@@ -311,8 +311,16 @@ class PID:
         remembered = {"derivative": terms["derivative"], "previous_error": p["c"] * r - y}
         own = {n: x[n] for n in RESET_STATES if self.reset}
         transfer = x["transfer"] / (1 + (self.sample_time or 0.0) / self.emptying_time(p))
-        integral = self._unwind(x["integral"], terms["integral"], w, u, p)
-        return {"integral": integral, **remembered, **sent, **own, "transfer": transfer, BAD_SAMPLES: ca.SX(0)}
+        # what the clip has taken from the command unwinds the integral; where Ki = 0, its time empties it
+        h, integral = self.sample_time or 0.0, terms["integral"]
+        kept, emptied = integral, integral - x["integral"] * (h / (h + self.emptying_time(p)))
+        if self.limits and self.anti_windup is AntiWindup.BACK_CALCULATION:
+            kept = integral + h / p["Tt"] * (u - w)
+        elif self.limits:
+            step, excess = integral - x["integral"], w - u
+            kept = integral - ca.fmax(0, ca.fmin(step, excess)) - ca.fmin(0, ca.fmax(step, excess))
+        after = ca.if_else(integrates(parallel_gains(self.form, p)[1]), kept, emptied)
+        return {"integral": after, **remembered, **sent, **own, "transfer": transfer, BAD_SAMPLES: ca.SX(0)}
 
     def hold(self, x: Symbols, count: ca.SX, p: Symbols) -> dict[str, ca.SX]:
         """The next value of each state at a bad sample, the `count`-th in a row: as it was, and the output's own."""
@@ -350,17 +358,6 @@ class PID:
     def clip(self, w: ca.SX, p: Symbols) -> ca.SX:
         """The saturated command: hard, as in a real controller; exact derivatives on either side of the corner."""
         return ca.fmin(ca.fmax(w, p["lower"]), p["upper"]) if self.limits else w
-
-    def _unwind(self, before: ca.SX, integral: ca.SX, w: ca.SX, u: ca.SX, p: Symbols) -> ca.SX:
-        """The integral after a sample, by what the clip has taken from the command, or where Ki = 0 by its time."""
-        h, kept = self.sample_time or 0.0, integral
-        if self.limits and self.anti_windup is AntiWindup.BACK_CALCULATION:
-            kept = integral + h / p["Tt"] * (u - w)
-        elif self.limits:
-            step, excess = integral - before, w - u
-            kept = integral - ca.fmax(0, ca.fmin(step, excess)) - ca.fmin(0, ca.fmax(step, excess))
-        emptied = integral - before * (h / (h + self.emptying_time(p)))
-        return ca.if_else(integrates(parallel_gains(self.form, p)[1]), kept, emptied)
 
     def emptying_time(self, p: Mapping[str, Any]) -> Any:
         """In which a transfer goes, and an integral that nothing fills [s]."""

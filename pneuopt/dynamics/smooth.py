@@ -112,26 +112,28 @@ class LimitMonitor:
         """
         t, places = self._with_checks(instants)
         x = run.advance_along(t) if isinstance(run, SmoothIntegration) else None
-        if not isinstance(run, SmoothIntegration) or x is None:
-            return self._follow_stepwise(run, instants, recorded, stops=stops)
+        if not isinstance(run, SmoothIntegration) or x is None:  # one instant after the other, to where it may fail
+            here = np.empty(0)
+            for k, instant in enumerate(instants.tolist()):
+                here = self.advance(run, instant)
+                if k < recorded and stops and self._contacts:
+                    break
+                if k < recorded:
+                    run.record()
+            return here
         kept = places[:recorded]
         if stops and ((crossed := self._crossings(x)[1].any(axis=1)).any() or self._contacts):
             kept = kept[kept < (0 if self._contacts else crossed.argmax())]
             places = places[: len(kept) + 1]
-        self._observe_along(t[: places[-1] + 1], x[: places[-1] + 1])
+        seen = x[: places[-1] + 1]
+        room, crossed = self._crossings(seen)
+        for k in np.flatnonzero(crossed.any(axis=1)).tolist():
+            if k:
+                self._t, self._values, self._room = t[k - 1], x[k - 1, self._indices], room[k - 1]
+            self.observe(t[k], x[k])
+        self._t, self._values, self._room = t[places[-1]], seen[-1, self._indices], room[-1]
         run.record_along(t[kept], x[kept])
         return np.array(x[-1])
-
-    def _follow_stepwise(self, run: Integration, instants: Array, recorded: int, *, stops: bool) -> Array:
-        """`follow` with an integration that reaches one instant after the other, or fails on the way."""
-        x = np.empty(0)
-        for k, t in enumerate(instants.tolist()):
-            x = self.advance(run, t)
-            if k < recorded:
-                if stops and self._contacts:
-                    break
-                run.record()
-        return x
 
     def _with_checks(self, instants: Array) -> tuple[Array, Indices]:
         """The instants and those between them at which the limits are checked, and the places of the former."""
@@ -144,15 +146,6 @@ class LimitMonitor:
         t = begins.repeat(more + 1) + (more.repeat(more + 1) + 1 - back) * LIMIT_CHECK_PERIOD
         t[places] = instants
         return t, places
-
-    def _observe_along(self, t: Array, x: Array) -> None:
-        """`observe` for each of the next states, shape (n, n_states)."""
-        room, crossed = self._crossings(x)
-        for k in np.flatnonzero(crossed.any(axis=1)).tolist():
-            if k:
-                self._t, self._values, self._room = t[k - 1], x[k - 1, self._indices], room[k - 1]
-            self.observe(t[k], x[k])
-        self._t, self._values, self._room = t[-1], x[-1, self._indices], room[-1]
 
     def _crossings(self, x: Array) -> tuple[Array, Mask]:
         """The room up to each limit at the next states, shape (n, n_limits), and which limits they cross."""

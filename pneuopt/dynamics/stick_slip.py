@@ -101,10 +101,18 @@ class StickSlipIntegration:
 
     def outputs(self) -> Array:
         """See `Integration`."""
-        p = self._p[self._mode or 0]
-        if self._mode == 0:
-            p = self._with_direction(p, self._balance_direction(self._now, self._x))
-        return self._ode(self._origin + self._now, self._x, self._inputs.at(self._now), p)[1]
+        t, x, p = self._now, self._x, self._p[self._mode or 0]
+        if self._mode == 0:  # friction balances the rest at a direction between -1 and 1
+            forward, backward = self._breakaway_accelerations(t, x)
+
+            def acceleration(direction: float) -> float:
+                directed = self._with_direction(p, direction)
+                return float(self._state_rate(self._origin + t, x, self._inputs.at(t), directed)[self._speed])
+
+            balances = forward < 0 < backward
+            direction = optimize.brentq(acceleration, -1.0, 1.0) if balances else np.sign(forward + backward)
+            return self._ode(self._origin + t, x, self._inputs.at(t), self._with_direction(p, float(direction)))[1]
+        return self._ode(self._origin + t, x, self._inputs.at(t), p)[1]
 
     def record(self) -> None:
         """See `Integration`."""
@@ -146,21 +154,18 @@ class StickSlipIntegration:
         too_many = self._steps > MAX_INTERNAL_STEPS
         if too_many or self._solver.t <= t or not np.isfinite(self._solver.y).all():
             self._record.fail(self._origin + t, x if self._mode else self._with_zero_speed(x))
-        self._event_time = (
-            inf if self._mode_persists() else _first_root(self._event_function, self._solver.t_old, self._solver.t)
-        )
-
-    def _mode_persists(self) -> bool:
-        """Whether the mode certainly lasts through the step, by a cheap test."""
+        # whether the mode certainly lasts through the step, by a cheap test
         begin, end = self._solver.t_old, self._solver.t
         before, self._last_indicator = self._last_indicator, self._mode_indicator(end, self._solver.y)
         if self._mode:
-            return bool(self._mode * self._solver.y[self._speed] > 0 and not before < 0 < self._last_indicator)
-        values = (before, self._event_function((begin + end) / 2), self._last_indicator)
-        return 2 * max(values) < min(values)
+            lasts = self._mode * self._solver.y[self._speed] > 0 and not before < 0 < self._last_indicator
+        else:
+            values = (before, self._event_function((begin + end) / 2), self._last_indicator)
+            lasts = 2 * max(values) < min(values)
+        self._event_time = inf if lasts else _first_root(self._event_function, begin, end)
 
     def _mode_indicator(self, t: float, x: Array) -> float:
-        """What `_mode_persists` compares at a step's ends: sliding, the gain of speed; stuck, `_event_function`."""
+        """What `_step` compares at a step's ends: sliding, the gain of speed; stuck, `_event_function`."""
         return float(self._mode * self._rate(t, x)[self._speed]) if self._mode else self._event_function(t)
 
     def _event_function(self, t: float) -> float:
@@ -177,18 +182,6 @@ class StickSlipIntegration:
         message = f"the static friction is negative at t = {self._origin + t:.9g} s; check its pressure coefficients"
         require(forward <= backward, message, ModelError)
         return 1 if forward > 0 else -1 if backward < 0 else 0
-
-    def _balance_direction(self, t: float, x: Array) -> float:
-        """The direction, between -1 and 1, at which the friction of a mass at rest balances the rest."""
-        forward, backward = self._breakaway_accelerations(t, x)
-        if not forward < 0 < backward:
-            return float(np.sign(forward + backward))
-
-        def acceleration(direction: float) -> float:
-            p = self._with_direction(self._p[0], direction)
-            return float(self._state_rate(self._origin + t, x, self._inputs.at(t), p)[self._speed])
-
-        return float(optimize.brentq(acceleration, -1.0, 1.0))
 
     def _breakaway_accelerations(self, t: float, x: Array) -> tuple[float, float]:
         """Accelerations that a mass at rest would have if it slid forwards, and backwards [m/s^2]."""

@@ -143,7 +143,8 @@ def run_as_block(
     clamps = maker_block.clamps and loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
     kind = AntiWindup.CLAMPING if clamps else loop.pid.anti_windup
     found += ["its integral is clamped at a limit, the design's unwinds by back-calculation"] * (clamps and integrates)
-    behind = integrates and maker_block.added is None and block_numbers(acting, parameters, 0.0).is_added_to
+    numbers = block_numbers(acting, parameters, 0.0)
+    behind = integrates and maker_block.sum_input(numbers) is None and numbers.is_added_to
     found += [f"{BLIND_LIMITS} (simulated as if they saw it)"] if behind and loop.pid.limits else []
     found += ["it has no dead band of the integral"] if acting.pid.dead_band else []
     found += ["it has no reset of the integral"] if loop.pid.reset else []
@@ -303,12 +304,17 @@ def find_surroundings(
     """What stands around a block, and the numbers of it or of a cascade's two; refuses what no block holds."""
     value = controller.values(parameters)
     low, high = _process_range(references, measured_span, controller.feedback.unit)
-    outer = _outer_numbers(controller, value, references, (low, high))
-    if outer is not None:
-        low, high = outer.low, outer.high
-    inner = replace(block_numbers(controller, parameters, centre), pv_low=low, pv_high=high)
-    given = references[0].origin
-    inner = replace(inner, start=given) if outer is None else replace(inner, reach="what the outer block gives at most")
+    inner, outer = block_numbers(controller, parameters, centre), None
+    if controller.outer is None:
+        inner = replace(inner, pv_low=low, pv_high=high, start=references[0].origin)
+    else:  # proportional; it reaches its limits only with its process value out of range
+        Kp, weight = (value[f"{controller.outer.section}.{n}"] for n in ("Kp", "weight"))
+        motions = [r.trajectory(r.horizon / 1000) for r in references]  # a step has no speed
+        speeds = (float(abs(t[REFERENCE_SPEED]).max()) for t in motions if REFERENCE_SPEED in t)
+        top, on = Kp * (high - low) + weight * max(speeds, default=0.0), controller.feedback
+        given = (math.nan, -top, top, 0.0, inner.sample_time, on.name, on.unit, inner.measured_unit, low, high)
+        outer = BlockNumbers(ParallelForm(Kp), 1.0, 1.0, *given, goes="to the inner block", zero="no speed")
+        inner = replace(inner, pv_low=-top, pv_high=top, reach="what the outer block gives at most")
     missing = "; ".join(_missing_parts(controller, value))
     title = maker_block.title.partition(" (")[0].partition(",")[0]
     told = f"{title} cannot hold this design: {missing}. No standard block of {maker_block.maker} stands for that"
@@ -356,22 +362,6 @@ def _process_range(references: Sequence[Reference], span: float | None, unit: st
         if ends_of_range[0] <= low and high <= ends_of_range[1]:
             return ends_of_range
     return (low + high - span) / 2, (low + high + span) / 2
-
-
-def _outer_numbers(
-    controller: Controller, value: Mapping[str, float], references: Sequence[Reference], span: tuple[float, float]
-) -> BlockNumbers | None:
-    """The outer block of a cascade: proportional; it reaches its limits only with its process value out of range."""
-    if controller.outer is None:
-        return None
-    Kp, weight = (value[f"{controller.outer.section}.{n}"] for n in ("Kp", "weight"))
-    motions = [r.trajectory(r.horizon / 1000) for r in references]  # a step has no speed
-    speeds = (float(abs(t[REFERENCE_SPEED]).max()) for t in motions if REFERENCE_SPEED in t)
-    top = Kp * (span[1] - span[0]) + weight * max(speeds, default=0.0)
-    gains, h = ParallelForm(Kp), controller.pid.sample_time or 0.0
-    on, speed = controller.feedback, controller.pid_signal.unit
-    found = BlockNumbers(gains, 1.0, 1.0, math.nan, -top, top, 0.0, h, on.name, on.unit, speed, *span)
-    return replace(found, goes="to the inner block", zero="no speed")
 
 
 def _missing_parts(controller: Controller, value: Mapping[str, float]) -> Iterator[str]:
@@ -453,30 +443,24 @@ def _added_lines(
         for gain, factor in gains.items()
         if value.get(gain)
     ]
-    terms += _dither_terms(controller, value, inner.sample_time)
+    if controller.dither is not None:
+        unit, turns = controller.command.unit, f"{number(value['dither.frequency'] * inner.sample_time)} k"
+        is_sine = controller.dither.waveform is Waveform.SINE
+        wave = f"sin(2 pi frac({turns}))" if is_sine else f"(1 - 4 abs(frac({turns} + 0.25) - 0.5))"
+        size = f"{write_value(value['dither.amplitude'], unit, 9)} x {wave}, k the number of the sample"
+        terms += [write_value(value["dither.offset"], unit, 9)] if value["dither.offset"] else []
+        terms += [size] if not controller.dither.analogue and value["dither.amplitude"] else []
     if terms:
-        where = maker_block.added(inner) if maker_block.added else "a sum behind the block, before the limits"
+        where = maker_block.sum_input(inner) or "a sum behind the block, before the limits"
         yield f"Sum: {' + '.join(terms)}; in your program once a sample, 0 while the block is not in automatic."
         yield f"Where it goes: {where}."
-
-
-def _dither_terms(controller: Controller, value: Mapping[str, float], sample_time: float) -> Iterator[str]:
-    if controller.dither is None:
-        return
-    unit, turns = controller.command.unit, f"{number(value['dither.frequency'] * sample_time)} k"
-    is_sine = controller.dither.waveform is Waveform.SINE
-    wave = f"sin(2 pi frac({turns}))" if is_sine else f"(1 - 4 abs(frac({turns} + 0.25) - 0.5))"
-    if value["dither.offset"]:
-        yield write_value(value["dither.offset"], unit, 9)
-    if not controller.dither.analogue and value["dither.amplitude"]:
-        yield f"{write_value(value['dither.amplitude'], unit, 9)} x {wave}, k the number of the sample"
 
 
 def _limit_words(d: BlockNumbers, maker_block: MakerBlock) -> str:
     if not (math.isfinite(d.low) or math.isfinite(d.high)):
         return "the design has none; the output stage has its own"
     ends = [write_value(v, d.command_unit) if math.isfinite(v) else "none" for v in (d.low, d.high)]
-    if not d.is_added_to or maker_block.added is not None:
+    if not d.is_added_to or maker_block.sum_input(d) is not None:
         return f"{ends[0]} to {ends[1]} on the wire, in the block"
     own = "; the block has the same, for its integral" if d.integrates else ""
     return f"{ends[0]} to {ends[1]} on the wire, behind that sum, in your program{own}"

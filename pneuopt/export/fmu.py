@@ -57,10 +57,17 @@ def export_fmu(system: System, parameters: ParameterSet, x: Array | None = None,
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
         files = builder.export_fmu({"no_warning": True, "with_serialization": False})
         texts = {str(Path(place)): Path(local).read_text("utf-8") for local, place in files.items()}
+    # CasADi's names are flat ones; date and token change from call to call
+    texts[_DESCRIPTION] = _MADE_AT.sub(
+        "", texts[_DESCRIPTION].replace('variableNamingConvention="structured"', 'variableNamingConvention="flat"')
+    )
+    found = _TOKEN.search(texts[_DESCRIPTION])
+    old = found[1] if found else ""
+    token = hashlib.sha256("".join(text.replace(old, "") for text in texts.values()).encode()).hexdigest()[:32]
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as target:
-        for place, text in _repair(texts).items():  # of one date, so that a model makes the same bytes each time
-            target.writestr(zipfile.ZipInfo(place, (1980, 1, 1, 0, 0, 0)), text)
+        for place, text in texts.items():  # of one date, so that a model makes the same bytes each time
+            target.writestr(zipfile.ZipInfo(place, (1980, 1, 1, 0, 0, 0)), text.replace(old, token))
     return archive.getvalue()
 
 
@@ -86,16 +93,3 @@ def _build(system: System, parameters: ParameterSet, start: Array, name: str) ->
     for n, value in values.items():
         dae.set_start(n, float(value))
     return dae
-
-
-def _repair(texts: Mapping[str, str]) -> dict[str, str]:
-    """Say what CasADi's names are, flat ones, and take date and token, which change from call to call, out of it."""
-    description = texts[_DESCRIPTION].replace(
-        'variableNamingConvention="structured"', 'variableNamingConvention="flat"'
-    )
-    description = _MADE_AT.sub("", description)
-    found = _TOKEN.search(description)
-    old = found[1] if found else ""
-    plain = {place: text.replace(old, "") for place, text in {**texts, _DESCRIPTION: description}.items()}
-    token = hashlib.sha256("".join(plain.values()).encode()).hexdigest()[:32]
-    return {n: text.replace(old, token) for n, text in {**texts, _DESCRIPTION: description}.items()}

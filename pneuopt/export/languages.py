@@ -21,7 +21,7 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.dynamics.system import FRICTION_DIRECTION
 from pneuopt.export.identifiers import RESERVED_FILES, Identifiers, reserved_as
 from pneuopt.export.program import CENTRE, ControllerProgram, Variable, controller_program
-from pneuopt.export.tolerances import LARGEST_LITERAL, RUN_SAMPLES, RUN_TOLERANCE, SELECT, SMALLEST_LITERAL
+from pneuopt.export.tolerances import LARGEST_LITERAL, RUN_TOLERANCE, SELECT, SMALLEST_LITERAL
 from pneuopt.export.writer import (
     ARITHMETIC,
     COMPARED,
@@ -123,13 +123,13 @@ class ReferenceRun:
     outputs: Array
 
 
-def make_reference_run(program: ControllerProgram) -> ReferenceRun:
+def make_reference_run(program: ControllerProgram, samples: int = 200) -> ReferenceRun:
     """A step of the reference, half of which drives the output to its limits, with a measured signal that swings in.
 
     Rates of the reference and further readings are waves. One sample of the measured signal is no number, and then so
     many in a row that the controller begins anew.
     """
-    k = np.arange(RUN_SAMPLES)
+    k = np.arange(samples)
     value = {n: v.value for n, v in program.originals.items()}
     gain, upper = abs(value.get("pid.Kp", value.get("pid.K", 1.0))), value.get("pid.upper", np.inf)
     has_limit = np.isfinite(upper) and upper > 0 and gain > 0

@@ -112,7 +112,37 @@ def controller_program(controller: Controller, parameters: ParameterSet, centre:
     """
     check_sampled(controller)
     controller.check(parameters)
-    return _assemble(_symbolic_law(controller), controller, parameters, centre)
+    law = _symbolic_law(controller)  # of whose states and parameters stand those that are needed
+    outputs = _outputs(law, controller, centre)
+    states = _needed_states(ca.vertcat(*(v for v, _ in outputs.values())), law.states, law.after)
+    after, first = (ca.densify(ca.vertcat(*(v[n] for n in states))) for v in (law.after, law.start))
+    results = ca.vertcat(*(v for v, _ in outputs.values()), after)
+    everything = ca.vertcat(results, first)
+    given = [n for n, s in law.parameters.items() if ca.depends_on(everything, s)]
+    terms = {n: v for n, v in law.terms.items() if not (v.is_symbolic() or v.is_constant())}
+    x, p = (ca.vertcat(*(own[n] for n in chosen)) for own, chosen in ((law.states, states), (law.parameters, given)))
+    signals = ca.vertcat(*(v for n, v in law.inputs.items() if n != "output"))
+    begin = ca.vertcat(signals, law.inputs["output"])
+    value = {**controller.values(parameters), CENTRE: centre}
+    unit, signal = controller.command.unit, controller.feedback
+    wanted = Variable("setpoint", signal.unit, f"the {signal.name} wanted")
+    measured = Variable("measured", law.measured.unit, f"the {law.measured.name}, as the controller's input shows it")
+    names = _claim_names(controller, outputs, given, states, terms)
+    inputs = (wanted, measured, *_more_inputs(controller, names.readings))
+    declared = {n: (q.unit, q.meaning or n) for n, q in controller.parameters.items()}
+    declared[CENTRE] = (unit, "output while the command is zero, as a valve's centre")
+    units = {q.name: q.unit for q in controller.states} | {SAMPLE: "1"}
+    return ControllerProgram(
+        controller.pid.sample_time or 0.0,
+        tuple(Variable(names.parameters[n], *declared[n], value[n], n) for n in given),
+        inputs,
+        tuple(Variable(names.states[n], units[n], STATE_MEANINGS.get(n, n), 0.0, n) for n in states),
+        (*(Variable(n, unit, what) for n, (_, what) in outputs.items() if n != FAULT), FAULT_FLAG),
+        (*inputs, Variable("start_output", unit, "what the actuator has got so far, from which it goes on")),
+        ca.Function("start", [begin, p], [first]),
+        ca.Function("step", [signals, x, p], [ca.densify(results), ca.densify(ca.vertcat(*terms.values()))]),
+        tuple(names.terms.values()),
+    )
 
 
 def check_sampled(controller: Controller) -> None:
@@ -192,40 +222,6 @@ def _start(computed: Controller, u: Signals, measured: str, readings: Iterable[s
     begun: Signals = {"sensor.reading": seen, "sensor.count": u["measured"]}
     begun |= computed.start(inner, seen, shown, command, frozen)
     return {**begun, f"pid.{BAD_SAMPLES}": ca.if_else(good, 0, own["fault_samples"]), SAMPLE: ca.SX(0)}
-
-
-def _assemble(law: _SymbolicLaw, controller: Controller, parameters: ParameterSet, centre: float) -> ControllerProgram:
-    """The program of a law, with the states and parameters that it needs and no others."""
-    outputs = _outputs(law, controller, centre)
-    states = _needed_states(ca.vertcat(*(v for v, _ in outputs.values())), law.states, law.after)
-    after, first = (ca.densify(ca.vertcat(*(v[n] for n in states))) for v in (law.after, law.start))
-    results = ca.vertcat(*(v for v, _ in outputs.values()), after)
-    everything = ca.vertcat(results, first)
-    given = [n for n, s in law.parameters.items() if ca.depends_on(everything, s)]
-    terms = {n: v for n, v in law.terms.items() if not (v.is_symbolic() or v.is_constant())}
-    x, p = (ca.vertcat(*(own[n] for n in chosen)) for own, chosen in ((law.states, states), (law.parameters, given)))
-    signals = ca.vertcat(*(v for n, v in law.inputs.items() if n != "output"))
-    begin = ca.vertcat(signals, law.inputs["output"])
-    value = {**controller.values(parameters), CENTRE: centre}
-    unit, signal = controller.command.unit, controller.feedback
-    wanted = Variable("setpoint", signal.unit, f"the {signal.name} wanted")
-    measured = Variable("measured", law.measured.unit, f"the {law.measured.name}, as the controller's input shows it")
-    names = _claim_names(controller, outputs, given, states, terms)
-    inputs = (wanted, measured, *_more_inputs(controller, names.readings))
-    declared = {n: (q.unit, q.meaning or n) for n, q in controller.parameters.items()}
-    declared[CENTRE] = (unit, "output while the command is zero, as a valve's centre")
-    units = {q.name: q.unit for q in controller.states} | {SAMPLE: "1"}
-    return ControllerProgram(
-        controller.pid.sample_time or 0.0,
-        tuple(Variable(names.parameters[n], *declared[n], value[n], n) for n in given),
-        inputs,
-        tuple(Variable(names.states[n], units[n], STATE_MEANINGS.get(n, n), 0.0, n) for n in states),
-        (*(Variable(n, unit, what) for n, (_, what) in outputs.items() if n != FAULT), FAULT_FLAG),
-        (*inputs, Variable("start_output", unit, "what the actuator has got so far, from which it goes on")),
-        ca.Function("start", [begin, p], [first]),
-        ca.Function("step", [signals, x, p], [ca.densify(results), ca.densify(ca.vertcat(*terms.values()))]),
-        tuple(names.terms.values()),
-    )
 
 
 class _ClaimedNames(NamedTuple):

@@ -23,7 +23,7 @@ from pneuopt.control.tolerances import LARGEST_SIGNAL
 from pneuopt.dynamics.compiled.c_writer import DIVISIONS, Instruction, read_instructions
 from pneuopt.export.identifiers import Identifiers
 from pneuopt.export.program import C_NAMES, ControllerProgram
-from pneuopt.export.tolerances import MAX_COMMENT, MAX_IDENTIFIER, MAX_INLINE, SELECT
+from pneuopt.export.tolerances import MAX_IDENTIFIER, SELECT
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import provenance
@@ -144,8 +144,16 @@ def write_expressions(function: ca.Function, names: Names, syntax: Syntax) -> Wr
     >>> found.coefficients, found.results
     ([Assignment(name='k1', text='2.0 / T')], {'y': 'k1 * (x - 1.0)'})
     """
-    writer = _Writer(names, syntax, _simplify(list(read_instructions(function))))
-    return writer.write()
+    instructions = list(read_instructions(function))
+    made = {i.target[0]: i for i in instructions if i.operation != ca.OP_OUTPUT}
+    needed: set[int] = set()
+    kept = []
+    for given in reversed(instructions):
+        i = _select(given, made) if given.operation == ca.OP_ADD else given
+        if i.operation == ca.OP_OUTPUT or i.target[0] in needed:
+            kept.append(i)
+            needed |= set(_operands(i))
+    return _Writer(names, syntax, kept[::-1]).write()
 
 
 @dataclass(frozen=True)
@@ -160,6 +168,8 @@ class _Value:
 class _Writer:
     """The state of one walk."""
 
+    longest = 70  # [character] of an expression within another: shorter, each operation has a line
+
     def __init__(self, names: Names, syntax: Syntax, instructions: list[Instruction]) -> None:
         self.names, self.syntax, self.instructions = names, syntax, instructions
         self.written = Written()
@@ -170,7 +180,11 @@ class _Writer:
         results = [i for i in instructions if i.operation == ca.OP_OUTPUT and i.target[0] == 0]
         self.labels = {i.sources[0]: names.results[i.target[1]] for i in reversed(results)}
         self.labels |= {i.sources[0]: names.labels[i.target[1]] for i in reversed(labelled)}
-        self.exact = _before_jumps(instructions)
+        self.exact: set[int] = set()  # from which an operation that jumps is computed: there a rounding could show
+        for i in reversed(instructions):
+            jumps = i.operation in STEPS or i.target[0] in self.exact
+            if jumps and i.operation not in (ca.OP_OUTPUT, ca.OP_INPUT, ca.OP_CONST):
+                self.exact |= set(i.sources)
         given = (n for entries in (*names.inputs, names.results, names.labels) for n in entries)
         self.identifiers = Identifiers([*given, *names.constants.values(), *names.taken])
 
@@ -178,9 +192,13 @@ class _Writer:
         for i in self.instructions:
             if i.operation == ca.OP_OUTPUT:
                 if i.target[0] == 0:
-                    self.written.results[self.names.results[i.target[1]]] = self._number(i.sources[0]).text
+                    self.written.results[self.names.results[i.target[1]]] = self._read(i.sources[0]).text
             else:
-                self.values[i.target[0]] = self._shorten(i.target[0], self._evaluate(i))
+                place, value = i.target[0], self._evaluate(i)
+                again, is_long = self.uses[place] > 1, len(value.text) > self.longest
+                wanted = self.labels.get(place) in self.names.labels or again or is_long
+                is_named = wanted and not (value.is_atom or value.is_condition)
+                self.values[place] = self._name(place, value) if is_named else value
         return self.written
 
     def _evaluate(self, i: Instruction) -> _Value:
@@ -191,22 +209,17 @@ class _Writer:
             known = self.names.constants.get(i.constant)
             literal = self.syntax.literal(i.constant)
             return _Value(known or literal, Binding.SUM if literal.startswith("-") else Binding.ATOM, is_atom=True)
-        if i.operation in DIVISIONS and i.target[0] not in self.exact:
-            factor = self._factor(i)
-            if factor is not None:
-                return factor
-        return self._apply(i.operation, i.sources)
-
-    def _factor(self, i: Instruction) -> _Value | None:
-        """A division of what varies by what does not, as a multiplication; None for another one."""
-        divisor = self._number(i.sources[-1])
-        if divisor.varies or i.operation == ca.OP_INV or not self._number(i.sources[0]).varies:
-            return None
-        if i.sources[-1] not in self.reciprocals:
+        if i.operation not in DIVISIONS or i.operation == ca.OP_INV or i.target[0] in self.exact:
+            return self._apply(i.operation, i.sources)
+        varying, divisor = i.sources
+        if self._read(divisor).varies or not self._read(varying).varies:
+            return self._apply(i.operation, i.sources)
+        # a division of what varies by what does not, as a multiplication
+        if divisor not in self.reciprocals:
             place = -2 - len(self.reciprocals)  # a place that no instruction has
-            self.values[place] = self._apply(ca.OP_INV, [i.sources[-1]])
-            self.reciprocals[i.sources[-1]] = place
-        return self._apply(ca.OP_MUL, [i.sources[0], self.reciprocals[i.sources[-1]]])
+            self.values[place] = self._apply(ca.OP_INV, [divisor])
+            self.reciprocals[divisor] = place
+        return self._apply(ca.OP_MUL, [varying, self.reciprocals[divisor]])
 
     def _apply(self, operation: int, sources: Sequence[int]) -> _Value:
         wording = self.syntax.operations.get(operation)
@@ -215,30 +228,15 @@ class _Writer:
         self.written.operations.add(operation)
         conditional = operation in (SELECT, ca.OP_IF_ELSE_ZERO)
         asks = [operation in LOGIC or (conditional and k == 0) for k in range(len(sources))]
-        found = [self._condition(k) if asked else self._number(k) for k, asked in zip(sources, asks, strict=True)]
+        found = [self._read(k, as_condition=asked) for k, asked in zip(sources, asks, strict=True)]
         varies = any(v.varies for v in found)
-        if varies:
-            found = [v if v.varies else self._keep(k, v) for k, v in zip(sources, found, strict=True)]
+        for k, (source, v) in enumerate(zip(sources, found, strict=True)) if varies else ():
+            if not (v.varies or v.is_atom or v.is_condition):  # computed when parameters are set, for a sample's use
+                found[k] = self.values[source] = self._name(source, v)
         if wording.template.count("{0}") > 1 and not found[0].is_atom:
             found[0] = self._name(sources[0], found[0])
         texts = (v.text if v.binding >= need else f"({v.text})" for v, need in zip(found, wording.needs, strict=False))
         return _Value(wording.template.format(*texts), wording.binding, operation in COMPARISONS | LOGIC, varies)
-
-    def _shorten(self, place: int, value: _Value) -> _Value:
-        """The value, under a name of its own where it has a label, is used again, or is long."""
-        if value.is_atom:
-            return value
-        again = self.uses[place] > 1
-        wanted = self.labels.get(place) in self.names.labels or again or len(value.text) > MAX_INLINE
-        return self._name(place, value) if wanted and not value.is_condition else value
-
-    def _keep(self, place: int, value: _Value) -> _Value:
-        """What is computed when parameters are set, for a sample's use."""
-        if value.is_atom or value.is_condition:
-            return value
-        named = self._name(place, value)
-        self.values[place] = named
-        return named
 
     def _name(self, place: int, value: _Value) -> _Value:
         written = self.written
@@ -250,30 +248,14 @@ class _Writer:
         text = own if value.varies else self.names.coefficient.format(own)
         return replace(value, text=text, binding=Binding.ATOM, is_atom=True)
 
-    def _number(self, place: int) -> _Value:
+    def _read(self, place: int, *, as_condition: bool = False) -> _Value:
+        """A value as a number, or as a condition."""
         value = self.values[place]
-        return self._wrap(self.syntax.truth, value, False) if value.is_condition else value
-
-    def _condition(self, place: int) -> _Value:
-        value = self.values[place]
-        return value if value.is_condition else self._wrap(self.syntax.condition, value, True)
-
-    def _wrap(self, wording: OperationSyntax, value: _Value, is_condition: bool) -> _Value:
+        if value.is_condition is as_condition:
+            return value
+        wording = self.syntax.condition if as_condition else self.syntax.truth
         text = value.text if value.binding >= wording.needs[0] else f"({value.text})"
-        return _Value(wording.template.format(text), wording.binding, is_condition, value.varies)
-
-
-def _simplify(instructions: list[Instruction]) -> list[Instruction]:
-    """The four parts of a choice as one operation, and nothing that no result needs."""
-    made = {i.target[0]: i for i in instructions if i.operation != ca.OP_OUTPUT}
-    found = [_select(i, made) if i.operation == ca.OP_ADD else i for i in instructions]
-    needed: set[int] = set()
-    kept = []
-    for i in reversed(found):
-        if i.operation == ca.OP_OUTPUT or i.target[0] in needed:
-            kept.append(i)
-            needed |= set(_operands(i))
-    return kept[::-1]
+        return _Value(wording.template.format(text), wording.binding, as_condition, value.varies)
 
 
 def _operands(i: Instruction) -> Sequence[int]:
@@ -291,17 +273,6 @@ def _select(i: Instruction, made: Mapping[int, Instruction]) -> Instruction:
         if negation.operation == ca.OP_NOT and negation.sources[0] == one.sources[0]:
             return i._replace(operation=SELECT, sources=(one.sources[0], one.sources[1], other.sources[1]))
     return i
-
-
-def _before_jumps(instructions: list[Instruction]) -> set[int]:
-    """Values from which an operation that jumps is computed: there a rounding could show."""
-    found: set[int] = set()
-    for i in reversed(instructions):
-        if i.operation not in (ca.OP_OUTPUT, ca.OP_INPUT, ca.OP_CONST) and (
-            i.operation in STEPS or i.target[0] in found
-        ):
-            found |= set(i.sources)
-    return found
 
 
 @dataclass(frozen=True)
@@ -387,15 +358,17 @@ class Header:
         return (self.name, *(f"{self.name}_{part}" for part in parts))
 
 
-def comment_text(text: str) -> str:
+def comment_text(text: str, longest: int = 200) -> str:
     r"""A text that cannot end a comment: one line of printable ASCII, without the marks of comments.
+
+    `longest` [characters] is what counts of it: more of a text from a file would fill the header with words of another.
 
     Examples
     --------
     >>> comment_text("a */ system(1); *) b \\\n c")
     'a * / system(1); * ) b c'
     """
-    plain = "".join(c if c.isprintable() and c.isascii() else " " for c in text[:MAX_COMMENT])
+    plain = "".join(c if c.isprintable() and c.isascii() else " " for c in text[:longest])
     while _COMMENT_MARKS.search(plain):
         plain = _COMMENT_MARKS.sub(lambda mark: " ".join(mark[0]).replace("\\", "").replace("$", ""), plain)
     return " ".join(plain.split())
@@ -426,12 +399,15 @@ def make_header(
     ]
     of = f" of the inner loop, which controls the {controller.pid_signal.name}" if controller.outer else ""
     lines += ["Numbers are in SI units, as marked.", "", f"Gains{of}, in every form that controllers take:"]
-    lines += [
-        *_gain_lines(controller, parameters),
-        *_part_lines(controller, parameters),
-        "",
-        *_notes(controller, parameters, centre),
-    ]
+    lines += _gain_lines(controller, parameters)
+    complete, parts = controller.complete(parameters), dict[str, list[str]]()
+    for n in controller.parameters:
+        section, _, own = n.partition(".")
+        parts.setdefault(section, []).append(f"{own} = {write_value(complete.value(n), complete[n].unit)}")
+    parts.pop("pid", None)
+    lines += ["", "Parts beside it, which belong to the design as much as its gains:"] if parts else []
+    lines += [f"- {section}: {', '.join(values)}" for section, values in parts.items()]
+    lines += ["", *_notes(controller, parameters, centre)]
     return Header(name, tuple(map(comment_text, lines)))
 
 
@@ -456,17 +432,6 @@ def _gain_lines(controller: Controller, parameters: ParameterSet) -> list[str]:
         line("standard", lambda: to_standard(gains), "Kp (1 + 1/(Ti s) + Td s/(1 + s Td/N)), N a ratio"),
         line("series", lambda: to_series(gains), "K (1 + 1/(Ti s)) (1 + Td s/(Tf s + 1))"),
     ]
-
-
-def _part_lines(controller: Controller, parameters: ParameterSet) -> list[str]:
-    """The parts beside the PID, each with its parameters, in the controller's order."""
-    complete, parts = controller.complete(parameters), dict[str, list[str]]()
-    for n in controller.parameters:
-        section, _, name = n.partition(".")
-        parts.setdefault(section, []).append(f"{name} = {write_value(complete.value(n), complete[n].unit)}")
-    parts.pop("pid", None)
-    lines = [f"- {section}: {', '.join(values)}" for section, values in parts.items()]
-    return ["", "Parts beside it, which belong to the design as much as its gains:", *lines] if lines else []
 
 
 def _notes(controller: Controller, parameters: ParameterSet, centre: float) -> list[str]:

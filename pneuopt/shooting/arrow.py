@@ -109,11 +109,7 @@ class ArrowEquations:
         """Solve D x = right, shape (m n, any); raises `LinAlgError` where D is not positive definite."""
         if not right.size:
             return right
-        factor = cholesky_banded(self._band_storage(damping), overwrite_ab=True, check_finite=False)
-        return np.asarray(cho_solve_banded((factor, False), right, check_finite=False))
-
-    def _band_storage(self, damping: Array | float) -> Array:
-        """Upper banded storage of D for LAPACK's pbtrf."""
+        # D in upper banded storage, for LAPACK's pbtrf
         m, n, _ = self.diagonal.shape
         upper = 2 * n - 1
         banded = np.zeros((upper + 1, m * n))
@@ -124,7 +120,8 @@ class ArrowEquations:
                 banded[upper + a - n - b, n + b :: n] = self.coupling[:-1, a, b]
         banded[upper] *= 1 + np.repeat(np.broadcast_to(damping, m), n)
         banded[upper] += STATE_REGULARISATION
-        return banded
+        factor = cholesky_banded(banded, overwrite_ab=True, check_finite=False)
+        return np.asarray(cho_solve_banded((factor, False), right, check_finite=False))
 
 
 def positive_definite_inverse(matrix: Array) -> Array:

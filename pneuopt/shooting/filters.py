@@ -190,38 +190,25 @@ class PredictionErrors:
                 P = np.tile(START_DEVIATION**2 * np.eye(n), (count, 1, 1))
             values = q[:, self.segments.parameter_positions[at]]
             found = update_states(self.segments, np.full(count, at), x, P, values, self.substeps)
-            x, X, P = self._add(sums, at, found, (x, X), chain, gathered)
+            gram, errors, prior = found.gram[:, :-1, :-1], found.gram[:, :-1, -1:], found.prior
+            unknowns = self.segments.unknowns[at]
+            own = np.flatnonzero(unknowns >= 0)  # the segment's own parameters, which move with those searched
+            direct = np.zeros((count, len(unknowns), k))
+            direct[:, own, unknowns[own]] = chain[:, 0, unknowns[own]]
+            moved = solve_each(found.information, prior @ X - gram[:, :n, n:] @ direct)
+            moves, away = np.concatenate([moved, direct], axis=1), moved - X
+            turned, pull = moves.transpose(0, 2, 1), prior @ away
+            limit = ROBUST_SQUARES * self._counts[at]
+            weights = 1 / (1 + found.squares / limit)
+            uphill = turned @ errors + pull.transpose(0, 2, 1) @ (found.state - x)[..., None]
+            squares = turned @ (gram @ moves) + away.transpose(0, 2, 1) @ pull
+            sums.costs[:] += limit * np.log1p(found.squares / limit)
+            sums.gradients[:] += weights[:, None] * uphill[..., 0]
+            sums.curvatures[:] += weights[:, None, None] * squares
+            x, X, P = found.end, found.moved @ moves, found.spread(gathered)
             lost = ~(np.isfinite(x).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & np.isfinite(X).all(axis=(1, 2)))
             sums.costs[lost], x[lost], X[lost], P[lost] = np.inf, self._rough[at], 0.0, START_DEVIATION**2 * np.eye(n)
         return sums
-
-    def _add(
-        self,
-        sums: Errors,
-        at: int,
-        found: StateUpdate,
-        before: tuple[Array, Array],
-        chain: Array,
-        gathered: float,
-    ) -> tuple[Array, Array, Array]:
-        """Add a segment's errors; return the states, their slopes and covariance at its end from those before it."""
-        (x, X), n, prior = before, before[0].shape[1], found.prior
-        gram, errors = found.gram[:, :-1, :-1], found.gram[:, :-1, -1:]
-        unknowns = self.segments.unknowns[at]
-        own = np.flatnonzero(unknowns >= 0)  # the segment's own parameters, which move with those searched
-        direct = np.zeros((len(chain), len(unknowns), chain.shape[2]))
-        direct[:, own, unknowns[own]] = chain[:, 0, unknowns[own]]
-        moved = solve_each(found.information, prior @ X - gram[:, :n, n:] @ direct)
-        moves, away = np.concatenate([moved, direct], axis=1), moved - X
-        turned, pull = moves.transpose(0, 2, 1), prior @ away
-        limit = ROBUST_SQUARES * self._counts[at]
-        weights = 1 / (1 + found.squares / limit)
-        uphill = turned @ errors + pull.transpose(0, 2, 1) @ (found.state - x)[..., None]
-        squares = turned @ (gram @ moves) + away.transpose(0, 2, 1) @ pull
-        sums.costs[:] += limit * np.log1p(found.squares / limit)
-        sums.gradients[:] += weights[:, None] * uphill[..., 0]
-        sums.curvatures[:] += weights[:, None, None] * squares
-        return found.end, found.moved @ moves, found.spread(gathered)
 
     def descend(self, z: Array, gathered: float, steps: int) -> tuple[Array, Array]:
         """Levenberg-Marquardt from sets of searched parameters (s, k) side by side: their ends, and costs (s,)."""

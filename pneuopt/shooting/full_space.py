@@ -411,23 +411,16 @@ def node_guesses(transcription: Transcription, q: Array, guesses: Sequence[Array
         guess = guesses[i] if i < len(guesses) else phase.guess
         x = x if phase.follows else np.zeros(len(nominal)) if phase.start is None else phase.start
         if guess is None:
-            guess, x = _simulate_guess(transcription, phase, q, x, 1e3 * nominal)
+            sample, length = _sample_function(transcription), _duration(transcription, phase, q)
+            p, guess = q[transcription.parameter_positions(phase)], np.empty((phase.n, len(x)))
+            for k in range(phase.n):
+                guess[k] = x
+                after = np.array(sample(phase.t[k] * length, phase.h[k] * length, x, phase.inputs[k], p)[0]).ravel()
+                x = after if bool(np.all(np.abs(after) < 1e3 * nominal)) else x  # one that runs away stays where it is
         else:
             x = guess[-1]
         found.append((guess[phase.nodes] / nominal).ravel())
     return found
-
-
-def _simulate_guess(transcription: Transcription, phase: Phase, q: Array, x: Array, most: Array) -> tuple[Array, Array]:
-    """States at the samples, and after the last; a state that runs away is held where it is."""
-    sample = _sample_function(transcription)
-    length = _duration(transcription, phase, q)
-    p, states = q[transcription.parameter_positions(phase)], np.empty((phase.n, len(x)))
-    for k in range(phase.n):
-        states[k] = x
-        x_next = np.array(sample(phase.t[k] * length, phase.h[k] * length, x, phase.inputs[k], p)[0]).ravel()
-        x = x_next if bool(np.all(np.abs(x_next) < most)) else x
-    return states, x
 
 
 def _solver_status(

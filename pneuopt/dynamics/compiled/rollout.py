@@ -139,7 +139,21 @@ class Rollout:
         for all; h = 0 pads a short segment. The state is returned at each so many samples (`states`), or at none (0).
         """
         _check.get()()
-        return self._run(*self._check_arrays(x0, u, p, t, h, substeps), substeps, states)
+        x, us, ps, ts, hs = self._check_arrays(x0, u, p, t, h, substeps)
+        m, n, ny, nx, ns = len(x), ts.shape[-1], self.n_outputs, self.n_states, self.n_columns
+        if self._library is None:
+            us, ts, hs = np.broadcast_to(us, (m, n, self.n_inputs)), *(np.broadcast_to(a, (m, n)) for a in (ts, hs))
+            run = run_in_vm(self._functions, (x, us, ps, ts, hs), self._starts, substeps, states, self._threads)
+            if not self.n_columns:
+                return RolloutResult(run.y, run.x_end, run.x)
+            return RolloutResult(run.y, run.x_end, run.x, _swap_last_axes(run.dy), _swap_last_axes(run.dx_end))
+        y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
+        dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
+        kept = np.empty((m, -(-n // states), nx)) if states else None
+        self._call_library(
+            (x, us, ps, ts, hs), substeps, states, (None, None, y, dy, kept, x_end, dx_end, None, None, None)
+        )
+        return RolloutResult(y, x_end, kept, _swap_last_axes(dy), _swap_last_axes(dx_end))
 
     def gram(
         self,
@@ -190,21 +204,6 @@ class Rollout:
         most = int(np.iinfo(np.intc).max)  # a C int counts them
         require(substeps <= most, f"substeps may be {most} at most, got {substeps}", ModelError)
         return x0, u, p, t, h
-
-    def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
-        m, n, ny, nx, ns = len(x0), t.shape[-1], self.n_outputs, self.n_states, self.n_columns
-        if self._library is None:
-            u, t, h = np.broadcast_to(u, (m, n, self.n_inputs)), np.broadcast_to(t, (m, n)), np.broadcast_to(h, (m, n))
-            given = (x0, u, p, t, h)
-            run = run_in_vm(self._functions, given, self._starts, substeps, states, self._threads)
-            if not self.n_columns:
-                return RolloutResult(run.y, run.x_end, run.x)
-            return RolloutResult(run.y, run.x_end, run.x, _swap_last_axes(run.dy), _swap_last_axes(run.dx_end))
-        y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
-        dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
-        x = np.empty((m, -(-n // states), nx)) if states else None
-        self._call_library((x0, u, p, t, h), substeps, states, (None, None, y, dy, x, x_end, dx_end, None, None, None))
-        return RolloutResult(y, x_end, x, _swap_last_axes(dy), _swap_last_axes(dx_end))
 
     def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         parts = []
@@ -493,7 +492,12 @@ def check_machine_code(
         plain = Rollout(pieces, threads=1, lanes=number)
         if number != 0 and not plain.uses_machine_code:
             break
-        nanoseconds[way] = 1e9 * _fastest(lambda plain=plain: run(plain)) / (segments * samples * substeps)  # type: ignore[misc]
+        seconds = []
+        for _ in range(2):  # the faster one counts
+            began = time.process_time()
+            run(plain)
+            seconds.append(time.process_time() - began)
+        nanoseconds[way] = 1e9 * min(seconds) / (segments * samples * substeps)
         slope = run(Rollout(pieces, wrt, threads=1, lanes=number)).dx_end
         assert slope is not None
         found[way], lanes = slope, max(lanes, plain.lanes)
@@ -511,13 +515,3 @@ def _distance(a: Array, b: Array) -> float:
     size = np.abs(b).max(axis=(0, 1))
     size[size == 0] = 1.0
     return float(np.max(np.abs(a - b) / size))
-
-
-def _fastest(run: Callable[[], object]) -> float:
-    """CPU seconds of the faster of two runs."""
-    found = []
-    for _ in range(2):
-        began = time.process_time()
-        run()
-        found.append(time.process_time() - began)
-    return min(found)

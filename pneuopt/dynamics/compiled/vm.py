@@ -197,8 +197,13 @@ def run_in_vm(
     state's.
     """
     (m, n), nx = given[3].shape, given[0].shape[1]
-    if nx == 0 and n > 1:
-        return _run_samples(functions, given, states, threads)
+    if nx == 0 and n > 1:  # a model without a state: each of its samples is a segment
+        x0, u, p, t, h = given
+        rows = p if p.ndim == 1 else np.repeat(p, n, axis=0)
+        flat = np.empty((m * n, 0)), u.reshape(m * n, 1, -1), rows, t.reshape(-1, 1), h.reshape(-1, 1)
+        run = run_in_vm(functions, flat, 0, 1, 0, threads)
+        x = np.empty((m, -(-n // states), 0)) if states else None
+        return VmRun(run.y.reshape(m, n, -1), run.dy.reshape(m, n, *run.dy.shape[2:]), x, x0, run.dx_end[:m])
     parts = _count_parts(functions["step"].n_instructions(), m, threads)
     if m < ARRAY_SEGMENTS * parts or not all(map(_find_program, functions.values())):
         return _run(functions, given, start_columns, substeps, states, _Machine(m, threads))
@@ -208,16 +213,6 @@ def run_in_vm(
     y, dy, x_end, dx_end = (np.concatenate([getattr(run, n) for run in runs]) for n in ("y", "dy", "x_end", "dx_end"))
     kept = [run.x for run in runs if run.x is not None]
     return VmRun(y, dy, np.concatenate(kept) if kept else None, x_end, dx_end)
-
-
-def _run_samples(functions: Mapping[str, ca.Function], given: Sequence[Array], states: int, threads: int) -> VmRun:
-    """A run of a model without a state: each of its samples is a segment."""
-    x0, u, p, t, h = given
-    (m, n), rows = t.shape, p if p.ndim == 1 else np.repeat(p, t.shape[1], axis=0)
-    flat = np.empty((m * n, 0)), u.reshape(m * n, 1, -1), rows, t.reshape(-1, 1), h.reshape(-1, 1)
-    run = run_in_vm(functions, flat, 0, 1, 0, threads)
-    kept = np.empty((m, -(-n // states), 0)) if states else None
-    return VmRun(run.y.reshape(m, n, -1), run.dy.reshape(m, n, *run.dy.shape[2:]), kept, x0, run.dx_end[:m])
 
 
 def _run(
