@@ -146,7 +146,7 @@ class TwoPhase:
         optima = _solve_stable(task, replace(task, space=space, spec=spec), method, progress)
         best, values = optima.best, optima.best.parameters
         stats = {"iterations": best.stats.get("iterations", 0.0)}
-        point, cost = np.array([values.value(n) for n in task.space.names]), best.stats.get("cost", np.nan)
+        point, cost = np.array([values.value(n) for n in task.space.names]), best.cost
         active = tuple(best.multipliers)
         return SearchResult(point, best.status, active, stats, optimum=cost, agreement=optima.agreement)
 
@@ -247,17 +247,17 @@ def solve_two_phase(
         point = space.from_unit(rng.random(len(space.names))) if k else space.start
         gains = dict(zip(space.names, point.tolist(), strict=True))
         found.append(solve_from(problem, parameters.with_values(gains)))
-        value, ended = _objective_value(found[-1]), found[-1].status.code.value
-        report_progress(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
+        ended = found[-1].status.code.value
+        report_progress(f"start {k + 1} of {method.starts}: objective {found[-1].cost:.4g}, {ended}")
         good += [s for s in found[-1:] if s.status.converged and is_allowed(s)]
     failed = [math.inf] * (len(found) - len(good))
-    agreement = compare_starts([*map(_objective_value, good), *failed], LEAST_IMPROVEMENT)
+    agreement = compare_starts([*(s.cost for s in good), *failed], LEAST_IMPROVEMENT)
     if not good:
-        closest = min(found, key=lambda s: s.stats.get("largest_violation", math.inf))
+        closest = min(found, key=lambda s: s.largest_violation)
         unstable = Status(Code.INFEASIBLE, ("every optimum found is an unstable loop, or nearly so", WIDEN_BOUNDS))
         closest = replace(closest, status=unstable) if closest.status.converged else closest
         return Optima(closest, agreement)
-    return Optima(min(good, key=_objective_value), agreement)
+    return Optima(min(good, key=lambda s: s.cost), agreement)
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,11 +287,6 @@ def two_phase_path(
     transcription = transcribe_two_phase(loop, references, space, spec, method.nodes)
     problem = prepare_full_space(transcription, method.solver, warm_start=True)
     return TwoPhasePath(problem, space.names, band_number(spec.band))
-
-
-def _objective_value(solution: Solution) -> float:
-    """The objective that a solution reached."""
-    return float(solution.stats["cost"])
 
 
 # Requirements that the problem has an equation for, beside the settling time, which is its free duration.
