@@ -34,8 +34,8 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import BISECTION_STEPS, JUST_BELOW, LEAST_GROWTH, MAX_CORNER_NAMES, POINTS_INSIDE
+from pneuopt.tuning.space import Space, shapes_linear_loop
+from pneuopt.tuning.tolerances import JUST_BELOW, LEAST_GROWTH, MAX_CORNER_NAMES, POINTS_INSIDE
 
 SIGNED_GAINS = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")  # which turn with the actuator; times and ratios do not
 
@@ -51,8 +51,13 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
         _check_horizon(case.reference, spec)
         _check_following(case, loop, spec)
     _check_noise(loop, space, spec)
+    # a dither moves the position over the edges of its counts, so that their mean tells it
+    dithered = max(abs(v) for v in _parameter_range(space, DITHER_AMPLITUDE)) > 0
+    counts = spec.concerns(SettlingTime) and not dithered and not sees_speed(loop)
     for case in cases:
-        _check_counts(loop, case, space, spec)
+        own = case.case_parameters(space.parameters)
+        message = describe_counts(loop, own, case.reference, spec.band) if counts else None
+        require(message is None, f"{_case_prefix(case)}{message}")
         check_travel(loop, case, space.parameters)
         check_motion(loop, case, space.parameters)
         _check_hold(loop, case, space, spec)
@@ -105,20 +110,11 @@ def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
     require(least <= spec.limit(NoiseGain), f"{message}; lower pid.Kp or pid.Kd, raise pid.Tf, or raise max")
 
 
-def _check_counts(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
-    """Check that a controller that sees a position in counts can tell whether it is in the settling band.
+def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification, bisections: int = 10) -> None:
+    """Check that a command within the limits holds the reference to within the settling band.
 
-    Under dither it can, in the mean: the ripple moves the position over the edges of counts. Of a speed it can as well.
+    Bisections find the largest part that can be held, for the message: ten for its three digits.
     """
-    dithered = max(abs(v) for v in _parameter_range(space, DITHER_AMPLITUDE)) > 0
-    if dithered or sees_speed(loop) or not spec.concerns(SettlingTime):
-        return
-    message = describe_counts(loop, case.case_parameters(space.parameters), case.reference, spec.band)
-    require(message is None, f"{_case_prefix(case)}{message}")
-
-
-def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
-    """Check that a command within the limits holds the reference to within the settling band."""
     reference = case.reference
     room = band_share(spec.band, reference) * reference.size  # 0 for a disturbance alone
     target = reference.final - room
@@ -136,7 +132,7 @@ def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specific
     obstacle = find_obstacle(1.0)
     if obstacle:
         low, high = 0.0, 1.0
-        for _ in range(BISECTION_STEPS if not find_obstacle(0.0) else 0):
+        for _ in range(bisections if not find_obstacle(0.0) else 0):
             middle = 0.5 * (low + high)
             low, high = (low, middle) if find_obstacle(middle) else (middle, high)
         most_held = f"; the most that can be held is {low * target:.3g} {loop.feedback.unit}" if low else ""
@@ -184,7 +180,7 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Spe
     may_miss = spec.limit(SteadyStateError) < inf and not spec.concerns(SettlingTime)
     if may_miss and not is_affine(loop.plant):
         return
-    names, order = [n for n in space.names if _shapes_linear_loop(loop, n)], list(space.parameters)
+    names, order = [n for n in space.names if shapes_linear_loop(loop, n)], list(space.parameters)
     if len(names) > MAX_CORNER_NAMES:
         return
     box, rng = Space(case.case_parameters(space.parameters), tuple(names)), np.random.default_rng(0)
@@ -211,13 +207,6 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Spe
     message = f"every gain allowed makes the loop unstable: {words}; linearised at {end}, where the reference ends, "
     remedy = ", or ".join(remedies) or "neither turned signs nor gains ten times as large hold it"
     require(False, f"{message}a deviation grows e-fold in {1 / growth:.2g} s or less; {remedy}")
-
-
-def _shapes_linear_loop(loop: ClosedLoop, n: str) -> bool:
-    """Whether the linearised loop depends on a parameter of the controller."""
-    section, _, name = n.partition(".")
-    acting = {"dither", "position_loop", "schedule", *(part.section for part in loop.controller.acting_always)}
-    return section in acting or (section == "pid" and name in loop.pid.form.gains)
 
 
 def _closed_loops(loop: ClosedLoop, p: Array, x: Array, command: float) -> Array:

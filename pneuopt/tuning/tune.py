@@ -150,7 +150,10 @@ def tune(
     specification = specify(minimise, subject_to)
     task = prepare_task(loop, references, parameters, specification, scenarios, accept, max_steps)
     check_rig(rig, task)
-    _warn_of_swing(task)
+    settles = task.spec.concerns(SettlingTime)
+    swing = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band) if settles else None
+    if swing is not None:
+        warnings.warn(swing, PhysicsWarning, stacklevel=2)
     search, result, is_stopped = _search(task, method, ProgressReporter(progress, "tune"))
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     if result.status.code is Code.NOT_CERTIFIED:
@@ -276,15 +279,6 @@ def _interrupt(task: TuningTask, result: TuningResult, reason: str) -> TuningRes
     lead = f"it keeps every limit on the model: {result.status.verdict}"
     sentences = (lead, f"{reason}: {UNTRIED}", *result.status.sentences[1:], "run again for an answer")
     return result.refuse(Status(Code.INTERRUPTED, sentences), task.space.parameters, task.space.names)
-
-
-def _warn_of_swing(task: TuningTask) -> None:
-    """Warn, in the name of the caller's caller, of a dither that moves the signal out of its settling band."""
-    if not task.spec.concerns(SettlingTime):
-        return
-    message = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
-    if message is not None:
-        warnings.warn(message, PhysicsWarning, stacklevel=3)
 
 
 def _search(task: TuningTask, method: Method | None, progress: ProgressCallback) -> tuple[Search, TuningResult, bool]:

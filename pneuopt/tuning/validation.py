@@ -23,9 +23,9 @@ from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet, check_parameters
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.results import Result
+from pneuopt.tuning.relaxation import round_outwards
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import MAX_TOLD, RELAXED_DIGITS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -225,7 +225,12 @@ def _simulate_plants(
     try:
         simulator = Simulator(loop, steps, space, scenarios, spec)
     except (ConvergenceError, InputError):
-        restless = [n for n in scenarios if not _rests(loop, steps, parameters, n, scenarios)]
+        for n, values in scenarios.items():
+            try:
+                for step in steps:
+                    TuningCase(step, n, values).initial(loop, parameters)
+            except (ConvergenceError, InputError):
+                restless.append(n)
         left = {n: values for n, values in scenarios.items() if n not in restless}
         if not restless or not left:
             raise
@@ -233,18 +238,6 @@ def _simulate_plants(
     rows = simulator.table(np.zeros(0), spec)
     found = pd.DataFrame({case.label: row for case, row in zip(simulator.cases, rows, strict=True)})
     return found.loc[[n for n in METRICS if n in (*spec.metric_names, *LANE_DEFECTS)]], restless
-
-
-def _rests(
-    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, plant: str, scenarios: Scenarios
-) -> bool:
-    """Whether the loop rests, or moves steadily, on a plant before each step."""
-    try:
-        for step in steps:
-            TuningCase(step, plant, scenarios[plant]).initial(loop, parameters)
-    except (ConvergenceError, InputError):
-        return False
-    return True
 
 
 def _certify(
@@ -347,60 +340,41 @@ def advise(
 ) -> tuple[tuple[str, ...], tuple[CorrelatedParameters, ...]]:
     """Advice where a design breaks on plants, a sentence each, and what to tune over.
 
-    `axes` are the metrics with one thing that varies alone at its low and its high end, a column each.
+    It says with which limits the same gains hold on all plants but those where no limit helps. `axes` are the metrics
+    with one thing that varies alone at its low and its high end, a column each.
     """
     if not broken:
         return (), ()
+    lost = [n for n, found in broken.items() if DEFECT_WORDS & set(found)]
+    sound = plants.loc[[n for n in plants.index if n not in lost]]
+    own, texts = [str(c) for c in certified if not str(c).endswith(tuple(f"[{n}]" for n in lost))], list[str]()
+    for q in (q for q in spec.limits if any(metric_name(q) in broken.get(str(n), ()) for n in sound.index)):
+        metric, least = q.metric, q.metric.sense is Sense.AT_LEAST
+        worst = max([*sound[metric.name], *certified[own].T[metric.name]], key=metric.requirement_value)
+        value, asked = round_outwards(worst, upwards=not least), metric.factor * (user_limit(q) or 0.0)
+        unit = metric.shown_unit(loop.command.unit, loop.feedback.unit)
+        texts.append(f"{metric.name} {'>=' if least else '<='} {value:g} {unit}".strip() + f" (now {asked:.4g})")
+    sentences = [f"with {' and '.join(texts)} these gains hold on {len(sound)} of {len(plants)}"] if texts else []
+    count = f"{len(lost)} plant{'s' if len(lost) > 1 else ''}"
+    sentences += [f"no relaxed limit helps on {count}, where the loop fails"] if lost else []
     suggested, reason = _culprits(spec, axes)
     names = " and ".join(a.label for a in suggested)
     remedy = f"{reason}: {names}; tune over that too" if names else "tune over such plants: add them to the scenarios"
-    return (*_relaxation(loop, spec, plants, broken, certified), remedy), suggested
-
-
-def _relaxation(
-    loop: ClosedLoop,
-    spec: Specification,
-    plants: "pd.DataFrame",
-    broken: Mapping[str, tuple[str, ...]],
-    certified: "pd.DataFrame",
-) -> list[str]:
-    """With which limits the same gains hold on all plants but those where no limit helps."""
-    lost = [n for n, found in broken.items() if DEFECT_WORDS & set(found)]
-    sound = plants.loc[[n for n in plants.index if n not in lost]]
-    limits = [q for q in spec.limits if any(metric_name(q) in broken.get(str(n), ()) for n in sound.index)]
-    own = [str(c) for c in certified if not any(str(c).endswith(f"[{n}]") for n in lost)]
-    texts = [_relaxed_limit(q, [*sound[metric_name(q)], *certified[own].T[metric_name(q)]], loop) for q in limits]
-    sentences = [f"with {' and '.join(texts)} these gains hold on {len(sound)} of {len(plants)}"] if texts else []
-    count = f"{len(lost)} plant{'s' if len(lost) > 1 else ''}"
-    return [*sentences, *([f"no relaxed limit helps on {count}, where the loop fails"] if lost else [])]
-
-
-def _relaxed_limit(requirement: Requirement, values: Sequence[float], loop: ClosedLoop) -> str:
-    """The limit that the worst value keeps, rounded away from what is asked: "Overshoot <= 4.44 %"."""
-    metric, least = requirement.metric, requirement.metric.sense is Sense.AT_LEAST
-    worst = max(values, key=metric.requirement_value)
-    digit = 10.0 ** (math.floor(math.log10(abs(worst))) + 1 - RELAXED_DIGITS)
-    value = (math.floor if least else math.ceil)(worst / digit) * digit
-    unit = metric.shown_unit(loop.command.unit, loop.feedback.unit)
-    asked = metric.factor * (user_limit(requirement) or 0.0)
-    return f"{metric.name} {'>=' if least else '<='} {value:.{RELAXED_DIGITS}g} {unit}".strip() + f" (now {asked:.4g})"
+    return (*sentences, remedy), suggested
 
 
 def _culprits(
-    spec: Specification, axes: Mapping[CorrelatedParameters, "pd.DataFrame"]
+    spec: Specification, axes: Mapping[CorrelatedParameters, "pd.DataFrame"], most: int = 3
 ) -> tuple[tuple[CorrelatedParameters, ...], str]:
-    """What breaks a limit on its own, the worst first; else what comes nearest to it."""
-    ends = {a: [{str(n): v for n, v in row.items()} for row in found.to_dict().values()] for a, found in axes.items()}
-    worst = {a: max((_worst_excess(row, spec) for row in rows), default=math.inf) for a, rows in ends.items()}
+    """What breaks a limit on its own, the worst first, at most so many; else what comes nearest to it."""
+    worst = dict[CorrelatedParameters, float]()
+    for a, found in axes.items():
+        ends = [{str(n): v for n, v in row.items()} for row in found.to_dict().values()]
+        works = ends and all(math.isfinite(row[n]) for row in ends for n in LANE_DEFECTS)  # it rests and settles
+        shares = [share for row in ends for share in spec.excess(requirement_values(row)).values()] if works else []
+        worst[a] = max(shares, default=-math.inf) if works else math.inf
     order = sorted(worst, key=lambda a: -worst[a])
     alone = [a for a in order if worst[a] > 0]
     if alone:
-        return tuple(alone[:MAX_TOLD]), "what breaks it most, each alone"
-    return tuple(order[:MAX_TOLD]), "nothing breaks it alone, most is done by"
-
-
-def _worst_excess(row: Mapping[str, float], spec: Specification) -> float:
-    """By what share the worst limit is exceeded; infinite where the loop never settles or is unstable."""
-    if not all(math.isfinite(row[n]) for n in LANE_DEFECTS):
-        return math.inf
-    return max(spec.excess(requirement_values(row)).values(), default=-math.inf)
+        return tuple(alone[:most]), "what breaks it most, each alone"
+    return tuple(order[:most]), "nothing breaks it alone, most is done by"
