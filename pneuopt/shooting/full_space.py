@@ -214,7 +214,10 @@ def _run_solver(
     raw = problem.solver(x0=w, p=q, lbx=low, ubx=up, lbg=low_g, ubg=up_g, **(multipliers or {}))
     found = {k: np.array(v).ravel() for k, v in raw.items()}
     ended, seconds = problem.solver.stats(), time.perf_counter() - begun
-    gap, violation = (_largest_violation(problem, found["g"], continuity=each) for each in (True, False))
+    gap, violation = (
+        max((float(np.max(_row_violation(r, found["g"]), initial=0.0)) for r in rows), default=0.0)
+        for rows in ([r for r in problem.graph.constraint_rows if r.continuity is each] for each in (True, False))
+    )
     stats = {"iterations": float(ended.get("iter_count", 0)), "largest_gap": gap}
     status = _solver_status(problem, str(ended["return_status"]), found, q, {**stats, "seconds": seconds})
     solution = _solution(problem, found["x"], q, status)
@@ -456,15 +459,6 @@ def _solver_status(
 def _row_violation(rows: ConstraintRows, g: Array) -> Array:
     values = g[rows.rows]
     return np.maximum(np.maximum(rows.lower - values, values - rows.upper), 0.0)
-
-
-def _largest_violation(problem: FullSpaceProblem, g: Array, continuity: bool) -> float:
-    pieces = [
-        float(np.max(_row_violation(r, g), initial=0.0))
-        for r in problem.graph.constraint_rows
-        if r.continuity is continuity
-    ]
-    return max(pieces, default=0.0)
 
 
 def _describe_worst_row(problem: FullSpaceProblem, g: Array) -> str:

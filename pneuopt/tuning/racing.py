@@ -424,34 +424,29 @@ def compute_merits(values: Mapping[str, Array], spec: Specification, scale: floa
 
 
 def search_result(task: TuningTask, simulator: Simulator, spec: Specification, point: Array) -> SearchResult:
-    """The result of a search by simulation for a tightened `spec`: its best point (n,), and what is active there."""
+    """The result of a search by simulation for a tightened `spec`: its best point (n,), what is active and broken."""
     values = to_records(simulator.values(point[None], spec))[0]
     limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= (1 - ACTIVE_ROOM) * upper_limit(q)]
     low, up = task.space.bounds.T
     near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
     active = (*limits, *(n for n, held in zip(task.space.names, near, strict=True) if held))
-    return SearchResult(point, _search_status(task.spec, values), active, optimum=spec.objective(values))
-
-
-def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
-    """The status of a search: converged where its point keeps the limits; otherwise it says which ones are broken."""
+    asked, status = task.spec, Status(Code.CONVERGED)
     broken = [
         f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"
-        for q in spec.violations(values, LIMIT_TOLERANCE)
+        for q in asked.violations(values, LIMIT_TOLERANCE)
     ]
-    if not broken and spec.with_stability().violations(values):
+    if broken:
+        verdict = f"the closest found has {' and '.join(broken)}"
+        status = Status(Code.INFEASIBLE, (verdict, "relax a limit or widen the bounds"))
+    elif asked.with_stability().violations(values):
         Ms = values["MaxSensitivity"]
         nearly = f"nearly unstable, with a MaxSensitivity of {Ms:.3g}, more than {STABILITY_SENSITIVITY:g}"
         verdict = f"the closest found is {nearly if np.isfinite(Ms) else 'no stable loop'}"
-        return Status(Code.INFEASIBLE, (verdict, WIDEN_BOUNDS))
-    if broken:
-        verdict = f"the closest found has {' and '.join(broken)}"
-        return Status(Code.INFEASIBLE, (verdict, "relax a limit or widen the bounds"))
-    if not np.isfinite(spec.objective(values)):
-        return Status(
-            Code.NOT_CONVERGED, ("nothing found settles", "widen the band or the bounds, or lengthen the horizon")
-        )
-    return Status(Code.CONVERGED)
+        status = Status(Code.INFEASIBLE, (verdict, WIDEN_BOUNDS))
+    elif not np.isfinite(asked.objective(values)):
+        remedy = "widen the band or the bounds, or lengthen the horizon"
+        status = Status(Code.NOT_CONVERGED, ("nothing found settles", remedy))
+    return SearchResult(point, status, active, optimum=spec.objective(values))
 
 
 class _Phase(NamedTuple):
@@ -460,21 +455,6 @@ class _Phase(NamedTuple):
     name: str
     simulator: Simulator
     trials: int
-
-
-def _other_population(method: Racing, names: Sequence[str], best: Array, rng: np.random.Generator) -> Array:
-    """A population of another kind than the one that found `best`: with hardly any dither, where it is free.
-
-    Its gains are those of the first one's best points, its offset is drawn anew; without a free dither all is.
-    """
-    if "dither.amplitude" not in names:
-        return first_population(method.members, rng.random(len(names)), rng)
-    population = best[np.arange(method.members) % min(FEW_BEST, len(best))]
-    population = np.clip(population + NEARBY * rng.standard_normal(population.shape), 0.0, 1.0)
-    population[:, names.index("dither.amplitude")] = NO_DITHER * rng.random(method.members)
-    if "dither.offset" in names:
-        population[:, names.index("dither.offset")] = rng.random(method.members)
-    return np.asarray(population)
 
 
 class _RacingSearch:
@@ -509,9 +489,16 @@ class _RacingSearch:
             self._ends.append(population)
             bests.append(float(merits[0]))
             self.starts, self.agreeing = len(bests), sum(b <= min(bests) * (1 + SAME_OBJECTIVE) for b in bests)
-            population = _other_population(method, names, population, self._rng)
-            if "dither.amplitude" in names:  # the next one begins near the best
-                method = replace(method, bands=tuple(sorted(method.bands)[:1]))
+            if "dither.amplitude" not in names:
+                population = first_population(method.members, self._rng.random(len(names)), self._rng)
+                continue
+            # another kind of start: the gains of the best points, hardly any dither, and an offset that is drawn anew
+            method = replace(method, bands=tuple(sorted(method.bands)[:1]))
+            population = population[np.arange(method.members) % min(FEW_BEST, len(population))]
+            population = np.clip(population + NEARBY * self._rng.standard_normal(population.shape), 0.0, 1.0)
+            population[:, names.index("dither.amplitude")] = NO_DITHER * self._rng.random(method.members)
+            if "dither.offset" in names:
+                population[:, names.index("dither.offset")] = self._rng.random(method.members)
         trials = (1 - sum(START_SHARES)) * method.trials * len(names)
         fine = _Phase("fine samples", self._simulator, round(trials))
         population = self._best_first(np.vstack([*self._ends, given]), self._coarse)[0][:FINE_MEMBERS]

@@ -314,9 +314,13 @@ class Search:
     def run(self, start: Array | None = None) -> TuningResult:
         """Search from a point, by default the given gains, until a rounded design is certified."""
         simulator = self.simulator
-        try:
-            if start is None:
-                self._report_start(simulator)
+        try:  # one of the cases in which the given gains never settle may be mistyped
+            rows = simulator.table(self.space.start, self.spec) if start is None else []
+            bad = [k for k, row in enumerate(rows) if not np.isfinite(row["SettlingTime"])]
+            if bad:
+                word = "runs away" if np.isinf(rows[bad[0]]["SettlingTime"]) else "never settles"
+                where = f"{simulator.cases[bad[0]].label}, {len(bad)} of {len(rows)} cases"
+                self.progress(f"with the given gains the loop {word} at {where}; searching on")
         except KeyboardInterrupt:
             return self._result_so_far(simulator, _interruption_result(self.space.start))
         result, start, agreement = None, self.space.start if start is None else start, None
@@ -417,15 +421,6 @@ class Search:
             if n in fine and not np.isclose(coarse[n], fine[n], rtol=SAMPLING_TOLERANCE, atol=least, equal_nan=True):
                 return False
         return True
-
-    def _report_start(self, simulator: Simulator) -> None:
-        """Report cases in which the loop never settles with the given gains: one of them may be mistyped."""
-        times = [row["SettlingTime"] for row in simulator.table(self.space.start, self.spec)]
-        bad = [k for k, t in enumerate(times) if not np.isfinite(t)]
-        if bad:
-            word = "runs away" if np.isinf(times[bad[0]]) else "never settles"
-            where = f"{simulator.cases[bad[0]].label}, {len(bad)} of {len(times)} cases"
-            self.progress(f"with the given gains the loop {word} at {where}; searching on")
 
     def certify_roundings(self, found: SearchResult, margin: float) -> TuningResult:
         """Certify roundings of the gains found, until one holds; otherwise the last one's result."""

@@ -136,38 +136,32 @@ class PointFinder:
         return np.column_stack([own.states[:, 0, : len(self.loop.plant.states)], control])
 
     def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints, reach: Array) -> Array:
-        """The plant's state and the command at the fastest sample, without ripple."""
-        begin = np.maximum(own.fastest - np.round(periods / 2 / grid.spacing).astype(np.intp), 0)
-        out, ends = self._run_up_to(grid, p, begin, own, periods > 0)
-        for period, rows in _by_period(periods):
-            along = self._period(grid, ends[rows], p[rows], grid.t[begin[rows]], period)
-            share = (grid.t[own.fastest[rows]] - grid.t[begin[rows]]) / period
-            at, lane = share * (along.shape[1] - 1), np.arange(len(along))
-            k = np.minimum(at.astype(np.intp), along.shape[1] - 2)
-            there = along[lane, k] + (at - k)[:, None] * (along[lane, k + 1] - along[lane, k])
-            _put_finite(out, rows, move_towards(there, _mean(along), reach[rows]))
-        return out
+        """The plant's state and the command at the fastest sample, without ripple.
 
-    def _run_up_to(
-        self, grid: ReferenceGrid, p: Array, last: Indices, own: ResponsePoints, goes_on: Mask
-    ) -> tuple[Array, Array]:
-        """The plant's state and the command at a sample of each lane, and the loop's state there.
-
-        Lanes wait for the latest between two samples of a held controller, which would act again at a sample; it has
-        not acted yet in lanes that go on from there.
+        Lanes are run up to it, or to half a period before it, and wait there for the latest between two samples of a
+        held controller, which would act again at a sample; it has not acted yet in lanes that go on from there.
         """
-        kept, rows = last // KEPT_STATES, np.arange(len(p))
-        left = (last - kept * KEPT_STATES)[:, None]
-        k, (u, t, h) = np.arange(left.max() + 1), grid.pad(len(grid.t))
-        at = kept[:, None] * KEPT_STATES + np.minimum(k, left)
-        waits = k + goes_on[:, None] > left
+        begin = np.maximum(own.fastest - np.round(periods / 2 / grid.spacing).astype(np.intp), 0)
+        kept, lanes = begin // KEPT_STATES, np.arange(len(p))
+        left = (begin - kept * KEPT_STATES)[:, None]
+        number, (u, t, h) = np.arange(left.max() + 1), grid.pad(len(grid.t))
+        at = kept[:, None] * KEPT_STATES + np.minimum(number, left)
+        waits = number + (periods > 0)[:, None] > left
         instants = t[at] + (0.5 * grid.spacing * waits if self.loop.pid.sample_time is not None else 0.0)
         with np.errstate(all="ignore"):
             substeps = rk4_substeps(self.rate, grid.spacing)
-            steps = np.where(k < left, h[at], 0.0)
-            run = self.rollout.run(own.states[rows, kept], u[at], p, instants, steps, substeps=substeps)
-        plant = run.x_end[:, : len(self.loop.plant.states)]
-        return np.column_stack([plant, run.y[:, -1, CONTROL_OUTPUT]]), run.x_end
+            steps = np.where(number < left, h[at], 0.0)
+            run = self.rollout.run(own.states[lanes, kept], u[at], p, instants, steps, substeps=substeps)
+        ends = run.x_end
+        out = np.column_stack([ends[:, : len(self.loop.plant.states)], run.y[:, -1, CONTROL_OUTPUT]])
+        for period, rows in _by_period(periods):
+            along = self._period(grid, ends[rows], p[rows], grid.t[begin[rows]], period)
+            share = (grid.t[own.fastest[rows]] - grid.t[begin[rows]]) / period
+            place, lane = share * (along.shape[1] - 1), np.arange(len(along))
+            k = np.minimum(place.astype(np.intp), along.shape[1] - 2)
+            there = along[lane, k] + (place - k)[:, None] * (along[lane, k + 1] - along[lane, k])
+            _put_finite(out, rows, move_towards(there, _mean(along), reach[rows]))
+        return out
 
     def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints) -> tuple[Array, Array]:
         """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.

@@ -510,23 +510,19 @@ def refine_grids(
     """
     finer = []
     for grid, own in zip(grids, cases, strict=True):
-        found = [_resolve(grid, case, read).t for case in np.flatnonzero(own).tolist()]
+        reference, found = grid.reference, list[Array]()
+        change = reference.final, reference.nominal_size, reference.at
+        for case in np.flatnonzero(own).tolist():
+            closer = grid
+            for _ in range(MAX_REFINEMENTS):
+                signal = read(case, closer)
+                instants = signal if signal is None else refine_instants(closer.t, signal, *change, SEARCH_TOLERANCE)
+                if instants is None:
+                    break
+                closer = closer.at(instants)
+            found.append(closer.t)
         t = np.unique(np.concatenate(found))
         least = 1e-6 * grid.spacing  # the same instant, but for rounding
         finer.append(grid.at(spread_instants(grid.t, t[np.append(True, np.diff(t) > least)], grid.reference.at)))
     more = any(len(new.t) > len(old.t) for new, old in zip(finer, grids, strict=True))
     return finer if more else grids
-
-
-def _resolve(grid: ReferenceGrid, case: int, read: Callable[[int, ReferenceGrid], Array | None]) -> ReferenceGrid:
-    """The samples of a case, with others where its response changes fast."""
-    reference = grid.reference
-    for _ in range(MAX_REFINEMENTS):
-        signal = read(case, grid)
-        if signal is None:
-            break
-        finer = refine_instants(grid.t, signal, reference.final, reference.nominal_size, reference.at, SEARCH_TOLERANCE)
-        if finer is None:
-            break
-        grid = grid.at(finer)
-    return grid

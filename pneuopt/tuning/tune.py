@@ -268,7 +268,24 @@ def _prove_further(
         except KeyboardInterrupt:
             result = _interrupt(task, result, "the simulation of the rig was interrupted")
     if result.status.converged:
-        result = _try_on_plants(task, result, plants, progress)
+        chosen = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
+        count = len(chosen.scenarios if isinstance(chosen, ExpectedPlants) else chosen)
+        try:
+            if count:
+                progress(f"trying the design on {count} plants")
+                found = validate_design(
+                    task.loop,
+                    task.references,
+                    result.parameters,
+                    minimise=task.spec,
+                    scenarios=chosen,
+                    accept=task.accept,
+                )
+                result = replace(result, validation=found)
+        except KeyboardInterrupt:
+            result = _interrupt(task, result, "the trial on other plants was interrupted")
+        except ConvergenceError as error:
+            result = replace(result, status=result.status.with_details(f"not tried on other plants: {error}"))
     return replace(result, stats={**result.stats, "seconds": time.perf_counter() - begun})
 
 
@@ -302,26 +319,6 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback)
     return other, found, False
 
 
-def _try_on_plants(
-    task: TuningTask, result: TuningResult, plants: ExpectedPlants | Scenarios | None, progress: ProgressCallback
-) -> TuningResult:
-    """The result with its validation; where that is interrupted or stops, the status says so."""
-    chosen = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
-    count = len(chosen.scenarios if isinstance(chosen, ExpectedPlants) else chosen)
-    if not count:
-        return result
-    progress(f"trying the design on {count} plants")
-    try:
-        found = validate_design(
-            task.loop, task.references, result.parameters, minimise=task.spec, scenarios=chosen, accept=task.accept
-        )
-    except KeyboardInterrupt:
-        return _interrupt(task, result, "the trial on other plants was interrupted")
-    except ConvergenceError as error:
-        return replace(result, status=result.status.with_details(f"not tried on other plants: {error}"))
-    return replace(result, validation=found)
-
-
 def check_rig(rig: Rig | None, task: TuningTask) -> None:
     """Refuse a rig that is not one of this loop, and a limit that only a rig shows without one, by an `InputError`."""
     if rig is None:
@@ -340,7 +337,7 @@ def check_rig(rig: Rig | None, task: TuningTask) -> None:
 def certify_on_rig(task: TuningTask, result: TuningResult, rig: Rig) -> TuningResult:
     """The certified result with what the rig shows of it on every reference; a limit that breaks there refutes it.
 
-    Margins are those of the smooth loop, which a rig does not have.
+    So does an end that is not as `NoHunting` wants it. Margins are those of the smooth loop, which a rig does not have.
     """
     assert rig.loop is not None
     parameters = task.space.parameters | result.parameters
@@ -356,15 +353,10 @@ def certify_on_rig(task: TuningTask, result: TuningResult, rig: Rig) -> TuningRe
     breaks = tuple(dict.fromkeys((*contacts, *_breaks(task, found))))
     if breaks:
         return _reject(task, result, found, breaks)
-    result = replace(result, on_rig=found)
-    return result if spec.rest is None else _watch_rest(task, result, rig, own, spec.rest)
-
-
-def _watch_rest(
-    task: TuningTask, result: TuningResult, rig: Rig, parameters: ParameterSet, wanted: NoHunting
-) -> TuningResult:
-    """The result with how the loop ends on the rig; where it does not end as wanted, it is no longer certified."""
-    rest = check_rest(rig, task.references, parameters, duration=wanted.duration)
+    result, wanted = replace(result, on_rig=found), spec.rest
+    if wanted is None:
+        return result
+    rest = check_rest(rig, task.references, own, duration=wanted.duration)
     breaks = tuple(f"on the rig {case.sentence}" for case in rest.cases if case.kind is not RestKind.RESTS)
     if rest.rests and rest.repeatability > wanted.repeatability:
         reached, limit = (write_value(v, rest.unit, 3) for v in (rest.repeatability, wanted.repeatability))
@@ -391,24 +383,6 @@ def _breaks(task: TuningTask, found: "pd.DataFrame") -> Iterator[str]:
             yield f"on the rig {metric_name(q)} is {value} at {worst}, the limit is {limit}"
 
 
-def _remedies(task: TuningTask, result: TuningResult, found: "pd.DataFrame") -> Iterator[str]:
-    """With which limit the search would leave the room that the rig needs, if the rig adds as much again.
-
-    A relaxed limit is named only where the loop settles on the rig, for it mends nothing else.
-    """
-    settles = bool(np.isfinite(found.loc["SettlingTime"].to_numpy(dtype=float)).all())
-    for q in task.spec.limits:
-        n = metric_name(q)
-        on_rig, smooth = (max(_requirement_rows(n, f).values(), default=-np.inf) for f in (found, result.certified))
-        room = upper_limit(q) - (on_rig - smooth)
-        if np.isfinite(on_rig) and on_rig > upper_limit(q) and q.metric.sense is Sense.AT_MOST:
-            added = f"the rig adds {_shown(q, on_rig - smooth, task)} to {n}"
-            if room > 0:
-                yield f"{added}: tune with at most {_shown(q, room, task)}"
-            elif settles:
-                yield f"{added}: relax its limit"
-
-
 def _requirement_rows(metric: str, found: "pd.DataFrame") -> dict[str, float]:
     """A requirement's value by case; empty where there is no such metric."""
     rows = {str(case): row for case, row in found.to_dict().items() if metric in row}
@@ -424,9 +398,19 @@ def _shown(requirement: Requirement, value: float, task: TuningTask) -> str:
 def _reject(
     task: TuningTask, result: TuningResult, found: "pd.DataFrame | None", breaks: tuple[str, ...]
 ) -> TuningResult:
-    """The result of a design that the rig refutes: the given gains stand."""
-    smooth = f"on the smooth model it is certified: {result.status.verdict}"
-    remedies = () if found is None else tuple(_remedies(task, result, found))
+    """The result of a design that the rig refutes: the given gains stand.
+
+    A relaxed limit is named only where the loop settles on the rig, for it mends nothing else.
+    """
+    smooth, remedies = f"on the smooth model it is certified: {result.status.verdict}", list[str]()
+    for q in task.spec.limits if found is not None else ():  # the room that the rig needs if it adds as much again
+        n, allowed = metric_name(q), upper_limit(q)
+        on_rig, without = (max(_requirement_rows(n, f).values(), default=-np.inf) for f in (found, result.certified))
+        if np.isfinite(on_rig) and on_rig > allowed and q.metric.sense is Sense.AT_MOST:
+            added, room = on_rig - without, allowed - (on_rig - without)
+            remedy = f"tune with at most {_shown(q, room, task)}" if room > 0 else "relax its limit"
+            if room > 0 or np.isfinite(found.loc["SettlingTime"].to_numpy(dtype=float)).all():
+                remedies.append(f"the rig adds {_shown(q, added, task)} to {n}: {remedy}")
     status = Status(Code.NOT_CERTIFIED, (*breaks, smooth, *remedies))
     return replace(result.refuse(status, task.space.parameters, task.space.names), on_rig=found)
 

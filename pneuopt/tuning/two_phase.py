@@ -307,14 +307,17 @@ def transcribe_two_phase(
     parameters = (averaged | extra).select(system.parameters)
     phases = [p for i, r in enumerate(references) for p in _reference_phases(loop, space, i, r, nodes)]
     parameters = parameters | _durations(references, spec, extra[SETTLING_PARAMETER])
-    limits = [
-        *_horizon_limits(references, parameters),
-        *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)),
-        *_sensitivity_limit(free_loop, averaged, space, spec, parameters),
-    ]
-    q, weights = ca.SX.sym("q", len(parameters)), {k.metric.name: spec.weight(k) for k in REQUIREMENT_KINDS}
+    q, at, limits = ca.SX.sym("q", len(parameters)), list(parameters).index, list[Limit]()
+    for i, reference in enumerate(references):
+        if parameters[_settled_duration(i)].free:  # as the settling time is: together they end with the horizon
+            end, record = q[at(SETTLING_PARAMETER)] + q[at(_settled_duration(i))], reference.horizon - reference.at
+            function = ca.Function("limit", [q], [end])
+            limits.append(Limit(f"horizon {i}", function, record, record, Where.PARAMETERS))
+    limits += [q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)]
+    limits += _sensitivity_limit(free_loop, averaged, space, spec, parameters)
+    weights = {k.metric.name: spec.weight(k) for k in REQUIREMENT_KINDS}
     costs = tuple(  # of the unknowns that stand for the objective's terms
-        Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
+        Cost(n, ca.Function("cost", [q], [q[at(n)]]), Where.PARAMETERS, weight=weight)
         for n, weight in weights.items()
         if METRICS[n].exact and weight > 0
     )
@@ -370,22 +373,6 @@ def _durations(references: Sequence[Reference], spec: Specification, settling: P
 def _settled_duration(i: int) -> str:
     """The name of the duration of reference i's settled phase."""
     return f"rest.{i}"
-
-
-def _horizon_limits(references: Sequence[Reference], parameters: ParameterSet) -> list[Limit]:
-    """The settled phase ends with the horizon, where its duration is unknown because the settling time is."""
-    q, names_ = ca.SX.sym("q", len(parameters)), list(parameters)
-    return [
-        Limit(
-            f"horizon {i}",
-            ca.Function("limit", [q], [q[names_.index(SETTLING_PARAMETER)] + q[names_.index(_settled_duration(i))]]),
-            r.horizon - r.at,
-            r.horizon - r.at,
-            Where.PARAMETERS,
-        )
-        for i, r in enumerate(references)
-        if parameters[_settled_duration(i)].free
-    ]
 
 
 def _extend_system(

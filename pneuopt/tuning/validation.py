@@ -160,11 +160,10 @@ def validate_design(
     ends = {f"{a.label} {side}": v for a in expected.axes for side, v in (("low", a.low), ("high", a.high))}
     by_case, restless = _simulate_plants(loop, steps, full, spec, {**expected.scenarios, **ends})
     restless = [n for n in restless if n in expected.scenarios]
-    values = _worst_by_plant(by_case, [n for n in expected.scenarios if n not in restless], steps)
+    shown = [name for name in METRICS if name in spec.metric_names]
+    values, worst = _worst_figures(by_case, [n for n in expected.scenarios if n not in restless], steps, shown)
     by_plant = {str(n): {str(m): float(v) for m, v in row.items()} for n, row in values.to_dict().items()}
     breaks = {n: find_breaks(row, spec, accept) for n, row in by_plant.items()} | dict.fromkeys(restless, (NO_REST,))
-    shown = [name for name in METRICS if name in spec.metric_names]
-    worst = {n: _worst_case(by_case, values, n, steps) for n in shown}
     certified, findings = _certify(loop, full, spec, expected.scenarios, steps, list(dict.fromkeys(worst.values())))
     for plant, words in findings:
         own = [w for w in words if Defect(w) not in accept and w not in breaks[plant]]
@@ -262,22 +261,27 @@ def _certify(
     return pd.DataFrame(metrics), defects
 
 
-def _worst_case(by_case: "pd.DataFrame", values: "pd.DataFrame", metric: str, steps: Sequence[Reference]) -> str:
-    """The case in which a metric is worst."""
-    plant = str(values.columns[_rank_order(values.loc[metric].to_numpy(dtype=float), metric)[-1]])
-    own = [TuningCase(step, plant).label for step in steps]
-    return own[int(_rank_order(by_case.loc[metric, own].to_numpy(dtype=float), metric)[-1])]
+def _worst_figures(
+    by_case: "pd.DataFrame", plants: Sequence[str], steps: Sequence[Reference], shown: Sequence[str]
+) -> tuple["pd.DataFrame", dict[str, str]]:
+    """The worst of each plant's metrics over its references, a column a plant, and the worst case of those shown.
 
-
-def _worst_by_plant(by_case: "pd.DataFrame", plants: Sequence[str], steps: Sequence[Reference]) -> "pd.DataFrame":
-    """The worst of each plant's metrics over its references, a column a plant; NaN is the worst."""
+    NaN is the worst.
+    """
     import pandas as pd
 
     columns = {str(label): number for number, label in enumerate(by_case)}
     own = np.array([[columns[TuningCase(step, plant).label] for step in steps] for plant in plants])
     table = by_case.to_numpy(dtype=float)[:, own]
-    worst = [[row[_rank_order(row, str(n))[-1]] for row in rows] for n, rows in zip(by_case.index, table, strict=True)]
-    return pd.DataFrame(worst, index=by_case.index, columns=list(plants))
+    rows = {
+        str(n): [row[_rank_order(row, str(n))[-1]] for row in found]
+        for n, found in zip(by_case.index, table, strict=True)
+    }
+    cases = dict[str, str]()
+    for n in shown:
+        labels = [TuningCase(step, plants[_rank_order(np.array(rows[n]), n)[-1]]).label for step in steps]
+        cases[n] = labels[int(_rank_order(by_case.loc[n, labels].to_numpy(dtype=float), n)[-1])]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=list(plants)), cases
 
 
 def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
@@ -337,11 +341,13 @@ def advise(
     broken: Mapping[str, tuple[str, ...]],
     certified: "pd.DataFrame",
     axes: Mapping[CorrelatedParameters, "pd.DataFrame"],
+    most: int = 3,
 ) -> tuple[tuple[str, ...], tuple[CorrelatedParameters, ...]]:
     """Advice where a design breaks on plants, a sentence each, and what to tune over.
 
-    It says with which limits the same gains hold on all plants but those where no limit helps. `axes` are the metrics
-    with one thing that varies alone at its low and its high end, a column each.
+    It says with which limits the same gains hold on all plants but those where no limit helps, and what breaks a limit
+    on its own, or comes nearest to it, the worst first, at most so many. `axes` are the metrics with one thing that
+    varies alone at its low and its high end, a column each.
     """
     if not broken:
         return (), ()
@@ -357,16 +363,6 @@ def advise(
     sentences = [f"with {' and '.join(texts)} these gains hold on {len(sound)} of {len(plants)}"] if texts else []
     count = f"{len(lost)} plant{'s' if len(lost) > 1 else ''}"
     sentences += [f"no relaxed limit helps on {count}, where the loop fails"] if lost else []
-    suggested, reason = _culprits(spec, axes)
-    names = " and ".join(a.label for a in suggested)
-    remedy = f"{reason}: {names}; tune over that too" if names else "tune over such plants: add them to the scenarios"
-    return (*sentences, remedy), suggested
-
-
-def _culprits(
-    spec: Specification, axes: Mapping[CorrelatedParameters, "pd.DataFrame"], most: int = 3
-) -> tuple[tuple[CorrelatedParameters, ...], str]:
-    """What breaks a limit on its own, the worst first, at most so many; else what comes nearest to it."""
     worst = dict[CorrelatedParameters, float]()
     for a, found in axes.items():
         ends = [{str(n): v for n, v in row.items()} for row in found.to_dict().values()]
@@ -375,6 +371,8 @@ def _culprits(
         worst[a] = max(shares, default=-math.inf) if works else math.inf
     order = sorted(worst, key=lambda a: -worst[a])
     alone = [a for a in order if worst[a] > 0]
-    if alone:
-        return tuple(alone[:most]), "what breaks it most, each alone"
-    return tuple(order[:most]), "nothing breaks it alone, most is done by"
+    reason = "what breaks it most, each alone" if alone else "nothing breaks it alone, most is done by"
+    suggested = tuple((alone or order)[:most])
+    names = " and ".join(a.label for a in suggested)
+    remedy = f"{reason}: {names}; tune over that too" if names else "tune over such plants: add them to the scenarios"
+    return (*sentences, remedy), suggested
