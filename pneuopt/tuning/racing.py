@@ -361,7 +361,7 @@ class SuccessHistory:
         one = (own + rng.integers(1, m, size=m)) % m  # neither it nor `other` is the member itself
         other: Indices = rng.integers(0, len(pool) - 2, size=m)
         for lower in (np.minimum(own, one), np.maximum(own, one)):
-            other += other >= lower
+            other = other + (other >= lower)
         mutant = x + F[:, None] * (towards - x) + F[:, None] * (x[one] - pool[other])
         mutant = np.where(mutant < 0, x / 2, np.where(mutant > 1, (1 + x) / 2, mutant))
         taken = rng.random((m, n)) < rates[:, None]

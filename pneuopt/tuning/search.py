@@ -134,18 +134,14 @@ class Certifier:
             proof = judge_evaluations(evaluations, spec.band, rest_error, continues=goes_on)
             certified, known = proof.metrics.loc[shown], proof.metrics.to_dict()
             slopes = {f"friction_slope[{n}]": v["FrictionSlope"] for n, v in known.items() if "FrictionSlope" in v}
-            status = (
-                Status(Code.NOT_CERTIFIED, (*dict.fromkeys(contacts), CONTACT_REMEDY))  # there the model fails
-                if contacts
-                else self._certificate_status(found, claimed, proof)
-            )
+            stops = (*dict.fromkeys(contacts), CONTACT_REMEDY) if contacts else ()  # there the model no longer holds
+            status = Status(Code.NOT_CERTIFIED, stops) if stops else self._certificate_status(found, claimed, proof)
         except ConvergenceError as error:
             proof, certified, contacts, slopes, within = None, claimed * np.nan, [], {}, False
             status = Status(Code.NOT_CERTIFIED, (str(error),))
         deviation = (claimed - certified).abs().max(axis=1).items() if found is not None else ()
-        marks = {"contacts": float(len(contacts))} if contacts else {}
         fails_late = within and not contacts and not status.converged
-        marks |= {"fails_late": 1.0} if fails_late else {}
+        marks = {"contacts": float(len(contacts))} if contacts else {"fails_late": 1.0} if fails_late else {}
         active, stats, agreement = ((), {}, None) if found is None else (found.active, found.figures, found.agreement)
         return TuningResult(
             self.task.space.parameters,

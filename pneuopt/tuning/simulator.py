@@ -107,13 +107,20 @@ class PointFinder:
         Each grid comes with its lanes; p (m, n_parameters) and averaging times (m,) [s], 0 without, are the lanes'.
         """
         plant, is_curved = self.loop.plant, not is_affine(self.loop.plant)
-        slides = is_curved and plant.axis is not None
+        slides, order = is_curved and plant.axis is not None, list(self.loop.parameters)
         count = 1 + is_curved + slides
         x, u = (np.zeros((count, len(p), len(signals))) for signals in (plant.states, plant.inputs))
         for grid, rows in grids:
             own = response_points.select(rows)
             end, reach = self._at_end(grid, p[rows], periods[rows], own)
-            states = [self._at_start(grid, p[rows], own)] if is_curved else []
+            states = list[Array]()
+            if is_curved:  # before the step, with the dither switched off
+                quiet, held, none = p[rows], np.zeros((len(rows), 1, grid.u.shape[1])), np.zeros((len(rows), 1))
+                quiet[:, [order.index(n) for n in (DITHER_AMPLITUDE, DITHER_OFFSET) if n in order]] = 0.0
+                held[:, 0, 0] = grid.reference.origin
+                start = own.states[:, 0]
+                control = self.rollout.run(start, held, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
+                states.append(np.column_stack([start[:, : len(plant.states)], control]))
             if slides:
                 states.append(self._sliding(grid, p[rows], periods[rows], own, reach))
             along = np.array([*states, end])
@@ -124,16 +131,6 @@ class PointFinder:
                 if name != self.loop.command.name and is_curved:
                     u[0, rows, k] = 0.0  # the disturbance has not begun
         return x, u
-
-    def _at_start(self, grid: ReferenceGrid, p: Array, own: ResponsePoints) -> Array:
-        """The plant's state and the command before the step, shape (m, n_plant_states + 1), dither switched off."""
-        order, quiet = list(self.loop.parameters), p.copy()
-        quiet[:, [order.index(n) for n in (DITHER_AMPLITUDE, DITHER_OFFSET) if n in order]] = 0.0
-        u = np.zeros((len(p), 1, grid.u.shape[1]))
-        u[:, 0, 0] = grid.reference.origin
-        none = np.zeros((len(p), 1))
-        control = self.rollout.run(own.states[:, 0], u, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
-        return np.column_stack([own.states[:, 0, : len(self.loop.plant.states)], control])
 
     def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints, reach: Array) -> Array:
         """The plant's state and the command at the fastest sample, without ripple.

@@ -337,7 +337,7 @@ def check_rig(rig: Rig | None, task: TuningTask) -> None:
 def certify_on_rig(task: TuningTask, result: TuningResult, rig: Rig) -> TuningResult:
     """The certified result with what the rig shows of it on every reference; a limit that breaks there refutes it.
 
-    So does an end that is not as `NoHunting` wants it. Margins are those of the smooth loop, which a rig does not have.
+    Margins are those of the smooth loop, which a rig does not have.
     """
     assert rig.loop is not None
     parameters = task.space.parameters | result.parameters
@@ -353,10 +353,15 @@ def certify_on_rig(task: TuningTask, result: TuningResult, rig: Rig) -> TuningRe
     breaks = tuple(dict.fromkeys((*contacts, *_breaks(task, found))))
     if breaks:
         return _reject(task, result, found, breaks)
-    result, wanted = replace(result, on_rig=found), spec.rest
-    if wanted is None:
-        return result
-    rest = check_rest(rig, task.references, own, duration=wanted.duration)
+    result = replace(result, on_rig=found)
+    return result if spec.rest is None else _watch_rest(task, result, rig, own, spec.rest)
+
+
+def _watch_rest(
+    task: TuningTask, result: TuningResult, rig: Rig, parameters: ParameterSet, wanted: NoHunting
+) -> TuningResult:
+    """The result with how the loop ends on the rig; where it does not end as wanted, it is no longer certified."""
+    rest = check_rest(rig, task.references, parameters, duration=wanted.duration)
     breaks = tuple(f"on the rig {case.sentence}" for case in rest.cases if case.kind is not RestKind.RESTS)
     if rest.rests and rest.repeatability > wanted.repeatability:
         reached, limit = (write_value(v, rest.unit, 3) for v in (rest.repeatability, wanted.repeatability))
@@ -403,13 +408,15 @@ def _reject(
     A relaxed limit is named only where the loop settles on the rig, for it mends nothing else.
     """
     smooth, remedies = f"on the smooth model it is certified: {result.status.verdict}", list[str]()
-    for q in task.spec.limits if found is not None else ():  # the room that the rig needs if it adds as much again
-        n, allowed = metric_name(q), upper_limit(q)
-        on_rig, without = (max(_requirement_rows(n, f).values(), default=-np.inf) for f in (found, result.certified))
-        if np.isfinite(on_rig) and on_rig > allowed and q.metric.sense is Sense.AT_MOST:
-            added, room = on_rig - without, allowed - (on_rig - without)
-            remedy = f"tune with at most {_shown(q, room, task)}" if room > 0 else "relax its limit"
-            if room > 0 or np.isfinite(found.loc["SettlingTime"].to_numpy(dtype=float)).all():
+    if found is not None:
+        settles = bool(np.isfinite(found.loc["SettlingTime"].to_numpy(dtype=float)).all())
+        for q in task.spec.limits:  # the room that the rig needs if it adds as much again
+            n, allowed = metric_name(q), upper_limit(q)
+            ours, theirs = (max(_requirement_rows(n, f).values(), default=-np.inf) for f in (result.certified, found))
+            added, room = theirs - ours, allowed - (theirs - ours)
+            broken = np.isfinite(theirs) and theirs > allowed and q.metric.sense is Sense.AT_MOST
+            if broken and (room > 0 or settles):
+                remedy = f"tune with at most {_shown(q, room, task)}" if room > 0 else "relax its limit"
                 remedies.append(f"the rig adds {_shown(q, added, task)} to {n}: {remedy}")
     status = Status(Code.NOT_CERTIFIED, (*breaks, smooth, *remedies))
     return replace(result.refuse(status, task.space.parameters, task.space.names), on_rig=found)
