@@ -64,13 +64,19 @@ class FullSpace:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The solution of a problem with costs and limits."""
+    """The solution of a problem with costs and limits.
+
+    `cost` and `largest_violation` of a limit are NaN and infinite where the solver could not start; `seconds` is its
+    wall time [s]. `multipliers` are the largest absolute ones of each limit and of each bound that is active, by name.
+    """
 
     trajectories: tuple[Trajectory, ...]  # states and outputs, one a phase
     parameters: ParameterSet  # the problem's parameters with the free ones solved for
     status: Status
-    stats: Mapping[str, float] = field(default_factory=dict)  # iterations, seconds, final cost, largest gap
-    # largest absolute multiplier of each limit and of each bound that is active, by name
+    cost: float = math.nan
+    largest_violation: float = math.inf
+    seconds: float = 0.0
+    stats: Mapping[str, float] = field(default_factory=dict)  # iterations and largest gap
     multipliers: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -165,7 +171,7 @@ def solve_from(problem: FullSpaceProblem, start: ParameterSet, guesses: Sequence
     w = np.clip(np.concatenate([to_unknowns(transcription, q), *nodes]), low, up)
     fault = _find_nan(problem, w, q)
     if fault:
-        return _solution(problem, w, q, Status(Code.DIVERGED, (f"at the start {fault}", "start elsewhere")), {}, {})
+        return _solution(problem, w, q, Status(Code.DIVERGED, (f"at the start {fault}", "start elsewhere")))
     return _run_solver(problem, w, q)[0]
 
 
@@ -207,16 +213,16 @@ def _run_solver(
     )
     raw = problem.solver(x0=w, p=q, lbx=low, ubx=up, lbg=low_g, ubg=up_g, **(multipliers or {}))
     found = {k: np.array(v).ravel() for k, v in raw.items()}
-    stats = problem.solver.stats()
-    figures = {
-        "iterations": float(stats.get("iter_count", 0)),
-        "seconds": time.perf_counter() - begun,
-        "cost": float(found["f"][0]),
-        "largest_gap": _largest_violation(problem, found["g"], continuity=True),
-        "largest_violation": _largest_violation(problem, found["g"], continuity=False),
-    }
-    status = _solver_status(problem, str(stats["return_status"]), found, q, figures)
-    return _solution(problem, found["x"], q, status, figures, _multipliers(problem, found, low, up)), found
+    ended, seconds = problem.solver.stats(), time.perf_counter() - begun
+    gap, violation = (
+        max((float(np.max(_row_violation(r, found["g"]), initial=0.0)) for r in rows), default=0.0)
+        for rows in ([r for r in problem.graph.constraint_rows if r.continuity is each] for each in (True, False))
+    )
+    stats = {"iterations": float(ended.get("iter_count", 0)), "largest_gap": gap}
+    status = _solver_status(problem, str(ended["return_status"]), found, q, {**stats, "seconds": seconds})
+    solution = _solution(problem, found["x"], q, status)
+    figures: Any = {"cost": float(found["f"][0]), "largest_violation": violation, "seconds": seconds, "stats": stats}
+    return replace(solution, **figures, multipliers=_multipliers(problem, found, low, up)), found
 
 
 @dataclass(frozen=True, eq=False)
@@ -448,15 +454,6 @@ def _row_violation(rows: ConstraintRows, g: Array) -> Array:
     return np.maximum(np.maximum(rows.lower - values, values - rows.upper), 0.0)
 
 
-def _largest_violation(problem: FullSpaceProblem, g: Array, continuity: bool) -> float:
-    pieces = [
-        float(np.max(_row_violation(r, g), initial=0.0))
-        for r in problem.graph.constraint_rows
-        if r.continuity is continuity
-    ]
-    return max(pieces, default=0.0)
-
-
 def _describe_worst_row(problem: FullSpaceProblem, g: Array) -> str:
     """A sentence on the constraint that is violated most, relative to the size of its bound."""
     table = [r for r in problem.graph.constraint_rows if r.rows.stop > r.rows.start]
@@ -521,14 +518,7 @@ def _multipliers(problem: FullSpaceProblem, found: Mapping[str, Array], low: Arr
     return active
 
 
-def _solution(
-    problem: FullSpaceProblem,
-    w: Array,
-    q: Array,
-    status: Status,
-    figures: Mapping[str, float],
-    multipliers: Mapping[str, float],
-) -> Solution:
+def _solution(problem: FullSpaceProblem, w: Array, q: Array, status: Status) -> Solution:
     transcription = problem.graph.transcription
     columns = (*names(transcription.system.states), *names(transcription.system.outputs))
     trajectories = []
@@ -537,4 +527,4 @@ def _solution(
         trajectories.append(Trajectory(t.ravel(), dict(zip(columns, (*x, *y), strict=True))))
     given = dict(zip(transcription.parameters, q.tolist(), strict=True))
     parameters = transcription.parameters.with_values({**given, **to_values(transcription, w)})
-    return Solution(tuple(trajectories), parameters, status, figures, multipliers)
+    return Solution(tuple(trajectories), parameters, status)

@@ -12,7 +12,7 @@ from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.linear_loop import ComposedLoops
 from pneuopt.control.loop import ClosedLoop, find_rest, set_sliding_direction
 from pneuopt.control.pid import PID
-from pneuopt.control.reference import Reference, Step
+from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import describe_counts, sees_speed
 from pneuopt.evaluation.margins import are_stable
 from pneuopt.evaluation.metric import band_share
@@ -34,8 +34,8 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import BISECTION_STEPS, JUST_BELOW, LEAST_GROWTH, MAX_CORNER_NAMES, POINTS_INSIDE
+from pneuopt.tuning.space import Space, shapes_linear_loop
+from pneuopt.tuning.tolerances import JUST_BELOW, LEAST_GROWTH, MAX_CORNER_NAMES, POINTS_INSIDE
 
 SIGNED_GAINS = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")  # which turn with the actuator; times and ratios do not
 
@@ -47,29 +47,33 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
     """
     if loop.dither is not None:
         loop.dither.check(highest_dither_frequency(loop, space.parameters), loop.pid.sample_time)
+    first = min((t for t, _, _ in spec.envelope), default=0.0)
     for case in cases:
-        _check_horizon(case.reference, spec)
+        reference, record = case.reference, case.reference.horizon - case.reference.at
+        for q in spec.limits:
+            if isinstance(q, SettlingTime | RiseTime) and upper_limit(q) > (1 - TAIL_SHARE) * record:
+                message = (
+                    f"{metric_name(q)}: max {upper_limit(q):g} s is more than {record:g} s after the step can show"
+                )
+                needed = f"{reference.at + upper_limit(q) / (1 - TAIL_SHARE):.4g} s"
+                raise InputError(
+                    f"{message} (reference {reference.label}); lengthen its horizon to {needed}, or lower max"
+                )
+        message = f"StepEnvelope begins {first:g} s after the step, the record of reference {reference.label} ends"
+        require(first < record, f"{message} after {record:g} s; lengthen its horizon, or let the bounds begin earlier")
         _check_following(case, loop, spec)
     _check_noise(loop, space, spec)
+    # a dither moves the position over the edges of its counts, so that their mean tells it
+    dithered = max(abs(v) for v in _parameter_range(space, DITHER_AMPLITUDE)) > 0
+    counts = spec.concerns(SettlingTime) and not dithered and not sees_speed(loop)
     for case in cases:
-        _check_counts(loop, case, space, spec)
+        own = case.case_parameters(space.parameters)
+        in_counts = describe_counts(loop, own, case.reference, spec.band) if counts else None
+        require(in_counts is None, f"{_case_prefix(case)}{in_counts}")
         check_travel(loop, case, space.parameters)
         check_motion(loop, case, space.parameters)
         _check_hold(loop, case, space, spec)
     _check_stability(loop, cases[0], space, spec)
-
-
-def _check_horizon(reference: Reference, spec: Specification) -> None:
-    """Check that a reference's record is long enough for the limits on times to be read."""
-    record = reference.horizon - reference.at
-    for q in spec.limits:
-        if isinstance(q, SettlingTime | RiseTime) and upper_limit(q) > (1 - TAIL_SHARE) * record:
-            message = f"{metric_name(q)}: max {upper_limit(q):g} s is more than {record:g} s after the step can show"
-            needed = f"{reference.at + upper_limit(q) / (1 - TAIL_SHARE):.4g} s"
-            require(False, f"{message} (reference {reference.label}); lengthen its horizon to {needed}, or lower max")
-    first = min((t for t, _, _ in spec.envelope), default=0.0)
-    message = f"StepEnvelope begins {first:g} s after the step, the record of reference {reference.label} ends after"
-    require(first < record, f"{message} {record:g} s; lengthen its horizon, or let the bounds begin earlier")
 
 
 def _check_following(case: TuningCase, loop: ClosedLoop, spec: Specification) -> None:
@@ -105,42 +109,23 @@ def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
     require(least <= spec.limit(NoiseGain), f"{message}; lower pid.Kp or pid.Kd, raise pid.Tf, or raise max")
 
 
-def _check_counts(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
-    """Check that a controller that sees a position in counts can tell whether it is in the settling band.
+def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification, bisections: int = 10) -> None:
+    """Check that a command within the limits holds the reference to within the settling band.
 
-    Under dither it can, in the mean: the ripple moves the position over the edges of counts. Of a speed it can as well.
+    Bisections find the largest part that can be held, for the message: ten for its three digits.
     """
-    dithered = max(abs(v) for v in _parameter_range(space, DITHER_AMPLITUDE)) > 0
-    if dithered or sees_speed(loop) or not spec.concerns(SettlingTime):
-        return
-    message = describe_counts(loop, case.case_parameters(space.parameters), case.reference, spec.band)
-    require(message is None, f"{_case_prefix(case)}{message}")
-
-
-def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
-    """Check that a command within the limits holds the reference to within the settling band."""
     reference = case.reference
     room = band_share(spec.band, reference) * reference.size  # 0 for a disturbance alone
     target = reference.final - room
-
-    def find_obstacle(share: float) -> str:
-        """The reason why a part of the reference cannot be held; empty where it can."""
-        try:
-            command = _find_operating_point(loop, case, space, share * target)[1]
-        except ConvergenceError:
-            command = 0.0  # no steady state is known
-        except InputError as error:
-            return str(error)
-        return _describe_command_excess(loop, case, space, spec, command, share * target)
-
-    obstacle = find_obstacle(1.0)
+    given = loop, case, space, spec
+    obstacle = _find_obstacle(*given, target)
     if obstacle:
-        low, high = 0.0, 1.0
-        for _ in range(BISECTION_STEPS if not find_obstacle(0.0) else 0):
+        low, high = 0.0, target
+        for _ in range(bisections if not _find_obstacle(*given, 0.0) else 0):
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if find_obstacle(middle) else (middle, high)
-        most_held = f"; the most that can be held is {low * target:.3g} {loop.feedback.unit}" if low else ""
-        require(False, f"{_case_prefix(case)}{obstacle}{most_held}")
+            low, high = (low, middle) if _find_obstacle(*given, middle) else (middle, high)
+        most_held = f"; the most that can be held is {low:.3g} {loop.feedback.unit}" if low else ""
+        raise InputError(f"{_case_prefix(case)}{obstacle}{most_held}")
 
 
 def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, value: float) -> tuple[Array, float]:
@@ -151,10 +136,14 @@ def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, valu
     return find_rest(acting, set_sliding_direction(acting, own, value), value, start)
 
 
-def _describe_command_excess(
-    loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification, command: float, value: float
-) -> str:
-    """The reason why a command that holds a value is not allowed; empty where it is."""
+def _find_obstacle(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification, value: float) -> str:
+    """The reason why a value cannot be held, or the command that holds it is not allowed; empty where it can."""
+    try:
+        command = _find_operating_point(loop, case, space, value)[1]
+    except ConvergenceError:
+        command = 0.0  # no steady state is known
+    except InputError as error:
+        return str(error)
     own, unit = case.case_parameters(space.parameters), loop.command.unit
     takes = f"holding {value:.4g} {loop.feedback.unit} takes {command:.4g} {unit}"
     if loop.pid.limits:
@@ -184,7 +173,7 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Spe
     may_miss = spec.limit(SteadyStateError) < inf and not spec.concerns(SettlingTime)
     if may_miss and not is_affine(loop.plant):
         return
-    names, order = [n for n in space.names if _shapes_linear_loop(loop, n)], list(space.parameters)
+    names, order = [n for n in space.names if shapes_linear_loop(loop, n)], list(space.parameters)
     if len(names) > MAX_CORNER_NAMES:
         return
     box, rng = Space(case.case_parameters(space.parameters), tuple(names)), np.random.default_rng(0)
@@ -211,13 +200,6 @@ def _check_stability(loop: ClosedLoop, case: TuningCase, space: Space, spec: Spe
     message = f"every gain allowed makes the loop unstable: {words}; linearised at {end}, where the reference ends, "
     remedy = ", or ".join(remedies) or "neither turned signs nor gains ten times as large hold it"
     require(False, f"{message}a deviation grows e-fold in {1 / growth:.2g} s or less; {remedy}")
-
-
-def _shapes_linear_loop(loop: ClosedLoop, n: str) -> bool:
-    """Whether the linearised loop depends on a parameter of the controller."""
-    section, _, name = n.partition(".")
-    acting = {"dither", "position_loop", "schedule", *(part.section for part in loop.controller.acting_always)}
-    return section in acting or (section == "pid" and name in loop.pid.form.gains)
 
 
 def _closed_loops(loop: ClosedLoop, p: Array, x: Array, command: float) -> Array:

@@ -211,7 +211,21 @@ class Front:
         """The table of the designs found so far; see `pareto_front`."""
         import pandas as pd
 
-        return pd.DataFrame([self._row(design) for design in self.designs])
+        pair, rows = (self.first, self.second), list[dict[str, Any]]()
+        for design in self.designs:
+            result = design.result
+            known = result if result is not None and result.status.converged else None
+            figures = {
+                f"{lead}{metric_name(q)}": nan if known is None else float(known.requirements[column][metric_name(q)])
+                for lead, column in (("", "certified"), ("claimed ", "claimed"))
+                for q in pair
+            }
+            gains = {n: nan if known is None else known.parameters.value(n) for n in self.base_search.space.names}
+            costs = {"solver_seconds": design.solver_seconds, "seconds": design.seconds}
+            error = "" if known else Code.INTERRUPTED.value if result is None else str(result.status)
+            limit = user_value(self.second, design.limit)
+            rows.append({**figures, "limit": limit, **gains, **costs, "error": error})
+        return pd.DataFrame(rows)
 
     def _find_end(self, requirement: Requirement, start: TuningResult | None = None) -> Design:
         """Find the design that is best by one requirement; among equals the one that is best by the other."""
@@ -264,7 +278,7 @@ class Front:
             asked = [self._search_for(k, self.base_search.method) for k in todo]
             found = self._track(path, [own.tighten(margin) for own in asked]) if todo else []
             for k, own, solution in zip(todo, asked, found, strict=True):
-                begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
+                begun, old, spent = time.perf_counter(), self.designs[k], solution.seconds
                 result = self._round_and_certify(own, solution, margin)
                 seconds, spent = old.seconds + spent + time.perf_counter() - begun, old.solver_seconds + spent
                 self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=spent)
@@ -294,9 +308,9 @@ class Front:
         if _solution_cost(other[0]) < _solution_cost(found[-1]) * (1 - LEAST_IMPROVEMENT):
             other = path.follow(starts[1], specs[::-1])
         for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
-            spent = found[k].stats["seconds"] + back.stats["seconds"]
+            spent = found[k].seconds + back.seconds
             better = back if _solution_cost(back) < _solution_cost(found[k]) else found[k]
-            found[k] = replace(better, stats={**better.stats, "seconds": spent})
+            found[k] = replace(better, seconds=spent)
         return found
 
     def _round_and_certify(self, search: Search, solution: Solution, margin: float) -> TuningResult:
@@ -304,7 +318,7 @@ class Front:
         if solution.status.code is Code.INTERRUPTED:
             raise KeyboardInterrupt
         point = np.array([solution.parameters.value(n) for n in search.space.names])
-        found = SearchResult(point, solution.status, tuple(solution.multipliers), optimum=solution.stats["cost"])
+        found = SearchResult(point, solution.status, tuple(solution.multipliers), optimum=solution.cost)
         good = solution.status.converged
         return (
             search.certify_roundings(found, margin)
@@ -318,15 +332,17 @@ class Front:
 
     def _improve(self, k: int, start: Array | None) -> None:
         """Search for design k from given gains; it replaces the present one if it is better."""
-        begun, old, path = time.perf_counter(), self.designs[k], self._path
-        if path is not None and start is not None:
-            result, spent = self._resolve(path, k, start)
+        begun, old, path, spent = time.perf_counter(), self.designs[k], self._path, 0.0
+        method = self.base_search.method
+        if path is None or start is None:
+            result = _check_interruption(self._search_for(k, method.shorten(method.margin)).run(start))
         else:
-            search, spent = (
-                self._search_for(k, self.base_search.method.shorten(self.base_search.method.margin)),
-                0.0,
-            )
-            result = _check_interruption(search.run(start))
+            search = self._search_for(k, method)
+            for margin in self._margins:  # more of it where rounding makes the solution infeasible
+                (solution,) = path.follow(start, [search.tighten(margin)])
+                result, spent = self._round_and_certify(search, solution, margin), spent + solution.seconds
+                if result.status.converged:
+                    break
         before, kept = old.result, result
         if before is not None and not result.status.converged:
             kept = before
@@ -337,17 +353,6 @@ class Front:
         self.base_search.progress(
             f"{metric_name(self.second)} {user_value(self.second, old.limit):.4g}: {result.status}"
         )
-
-    def _resolve(self, path: LimitPath, k: int, start: Array) -> tuple[TuningResult, float]:
-        """Solve for design k, with more margin where rounding makes it infeasible; also the solver's time [s]."""
-        search, spent, result = self._search_for(k, self.base_search.method), 0.0, None
-        for margin in self._margins:
-            (solution,) = path.follow(start, [search.tighten(margin)])
-            result, spent = self._round_and_certify(search, solution, margin), spent + solution.stats["seconds"]
-            if result.status.converged:
-                break
-        assert result is not None
-        return result, spent
 
     def _rival(self, k: int) -> Array | None:
         """The gains of another design or sampled point that beats design k within its limit; None if there is none."""
@@ -372,22 +377,6 @@ class Front:
         space, rng = self.base_search.space, np.random.default_rng(0)
         points = space.from_unit(first_population(RIVAL_SAMPLES, space.to_unit(space.start), rng))
         return points, to_records(self.base_search.simulator.values(points, self.base_search.spec))
-
-    def _row(self, design: Design) -> dict[str, Any]:
-        """A row of `pareto_front`'s table."""
-        result, pair, space = design.result, (self.first, self.second), self.base_search.space
-        good = result is not None and result.status.converged
-        columns = {"": "certified", "claimed ": "claimed"}
-        known = result.requirements if result is not None and good else None
-        figures = {
-            f"{lead}{metric_name(q)}": nan if known is None else float(known[column][metric_name(q)])
-            for lead, column in columns.items()
-            for q in pair
-        }
-        gains = {n: nan if result is None or not good else result.parameters.value(n) for n in space.names}
-        costs = {"solver_seconds": design.solver_seconds, "seconds": design.seconds}
-        error = "" if good else Code.INTERRUPTED.value if result is None else str(result.status)
-        return {**figures, "limit": user_value(self.second, design.limit), **gains, **costs, "error": error}
 
 
 def _result_of(design: Design) -> TuningResult:
@@ -414,7 +403,7 @@ def _design_status(design: Design) -> Status:
 
 def _solution_cost(solution: Solution) -> float:
     """The objective of a solution; infinite where the solver did not converge."""
-    return solution.stats["cost"] if solution.status.converged else np.inf
+    return solution.cost if solution.status.converged else np.inf
 
 
 def _result_value(result: TuningResult, requirement: Requirement) -> float:

@@ -15,15 +15,15 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
+from pneuopt.control.dither import DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
+from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.evaluation.metric import (
     DitherPeriodMean,
     SettlingBand,
@@ -59,15 +59,14 @@ from pneuopt.tuning.space import (
     is_sound,
     loop_pieces,
     meter_values,
+    shapes_linear_loop,
 )
 from pneuopt.tuning.tolerances import (
     DIFFERENCE_STEP,
     INFINITE_BOUND,
     KEPT_STATES,
     MAX_CUTTING_ROUNDS,
-    MAX_SENSITIVITY_LANES,
     NEAR_LIMIT,
-    NODES,
     PENALTY_RAISES,
     PROGRAM_BAND_PENALTY,
     PROGRAM_LIMIT_PENALTY,
@@ -81,10 +80,11 @@ from pneuopt.tuning.tolerances import (
 
 @dataclass(frozen=True, eq=False)
 class Polish:
-    """Improve points of a search by gradients."""
+    """Improve points of a search by gradients, from responses that are read at so many `nodes`, at most."""
 
     simulator: Simulator
     spec: Specification
+    nodes: int = 2000
 
     @property
     def is_possible(self) -> bool:
@@ -103,7 +103,7 @@ class Polish:
         known = {n: v if np.isfinite(v) else unknown.get(n, 1.0) for n, v in first.items()}
         scale = self.spec.objective(known)  # the size of the objective sets that of the penalties
         for raises in range(PENALTY_RAISES + 1):
-            problem = LinearisedProblem(on, self._rollout, inside, NODES, scale * 10.0**raises)
+            problem = LinearisedProblem(on, self._rollout, inside, self.nodes, scale * 10.0**raises)
             found = descend(problem, problem.start(unit), iterations, SQP())
             unit, count = np.array([point.z[:-1] for point in found]), count + problem.count
             values = to_records(on.values(space.from_unit(unit), self.spec))
@@ -237,14 +237,15 @@ def _advance(problem: MinimaxProblem, descents: Sequence[DescentState], method: 
         for k, (predicted, gained) in enumerate(gains)
         if _promises_decrease(descents[k], predicted, method) and gained < method.shrink * predicted
     ]
-    seconds = [
-        _second_order_step(descents[k].point, steps[k], trials[k][0], _step_box(problem, descents[k])) for k in poor
-    ]
-    for k, second in zip(
-        poor,
-        _evaluate_and_improve(problem, [descents[k].point.z + s for k, s in zip(poor, seconds, strict=True)]),
-        strict=True,
-    ):
+    corrected = list[Array]()
+    for k in poor:  # the step of the program with the rows' true values at the trial point
+        point, trial = descents[k].point, trials[k][0]
+        with np.errstate(invalid="ignore"):
+            values = trial.values - point.slopes @ steps[k]
+        known = np.isfinite(values) & np.isfinite(point.values)
+        point = replace(point, values=np.where(known, values, point.values))
+        corrected.append(point.z + solve_quadratic_program(point, _step_box(problem, descents[k])))
+    for k, second in zip(poor, _evaluate_and_improve(problem, corrected), strict=True):
         if second[1].merit < trials[k][1].merit:
             trials[k] = second
     return [
@@ -286,14 +287,6 @@ def _update_descent(
 def _step_box(problem: MinimaxProblem, descent: DescentState) -> Array:
     """Bounds and trust region as `solve_quadratic_program` takes them, shape (n, 3)."""
     return np.column_stack([problem.bounds, descent.radius * problem.scales])
-
-
-def _second_order_step(point: LinearisedPoint, step: Array, trial: LinearisedPoint, box: Array) -> Array:
-    """The second-order correction: the step of the program with the rows' true values at the trial point."""
-    with np.errstate(invalid="ignore"):
-        values = trial.values - point.slopes @ step
-    known = np.isfinite(values) & np.isfinite(point.values)
-    return solve_quadratic_program(replace(point, values=np.where(known, values, point.values)), box)
 
 
 def solve_quadratic_program(point: LinearisedPoint, box: Array) -> Array:
@@ -390,8 +383,10 @@ class LinearisedProblem:
 
     Responses of the simulator's cases are read at so many nodes; the objective's size `scale` sets that of the
     penalties. `bounds` (n + 1, 2) and `scales` (n + 1,) are the unknowns' ranges and trust regions, `count` the
-    candidates simulated.
+    candidates simulated; `most_lanes` with sensitivities run at a time, as fit a processor's cache.
     """
+
+    most_lanes: ClassVar[int] = 64
 
     def __init__(self, simulator: Simulator, rollout: Rollout, spec: Specification, nodes: int, scale: float) -> None:
         self._simulator, self._rollout, self._spec, self.count = simulator, rollout, spec, 0
@@ -421,8 +416,20 @@ class LinearisedProblem:
     def evaluate(self, z: Array) -> Sequence[LinearisedPoint]:
         """Simulate and linearise the responses for each row of z."""
         self.count += len(z)
-        readings = self._read(z[:, :-1])
-        return [self._point(row, reading) for row, reading in zip(z, readings, strict=True)]
+        points = self._space.from_unit(z[:, :-1])
+        found: list[list[LinearisedResponse]] = [[] for _ in points]
+        for g, own in enumerate(self._cases):
+            rows, case = np.repeat(np.arange(len(points)), len(own)), np.tile(own, len(points))
+            chunks = [slice(k, k + self.most_lanes) for k in range(0, len(rows), self.most_lanes)]
+            parts = [self._simulate_lanes(g, points, rows[k], case[k]) for k in chunks]
+            error, by_gain = (np.concatenate(rows) for rows in zip(*((r.error, r.by_gain) for r in parts), strict=True))
+            values = {k: np.concatenate([r.values[k] for r in parts]) for k in parts[0].values}
+            slopes = {k: np.concatenate([r.derivatives[k] for r in parts]) for k in values}
+            for i in range(len(points)):
+                lanes = slice(i * len(own), (i + 1) * len(own))
+                tables = ({k: v[lanes] for k, v in every.items()} for every in (values, slopes))
+                found[i].append(LinearisedResponse(error[lanes], by_gain[lanes], *tables))
+        return [self._point(row, readings) for row, readings in zip(z, found, strict=True)]
 
     def improve(self, point: LinearisedPoint) -> LinearisedPoint:
         """Keep the gains and choose their best Ts: the settling time, or an earlier one where that pays."""
@@ -504,27 +511,6 @@ class LinearisedProblem:
         slopes = np.concatenate([by_gain, by_time[..., None]], axis=-1)
         return np.array([error, -error]) - self._band, np.array([slopes, -slopes])
 
-    def _read(self, unit: Array) -> list[list[LinearisedResponse]]:
-        """Simulate points; the linearised response of each point to each reference."""
-        points = self._space.from_unit(unit)
-        found: list[list[LinearisedResponse]] = [[] for _ in points]
-        for g, own in enumerate(self._cases):
-            rows, case = np.repeat(np.arange(len(points)), len(own)), np.tile(own, len(points))
-            parts = [
-                self._simulate_lanes(
-                    g, points, rows[k : k + MAX_SENSITIVITY_LANES], case[k : k + MAX_SENSITIVITY_LANES]
-                )
-                for k in range(0, len(rows), MAX_SENSITIVITY_LANES)
-            ]
-            error, by_gain = (np.concatenate(rows) for rows in zip(*((r.error, r.by_gain) for r in parts), strict=True))
-            values = {k: np.concatenate([r.values[k] for r in parts]) for k in parts[0].values}
-            slopes = {k: np.concatenate([r.derivatives[k] for r in parts]) for k in values}
-            for i in range(len(points)):
-                lanes = slice(i * len(own), (i + 1) * len(own))
-                tables = ({k: v[lanes] for k, v in every.items()} for every in (values, slopes))
-                found[i].append(LinearisedResponse(error[lanes], by_gain[lanes], *tables))
-        return found
-
     def _simulate_lanes(self, g: int, points: Array, rows: Indices, case: Indices) -> LinearisedResponse:
         """Simulate lanes on one grid and linearise their responses."""
         grid = self._simulator.grids[g]
@@ -553,7 +539,14 @@ class LinearisedProblem:
             if kind.metric.slope is not None and self._spec.concerns(kind)
         }
         if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
-            rows_of |= self._robustness_rows(p, sound, self._points(grid, p, case, found), points[rows], case)
+            fastest, periods = np.zeros(len(p), dtype=np.intp), self._simulator.sampled.periods(p)
+            for period in np.unique(periods).tolist():
+                own = periods == period
+                fastest[own] = self._simulator.fastest_samples(grid, found.y[own], period)
+            assert found.x is not None
+            ends = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
+            at = self._simulator.operating_points(p, case, ends)
+            rows_of |= self._robustness_rows(p, sound, at, points[rows], case)
         return LinearisedResponse(
             np.where(sound[:, None], error, np.inf),
             by_gain,
@@ -561,34 +554,20 @@ class LinearisedProblem:
             {kind: slopes for kind, (_, slopes) in rows_of.items()},
         )
 
-    def _points(self, grid: ReferenceGrid, p: Array, case: Indices, found: RolloutResult) -> tuple[Array, Array]:
-        """The operating points of lanes on one grid, states and inputs."""
-        fastest, periods = np.zeros(len(p), dtype=np.intp), self._simulator.sampled.periods(p)
-        for period in np.unique(periods).tolist():
-            rows = periods == period
-            fastest[rows] = self._simulator.fastest_samples(grid, found.y[rows], period)
-        assert found.x is not None
-        response_points = ResponsePoints(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
-        return self._simulator.operating_points(p, case, response_points)
-
     def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:
         """Derivatives of parameters, and of starts that depend on gains, to the unknowns (m, n_columns, n)."""
         names, cases = self._space.names, self._simulator.cases
         factors = np.array([case.slopes(names) for case in cases])[case]
         chain = factors[:, :, None] * np.eye(len(names))
         if self._rollout.n_columns > len(names):
-            chain = np.concatenate([self._rest_slopes(points, rows, case), chain], axis=1)
+            (low, up), columns = self._space.bounds.T, []
+            for k, step in enumerate(DIFFERENCE_STEP * (up - low)):  # start states by central differences
+                nudge = step * (np.arange(len(low)) == k)
+                above, below = (np.clip(points + sign * nudge, low, up) for sign in (1, -1))
+                moved = (self._simulator.lanes(side, rows, case)[1] for side in (above, below))
+                columns.append((next(moved) - next(moved)) / (above - below)[rows, k][:, None])
+            chain = np.concatenate([np.stack(columns, axis=-1), chain], axis=1)
         return np.asarray(chain * self._space.from_unit_slope(points)[rows][:, None, :])
-
-    def _rest_slopes(self, points: Array, rows: Indices, case: Indices) -> Array:
-        """Derivatives of the start states to the gains by central differences, shape (m, n_states, n)."""
-        (low, up), columns = self._space.bounds.T, []
-        for k, step in enumerate(DIFFERENCE_STEP * (up - low)):
-            nudge = step * (np.arange(len(low)) == k)
-            above, below = (np.clip(points + sign * nudge, low, up) for sign in (1, -1))
-            moved = (self._simulator.lanes(side, rows, case)[1] for side in (above, below))
-            columns.append((next(moved) - next(moved)) / (above - below)[rows, k][:, None])
-        return np.stack(columns, axis=-1)
 
     def _robustness_rows(
         self, p: Array, sound: Mask, at: tuple[Array, Array], points: Array, case: Indices
@@ -599,12 +578,8 @@ class LinearisedProblem:
             len(self._wrt),
             [k for k in ROBUSTNESS_REQUIREMENTS if self._spec.concerns(k)],
         )
-        loop = self._simulator.loop
-        outer = (loop.outer,) if loop.outer else ()
-        scheduled = (loop.schedule,) if loop.schedule else ()
-        sections = tuple(f"{c.section}." for c in (*outer, *scheduled, *loop.controller.acting_always))
-        felt = {*(f"pid.{gain}" for gain in loop.pid.form.gains), DITHER_AMPLITUDE, DITHER_FREQUENCY}
-        shaping = [k for k, name in enumerate(names) if name in felt or name.startswith(sections)]
+        loop = self._simulator.loop  # an offset acts by the operating points only, which are held
+        shaping = [k for k, n in enumerate(names) if n != DITHER_OFFSET and shapes_linear_loop(loop, n)]
         found: dict[type, tuple[Array, Array]] = {
             kind: (np.full((len(p), 1), np.inf), np.zeros((len(p), 1, n))) for kind in kinds
         }

@@ -14,7 +14,7 @@ R. Tanabe, A. Fukunaga, Success-history based parameter adaptation for different
 Evolutionary Computation 2013, 71-78. It knows no merit function, so that a race may answer with a bound.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -45,7 +45,6 @@ from pneuopt.tuning.simulator import Responses, Simulator, to_records
 from pneuopt.tuning.space import penalty_settling_time
 from pneuopt.tuning.tolerances import (
     ACTIVE_ROOM,
-    AGREEMENT,
     BAND_SHARES,
     BEST_SHARE,
     CUT_SETTLING_TIMES,
@@ -59,7 +58,6 @@ from pneuopt.tuning.tolerances import (
     LEAST_SHORT_TRIALS,
     LEAST_SPREAD,
     LIMIT_TOLERANCE,
-    MAX_RECORDED_NUMBERS,
     MEMORY_OF_KILLS,
     MEMORY_SIZE,
     MIN_DISTANCE,
@@ -68,8 +66,8 @@ from pneuopt.tuning.tolerances import (
     POLISHED,
     POLISHED_NEARBY,
     RUNAWAY_LEVEL,
+    SAME_OBJECTIVE,
     SHORT_MEMBERS,
-    SIMULATION_PEAK_MARGIN,
     STALLED_GENERATIONS,
     START_SHARES,
     VIOLATION_PENALTY,
@@ -108,7 +106,7 @@ class Racing:
     seed: int = 0
     digits: int | None = 4
 
-    peak_margin: ClassVar[float] = SIMULATION_PEAK_MARGIN
+    peak_margin: ClassVar[float] = 1 / 5  # of which coarse samples miss as much
     parameters_without_effect: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -211,8 +209,11 @@ class Race:
     """Races on one simulator for one specification.
 
     `scale`, the horizon [s], stands for the settling time of what never settles; `count` is the number of points
-    simulated, on one case or more; `is_cut` says that races see less than the whole of a response.
+    simulated, on one case or more; `is_cut` says that races see less than the whole of a response, and `most_numbers`
+    how many numbers of 8 bytes it records, at most.
     """
+
+    most_numbers: ClassVar[int] = 2**25
 
     def __init__(self, simulator: Simulator, spec: Specification, scale: float) -> None:
         self._whole, self._spec, self._scale, self.count = simulator, spec, scale, 0
@@ -246,7 +247,7 @@ class Race:
         compete, most = self._race_cases, len(points)
         if self._uses_bounds:
             numbers = len(self._course.length) * self._course.t.shape[1] * self._simulator.rollout.n_outputs
-            compete, most = self._race_lanes, max(1, MAX_RECORDED_NUMBERS // numbers)
+            compete, most = self._race_lanes, max(1, self.most_numbers // numbers)
         merits, worst = np.full(len(points), np.inf), first.copy()
         for k in range(0, len(points), most):
             part = slice(k, k + most)
@@ -356,8 +357,11 @@ class SuccessHistory:
         F, rates = np.minimum(F, 1.0), np.clip(rng.normal(self._rates[entry], 0.1), 0.0, 1.0)
         best = np.argsort(self.merits, kind="stable")[: max(2, round(BEST_SHARE * m))]
         towards = x[rng.choice(best, m)]
-        one, other = _others(m, m + len(self._archive), rng)
-        pool = np.vstack([x, self._archive])
+        pool, own = np.vstack([x, self._archive]), np.arange(m)
+        one = (own + rng.integers(1, m, size=m)) % m  # neither it nor `other` is the member itself
+        other: Indices = rng.integers(0, len(pool) - 2, size=m)
+        for lower in (np.minimum(own, one), np.maximum(own, one)):
+            other = other + (other >= lower)
         mutant = x + F[:, None] * (towards - x) + F[:, None] * (x[one] - pool[other])
         mutant = np.where(mutant < 0, x / 2, np.where(mutant > 1, (1 + x) / 2, mutant))
         taken = rng.random((m, n)) < rates[:, None]
@@ -396,16 +400,6 @@ def first_population(members: int, start: Array, rng: np.random.Generator) -> Ar
     return found
 
 
-def _others(m: int, size: int, rng: np.random.Generator) -> tuple[Indices, Indices]:
-    """For each of m members another one, and a third out of `size`, shapes (m,): neither is the member itself."""
-    own = np.arange(m)
-    one = (own + rng.integers(1, m, size=m)) % m
-    third: Indices = rng.integers(0, size - 2, size=m)
-    low, high = np.minimum(own, one), np.maximum(own, one)
-    third += third >= low
-    return one, third + (third >= high)
-
-
 WIDEN_BOUNDS = "widen the gains' bounds, or lower their lower ends"  # the remedy where no stable loop is found
 
 
@@ -430,34 +424,29 @@ def compute_merits(values: Mapping[str, Array], spec: Specification, scale: floa
 
 
 def search_result(task: TuningTask, simulator: Simulator, spec: Specification, point: Array) -> SearchResult:
-    """The result of a search by simulation for a tightened `spec`: its best point (n,), and what is active there."""
+    """The result of a search by simulation for a tightened `spec`: its best point (n,), what is active and broken."""
     values = to_records(simulator.values(point[None], spec))[0]
     limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= (1 - ACTIVE_ROOM) * upper_limit(q)]
     low, up = task.space.bounds.T
     near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
     active = (*limits, *(n for n, held in zip(task.space.names, near, strict=True) if held))
-    return SearchResult(point, _search_status(task.spec, values), active, optimum=spec.objective(values))
-
-
-def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
-    """The status of a search: converged where its point keeps the limits; otherwise it says which ones are broken."""
+    asked, status = task.spec, Status(Code.CONVERGED)
     broken = [
         f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"
-        for q in spec.violations(values, LIMIT_TOLERANCE)
+        for q in asked.violations(values, LIMIT_TOLERANCE)
     ]
-    if not broken and spec.with_stability().violations(values):
+    if broken:
+        verdict = f"the closest found has {' and '.join(broken)}"
+        status = Status(Code.INFEASIBLE, (verdict, "relax a limit or widen the bounds"))
+    elif asked.with_stability().violations(values):
         Ms = values["MaxSensitivity"]
         nearly = f"nearly unstable, with a MaxSensitivity of {Ms:.3g}, more than {STABILITY_SENSITIVITY:g}"
         verdict = f"the closest found is {nearly if np.isfinite(Ms) else 'no stable loop'}"
-        return Status(Code.INFEASIBLE, (verdict, WIDEN_BOUNDS))
-    if broken:
-        verdict = f"the closest found has {' and '.join(broken)}"
-        return Status(Code.INFEASIBLE, (verdict, "relax a limit or widen the bounds"))
-    if not np.isfinite(spec.objective(values)):
-        return Status(
-            Code.NOT_CONVERGED, ("nothing found settles", "widen the band or the bounds, or lengthen the horizon")
-        )
-    return Status(Code.CONVERGED)
+        status = Status(Code.INFEASIBLE, (verdict, WIDEN_BOUNDS))
+    elif not np.isfinite(asked.objective(values)):
+        remedy = "widen the band or the bounds, or lengthen the horizon"
+        status = Status(Code.NOT_CONVERGED, ("nothing found settles", remedy))
+    return SearchResult(point, status, active, optimum=spec.objective(values))
 
 
 class _Phase(NamedTuple):
@@ -466,32 +455,6 @@ class _Phase(NamedTuple):
     name: str
     simulator: Simulator
     trials: int
-
-
-def _phases(simulator: Simulator, spec: Specification, method: Racing, share: float) -> Iterator[_Phase]:
-    """The phases of a start on coarse samples; wider bands only where a settling time is asked for."""
-    trials = share * method.trials * len(simulator.space.names)
-    widest = max(band_share(spec.band, grid.reference) for grid in simulator.grids)
-    wider = [spec.band * b for b in sorted(method.bands) if widest * b < 1] if spec.concerns(SettlingTime) else []
-    stages = [bands for bands in (wider, wider[:1]) if bands]
-    for bands, part in zip(stages, BAND_SHARES, strict=False):
-        yield _Phase("wide bands", simulator.coarse(spec, bands), round(part * trials))
-    yield _Phase("coarse samples", simulator.coarse(spec), round((1 - sum(BAND_SHARES[: len(stages)])) * trials))
-
-
-def _other_population(method: Racing, names: Sequence[str], best: Array, rng: np.random.Generator) -> Array:
-    """A population of another kind than the one that found `best`: with hardly any dither, where it is free.
-
-    Its gains are those of the first one's best points, its offset is drawn anew; without a free dither all is.
-    """
-    if "dither.amplitude" not in names:
-        return first_population(method.members, rng.random(len(names)), rng)
-    population = best[np.arange(method.members) % min(FEW_BEST, len(best))]
-    population = np.clip(population + NEARBY * rng.standard_normal(population.shape), 0.0, 1.0)
-    population[:, names.index("dither.amplitude")] = NO_DITHER * rng.random(method.members)
-    if "dither.offset" in names:
-        population[:, names.index("dither.offset")] = rng.random(method.members)
-    return np.asarray(population)
 
 
 class _RacingSearch:
@@ -513,7 +476,7 @@ class _RacingSearch:
         self._ends, self._polished, self._points = list[Array](), list[Array](), POLISHED
 
     def run(self, method: Racing) -> None:
-        """Search from each start on coarse samples, then from the best of all on fine ones."""
+        """Search from each start on coarse samples; from the best of all on fine ones, by gradients and by trials."""
         names, given = self._space.names, self.best
         population = first_population(method.members, given, self._rng)
         if not method.bands:
@@ -525,22 +488,26 @@ class _RacingSearch:
             population, merits = self._search(population, method, share, LAGGING * min(bests, default=np.inf))
             self._ends.append(population)
             bests.append(float(merits[0]))
-            self.starts, self.agreeing = len(bests), sum(b <= min(bests) * (1 + AGREEMENT) for b in bests)
-            population = _other_population(method, names, population, self._rng)
-            if "dither.amplitude" in names:  # the next one begins near the best
-                method = replace(method, bands=tuple(sorted(method.bands)[:1]))
+            self.starts, self.agreeing = len(bests), sum(b <= min(bests) * (1 + SAME_OBJECTIVE) for b in bests)
+            if "dither.amplitude" not in names:
+                population = first_population(method.members, self._rng.random(len(names)), self._rng)
+                continue
+            # another kind of start: the gains of the best points, hardly any dither, and an offset that is drawn anew
+            method = replace(method, bands=tuple(sorted(method.bands)[:1]))
+            population = population[np.arange(method.members) % min(FEW_BEST, len(population))]
+            population = np.clip(population + NEARBY * self._rng.standard_normal(population.shape), 0.0, 1.0)
+            population[:, names.index("dither.amplitude")] = NO_DITHER * self._rng.random(method.members)
+            if "dither.offset" in names:
+                population[:, names.index("dither.offset")] = self._rng.random(method.members)
         trials = (1 - sum(START_SHARES)) * method.trials * len(names)
         fine = _Phase("fine samples", self._simulator, round(trials))
-        self._finish(np.vstack([*self._ends, given]), fine, method.polish)
-
-    def _finish(self, population: Array, fine: _Phase, iterations: int) -> None:
-        """Search on fine samples: by gradients from the best points, then by trials, and again where those got on."""
-        few = np.vstack([self._best_first(population, self._coarse)[0][:FINE_MEMBERS], *self._polished])
-        population, merits = self._polish(*self._best_first(few, fine.simulator), fine.simulator, iterations)
+        population = self._best_first(np.vstack([*self._ends, given]), self._coarse)[0][:FINE_MEMBERS]
+        ranked = self._best_first(np.vstack([population, *self._polished]), fine.simulator)
+        population, merits = self._polish(*ranked, fine.simulator, method.polish)
         best = merits[0] * (1 - LEAST_IMPROVEMENT)
         population, merits = self.evolve(population[:FINE_MEMBERS], fine)
         if merits[0] < best:
-            self._polish(population, merits, fine.simulator, iterations)
+            self._polish(population, merits, fine.simulator, method.polish)
 
     def best_so_far(self) -> Array:
         """The best of the present phase, which may ask for another band, and of the starts that have ended."""
@@ -551,18 +518,23 @@ class _RacingSearch:
     def _search(self, population: Array, method: Racing, share: float, most: float) -> tuple[Array, Array]:
         """Search from one start on coarse samples: over wide bands first, by gradients, and in the band asked for.
 
-        It ends after the wide bands where the best merit is above `most`.
+        It ends after the wide bands where the best merit is above `most`; there are none without a settling time.
         """
-        *wide, last = _phases(self._simulator, self._spec, method, share)
-        for phase in wide:
+        simulator, spec, trials = self._simulator, self._spec, share * method.trials * len(self._space.names)
+        widest = max(band_share(spec.band, grid.reference) for grid in simulator.grids)
+        wider = [spec.band * b for b in sorted(method.bands) if widest * b < 1] if spec.concerns(SettlingTime) else []
+        stages = [bands for bands in (wider, wider[:1]) if bands]
+        for bands, part in zip(stages, BAND_SHARES, strict=False):
+            phase = _Phase("wide bands", simulator.coarse(spec, bands), round(part * trials))
             population, _ = self.evolve(population, phase)
-        if wide:
+        if stages:
             population, merits = self._best_first(population, self._simulator)
             if merits[0] > most:
                 return population, merits
             population = self._polish(population, merits, self._simulator, method.polish)[0]
             self._polished.append(population[: self._points])
-        return self.evolve(population, last)
+        left = round((1 - sum(BAND_SHARES[: len(stages)])) * trials)
+        return self.evolve(population, _Phase("coarse samples", simulator.coarse(spec), left))
 
     def _best_first(self, population: Array, simulator: Simulator) -> tuple[Array, Array]:
         """A population in the order of its merits on whole responses, and these."""
@@ -574,7 +546,7 @@ class _RacingSearch:
         """Improve the best points of a population, apart from each other, by gradients; the best first."""
         if not iterations or not self._polisher.is_possible:
             return population, merits
-        chosen = _distinct_points(population[merits <= LAGGING * merits[0]])[: self._points]
+        chosen = distinct_points(population[merits <= LAGGING * merits[0]], MIN_DISTANCE)[: self._points]
         self.best = population[0].copy()
         unit, count = self._polisher.improve(population[chosen], simulator, iterations)
         self.count += count
@@ -620,13 +592,13 @@ class _RacingSearch:
         race.cut(max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf)
 
 
-def _distinct_points(unit: Array) -> Indices:
-    """Indices of points in their order; one that lies close to one before it is left out."""
+def distinct_points(unit: Array, distance: float) -> Indices:
+    """Indices of points in their order; one that lies within a distance of one before it is left out."""
     found = list[int]()
     for k in range(len(unit)):
-        if all(np.max(np.abs(unit[k] - unit[other])) > MIN_DISTANCE for other in found):
+        if all(np.max(np.abs(unit[k] - unit[other])) > distance for other in found):
             found.append(k)
-    return np.array(found)
+    return np.array(found, dtype=np.intp)
 
 
 def _is_done(stand: Sequence[tuple[float, float]], merits: Array) -> bool:

@@ -21,7 +21,7 @@ from pneuopt.evaluation.tolerances import TAIL_SHARE
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import MAX_LOCAL_SIMULATIONS, RELAXED_DIGITS, UNSETTLED_EXCESS
+from pneuopt.tuning.tolerances import MAX_LOCAL_SIMULATIONS, UNSETTLED_EXCESS
 
 
 def relaxation_specification(
@@ -93,10 +93,10 @@ def relaxation_row(
     """
     gains = dict(zip(names, point.tolist(), strict=True)) if np.isfinite(value) else dict.fromkeys(names, nan)
     if requirement is None:
-        return {"asked": nan, "needed": nan, "share": _round_outwards(value, upwards=True), **gains}
+        return {"asked": nan, "needed": nan, "share": round_outwards(value, upwards=True), **gains}
     asked, least = user_limit(requirement), requirement.metric.sense is Sense.AT_LEAST
     assert asked is not None
-    needed = _round_outwards(value, upwards=not least)
+    needed = round_outwards(value, upwards=not least)
     return {"asked": asked, "needed": needed, "share": (asked - needed if least else needed - asked) / asked, **gains}
 
 
@@ -111,16 +111,16 @@ def describe_relaxations(rows: Mapping[str, Mapping[str, float]]) -> str:
     return "; or ".join(parts)
 
 
-def _round_outwards(value: float, *, upwards: bool) -> float:
+def round_outwards(value: float, *, upwards: bool, digits: int = 3) -> float:
     """Round a limit so that the design that was found keeps it.
 
     Examples
     --------
-    >>> _round_outwards(0.08112, upwards=True), _round_outwards(1.8467, upwards=False)
+    >>> round_outwards(0.08112, upwards=True), round_outwards(1.8467, upwards=False)
     (0.0812, 1.84)
     """
     if not 0 < abs(value) < inf:
         return value
-    place = 10.0 ** (floor(log10(abs(value))) - RELAXED_DIGITS + 1)
+    place = 10.0 ** (floor(log10(abs(value))) - digits + 1)
     steps = (ceil if upwards else floor)(value / place * (1 - 1e-12 if upwards else 1 + 1e-12))
-    return float(f"{steps * place:.{RELAXED_DIGITS}g}")
+    return float(f"{steps * place:.{digits}g}")

@@ -12,7 +12,7 @@ from pneuopt.control.pid import Form, ParallelForm, SeriesForm, StandardForm, to
 from pneuopt.evaluation.certificate import Certificate, report_margins, report_notes
 from pneuopt.evaluation.evaluate import report_metrics
 from pneuopt.evaluation.limit_cycle import RestCheck
-from pneuopt.evaluation.metric import Requirement, Sense
+from pneuopt.evaluation.metric import Sense
 from pneuopt.evaluation.requirements import (
     metric_name,
     percent_factor,
@@ -173,11 +173,22 @@ def requirement_table(
     """A table of each requirement's claimed and certified figure beside its limit; see `TuningResult.requirements`."""
     import pandas as pd
 
-    limits = {metric_name(q): q for q in spec.limits}
-    rows = {
-        metric_name(q): _requirement_row(limits.get(metric_name(q), q), claimed, certified)
-        for q in (*spec.weights, *spec.limits)
-    }
+    rows = dict[str, dict[str, Any]]()
+    for n, requirement in {metric_name(q): q for q in (*spec.weights, *spec.limits)}.items():
+        values = [requirement_values({n: frame.loc[n].to_numpy(dtype=float)})[n] for frame in (claimed, certified)]
+        k = [int(np.argmax(np.where(np.isnan(v), np.inf, v))) for v in values]
+        claim, proof = (float(v[i]) for v, i in zip(values, k, strict=True))
+        limit, allowed, room = user_limit(requirement), upper_limit(requirement), nan
+        if limit is not None:
+            least = requirement.metric.sense is Sense.AT_LEAST
+            room = user_value(requirement, proof) * allowed - 1 if least else 1 - proof / allowed
+        rows[n] = {
+            "claimed": user_value(requirement, claim),
+            "certified": user_value(requirement, proof),
+            "allowed": nan if limit is None else limit,
+            "room": room,
+            "case": str(certified.columns[k[1]]),
+        }
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=None if rows else [*REQUIREMENT_COLUMNS])
     frame["active"] = [n in active or room <= ACTIVE_ROOM for n, room in frame["room"].items()]
     return frame
@@ -204,24 +215,6 @@ def relaxation_share(result: TuningResult) -> float:
     rooms = known["room"][known["allowed"].notna()]
     unreached = known["certified"].isna().any() or rooms.isna().any()
     return float("inf") if unreached else float(-rooms.min())
-
-
-def _requirement_row(requirement: Requirement, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> dict[str, Any]:
-    """A row of `TuningResult.requirements`, but for "active"."""
-    n = metric_name(requirement)
-    values = [requirement_values({n: frame.loc[n].to_numpy(dtype=float)})[n] for frame in (claimed, certified)]
-    k = [int(np.argmax(np.where(np.isnan(v), np.inf, v))) for v in values]
-    claim, proof = (float(v[i]) for v, i in zip(values, k, strict=True))
-    limit, allowed = user_limit(requirement), upper_limit(requirement)
-    least = requirement.metric.sense is Sense.AT_LEAST
-    room = nan if limit is None else (user_value(requirement, proof) * allowed - 1 if least else 1 - proof / allowed)
-    return {
-        "claimed": user_value(requirement, claim),
-        "certified": user_value(requirement, proof),
-        "allowed": nan if limit is None else limit,
-        "room": room,
-        "case": str(certified.columns[k[1]]),
-    }
 
 
 def report_tuning(
@@ -289,16 +282,14 @@ def _other_form(parameters: ParameterSet) -> str:
         derivative = f"Kd {same.Kd:.4g}, Tf {same.Tf:.4g} s" if same.Kd else "no derivative"
         return f"parallel form: Kp {same.Kp:.4g}, Ki {same.Ki:.4g}, {derivative}"
     gains = ParallelForm(*own)
-    return f"standard form: {_standard_form(gains)}" if gains.Kp else "no standard form: Kp is zero"
-
-
-def _standard_form(gains: ParallelForm) -> str:
+    if not gains.Kp:
+        return "no standard form: Kp is zero"
     form = to_standard(gains)
     integral = f", Ti {form.Ti:.4g} s" if gains.Ki else ", no integral"
     derivative = f", Td {form.Td:.4g} s, N {form.N:.4g} (ISA's ratio Td/Tf)" if gains.Kd else ", no derivative"
     if 0 < abs(form.N) < MIN_DERIVATIVE_RATIO:
         derivative = f", next to no derivative (Kd/Tf is {100 * abs(form.N):.2g} % of Kp)"
-    return f"Kp {form.Kp:.4g}{integral}{derivative}"
+    return f"standard form: Kp {form.Kp:.4g}{integral}{derivative}"
 
 
 def report_active(requirements: "pd.DataFrame", active: Sequence[str], parameters: ParameterSet) -> Report:

@@ -8,7 +8,7 @@ may hold where the best one hunts, creeps, or breaks a limit after its horizon.
 """
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
@@ -39,7 +39,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback, Status, provenance
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, SearchResult, TuningTask, describe_agreement
-from pneuopt.tuning.racing import compute_merits
+from pneuopt.tuning.racing import compute_merits, distinct_points
 from pneuopt.tuning.relaxation import (
     limit_excess,
     limits_with_settling,
@@ -58,17 +58,16 @@ from pneuopt.tuning.result import (
 from pneuopt.tuning.simulator import Simulator, to_records, worst_values
 from pneuopt.tuning.space import Space
 from pneuopt.tuning.tolerances import (
-    CANDIDATE_DISTANCE,
     HORIZON_FACTORS,
     MARGINS_TO_TRY,
     MAX_CANDIDATES,
-    MAX_CERTIFIED_EXCESS,
     MAX_CERTIFIED_POINTS,
     MAX_REFINED_SEARCHES,
-    MAX_TOLD,
     MEMBERS_A_GAIN,
+    NEARBY,
     RELAXATION_MARGIN,
     ROUNDING_ROUNDS,
+    SAME_OBJECTIVE,
     SAMPLING_TOLERANCE,
     TRIALS_A_GAIN,
 )
@@ -77,6 +76,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+CONTACT_REMEDY = "shorten the horizon, take a smaller step, or start elsewhere, Step(..., start={'position': ...})"
 # What is said of a design that has no value of a metric; where nothing stands here, it "has no" that metric.
 WORDS_WITHOUT_VALUE = {
     SettlingTime.metric.name: "does not settle within its horizon",
@@ -87,10 +87,14 @@ TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.met
 
 @dataclass(frozen=True, eq=False)
 class Certifier:
-    """Make the certificate of gains: their independent simulation, beside the claim of the method's search, if any."""
+    """Make the certificate of gains: their independent simulation, beside the claim of the method's search, if any.
+
+    Messages name `most_told` defects.
+    """
 
     task: TuningTask
     method: Method | None = None
+    most_told: int = 3
 
     def certify(self, simulator: Simulator, found: SearchResult, point: Array) -> TuningResult:
         """Simulate a point by both simulations; the result has its gains where the certificate holds."""
@@ -117,45 +121,42 @@ class Certifier:
         """The result of parameters, with the given ones; `found` is None where nobody has claimed the figures."""
         import pandas as pd
 
+        method, spec = (self.method,) if self.method is not None else (), self.task.spec
         ripple = ("SettlingTimeRaw", "Ripple") if self.task.loop.dither_period(parameters) else ()
-        shown = [n for n in METRICS if n in (*TABLE_METRICS, *ripple, *self.task.spec.metric_names)]
+        shown = [n for n in METRICS if n in (*TABLE_METRICS, *ripple, *spec.metric_names)]
         claimed = claimed.loc[shown]
         try:
             evaluations, contacts = self._evaluate(parameters)
             within = self._compare(found, claimed, tabulate_metrics(evaluations).loc[shown]).converged
-            allowed = self.task.spec.limit(SteadyStateError)
+            allowed = spec.limit(SteadyStateError)
             rest_error = allowed if np.isfinite(allowed) else 0.0  # how far it may rest off the reference
             goes_on = (within or found is None) and not contacts
-            proof = judge_evaluations(evaluations, self.task.spec.band, rest_error, continues=goes_on)
+            proof = judge_evaluations(evaluations, spec.band, rest_error, continues=goes_on)
             certified, known = proof.metrics.loc[shown], proof.metrics.to_dict()
             slopes = {f"friction_slope[{n}]": v["FrictionSlope"] for n, v in known.items() if "FrictionSlope" in v}
-            status = _contact_status(contacts) if contacts else self._certificate_status(found, claimed, proof)
+            stops = (*dict.fromkeys(contacts), CONTACT_REMEDY) if contacts else ()  # there the model no longer holds
+            status = Status(Code.NOT_CERTIFIED, stops) if stops else self._certificate_status(found, claimed, proof)
         except ConvergenceError as error:
             proof, certified, contacts, slopes, within = None, claimed * np.nan, [], {}, False
             status = Status(Code.NOT_CERTIFIED, (str(error),))
         deviation = (claimed - certified).abs().max(axis=1).items() if found is not None else ()
-        marks = {"contacts": float(len(contacts))} if contacts else {}
         fails_late = within and not contacts and not status.converged
-        marks |= {"fails_late": 1.0} if fails_late else {}
+        marks = {"contacts": float(len(contacts))} if contacts else {"fails_late": 1.0} if fails_late else {}
         active, stats, agreement = ((), {}, None) if found is None else (found.active, found.figures, found.agreement)
         return TuningResult(
             self.task.space.parameters,
             claimed,
             certified,
-            requirement_table(self.task.spec, claimed, certified, active),
+            requirement_table(spec, claimed, certified, active),
             pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.task.space.names], dtype=float),
             active,
             status,
             {**stats, **{f"deviation.{n}": float(v) for n, v in deviation}, **marks, **slopes},
-            self._provenance(),
+            provenance(*method, *spec.weights, *spec.limits, *self.task.references, *self.task.scenarios.items()),
             proof,
             agreement=agreement,
             refusal=Refusal.END_STOP if contacts else Refusal.LATE if fails_late else None,
         )
-
-    def _provenance(self) -> dict[str, str]:
-        method, spec = (self.method,) if self.method is not None else (), self.task.spec
-        return provenance(*method, *spec.weights, *spec.limits, *self.task.references, *self.task.scenarios.items())
 
     def _evaluate(self, parameters: ParameterSet) -> tuple[tuple[CaseEvaluation, ...], list[str]]:
         """Every case over its horizon, and the warnings of end stops and emptied chambers that the responses met."""
@@ -177,17 +178,17 @@ class Certifier:
         defects = dict.fromkeys(f.sentence for f in proof.findings if f.defect not in self.task.accept)
         if (found is not None and not found.status.converged) or not defects:
             details = [f"accepted: {f.sentence}" for f in proof.findings] if status.converged else proof.notes
-            return status.with_details(*details[:MAX_TOLD])
+            return status.with_details(*details[: self.most_told])
         words = dict.fromkeys(f.defect.value for f in proof.findings if f.defect not in self.task.accept)
         if found is None:
             broken = () if status.converged else status.sentences
-            return Status(Code.NOT_CERTIFIED, (*list(defects)[:MAX_TOLD], *broken))
+            return Status(Code.NOT_CERTIFIED, (*list(defects)[: self.most_told], *broken))
         remedy = f"limit SettlingTime or MaxSensitivity, or accept it by name: {', '.join(map(repr, words))}"
         if Defect.STANDS_STILL.value in words and self.task.spec.limits:
             limits = " and ".join(metric_name(q) for q in self.task.spec.limits)
             remedy = f"the search found only designs that stand still: {limits} may leave no room to move; relax them"
         broken = () if status.converged else status.sentences[:1]
-        return Status(Code.NOT_CERTIFIED, (*list(defects)[:MAX_TOLD], *broken, remedy))
+        return Status(Code.NOT_CERTIFIED, (*list(defects)[: self.most_told], *broken, remedy))
 
     def _compare(self, found: SearchResult | None, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
         """Whether the certified metrics keep the limits and agree with the claimed objective, where there is one."""
@@ -267,15 +268,9 @@ def objectives_agree(certified: float, claimed: float, optimum: float, resolutio
     (False, False)
     """
     lowest, highest = claimed, min(claimed, optimum)
-    above = lowest - MAX_CERTIFIED_EXCESS * abs(lowest) - resolution
-    below = highest + MAX_CERTIFIED_EXCESS * abs(highest) + resolution
+    above = lowest - SAME_OBJECTIVE * abs(lowest) - resolution
+    below = highest + SAME_OBJECTIVE * abs(highest) + resolution
     return above <= certified <= below
-
-
-def _contact_status(contacts: Sequence[str]) -> Status:
-    """The status of a design whose response meets an end stop or empties a chamber, where the model no longer holds."""
-    remedy = "shorten the horizon, take a smaller step, or start elsewhere, Step(..., start={'position': ...})"
-    return Status(Code.NOT_CERTIFIED, (*dict.fromkeys(contacts), remedy))
 
 
 # Defects of designs that no requirement makes move to the reference and stay there.
@@ -315,16 +310,22 @@ class Search:
     def run(self, start: Array | None = None) -> TuningResult:
         """Search from a point, by default the given gains, until a rounded design is certified."""
         simulator = self.simulator
-        try:
-            if start is None:
-                self._report_start(simulator)
+        try:  # one of the cases in which the given gains never settle may be mistyped
+            rows = simulator.table(self.space.start, self.spec) if start is None else []
+            bad = [k for k, row in enumerate(rows) if not np.isfinite(row["SettlingTime"])]
+            if bad:
+                word = "runs away" if np.isinf(rows[bad[0]]["SettlingTime"]) else "never settles"
+                where = f"{simulator.cases[bad[0]].label}, {len(bad)} of {len(rows)} cases"
+                self.progress(f"with the given gains the loop {word} at {where}; searching on")
         except KeyboardInterrupt:
             return self._result_so_far(simulator, _interruption_result(self.space.start))
         result, start, agreement = None, self.space.start if start is None else start, None
         finder = self
         for attempt in range(MARGINS_TO_TRY):
             margin = min(self.method.margin * 2**attempt, 0.5)
-            found = self._find_with(finder, margin, start, attempt)
+            found = finder.find(margin, start, attempt)
+            if finder is not self and found.is_complete:
+                found = self.restate(found)
             simulator = self.simulator
             agreement = agreement or found.agreement  # later searches begin near the first one's point
             found = replace(found, stats={**found.stats, "margin": margin}, agreement=agreement)
@@ -345,14 +346,6 @@ class Search:
             finder = self.lengthen(rests=found.status.converged) if late and attempt + 1 < MARGINS_TO_TRY else finder
         assert result is not None
         return result
-
-    def _find_with(self, finder: "Search", margin: float, start: Array, attempt: int) -> SearchResult:
-        """What a search for this one's task finds, over a longer horizon perhaps; its objective is this one's."""
-        try:
-            found = finder.find(margin, start, attempt)
-        except KeyboardInterrupt:  # in a method that holds no best point yet
-            return _interruption_result(start)
-        return found if finder is self or not found.is_complete else self.restate(found)
 
     def among_resting(self) -> "Search":
         """The search among responses that settle within the horizon, on the same compiled simulator."""
@@ -397,25 +390,23 @@ class Search:
         Shorter steps leave an optimum near the one that longer steps found, so that search is as one after a refusal.
         """
         spec = self.tighten(margin)
-        found = self.method.find(self.task, self.simulator, spec, start, attempt, self.progress)
-        for _ in range(MAX_REFINED_SEARCHES):
-            coarser = self.simulator
-            finer = self._resolve(found.point) if found.is_complete else coarser
-            if finer is coarser:
-                break
-            self.simulator = finer
-            if found.uses_simulator:  # otherwise the method has samples of its own
-                self.progress("the response is too fast for the samples of the search; searching again on closer ones")
-                attempt = attempt if finer.grids is not coarser.grids else max(1, attempt)
-                found = self.method.find(self.task, finer, spec, found.point, attempt, self.progress)
+        try:
+            found = self.method.find(self.task, self.simulator, spec, start, attempt, self.progress)
+            for _ in range(MAX_REFINED_SEARCHES):
+                coarser = self.simulator
+                others = (coarser.refine(found.point), coarser.shorten_steps()) if found.is_complete else ()
+                needed = (s for s in others if s is not coarser and not self._agree(s, found.point))
+                self.simulator = next(needed, coarser)
+                if self.simulator is coarser:
+                    break
+                if found.uses_simulator:  # otherwise the method has samples of its own
+                    reason = "the response is too fast for the samples of the search"
+                    self.progress(f"{reason}; searching again on closer ones")
+                    attempt = attempt if self.simulator.grids is not coarser.grids else max(1, attempt)
+                    found = self.method.find(self.task, self.simulator, spec, found.point, attempt, self.progress)
+        except KeyboardInterrupt:  # in a method that holds no best point yet
+            return _interruption_result(start)
         return found
-
-    def _resolve(self, point: Array) -> Simulator:
-        """The simulator, or one with closer samples or shorter steps where a point's requirements need them."""
-        for finer in (self.simulator.refine(point), self.simulator.shorten_steps()):
-            if finer is not self.simulator and not self._agree(finer, point):
-                return finer
-        return self.simulator
 
     def _agree(self, finer: Simulator, point: Array) -> bool:
         """Whether the requirements have the same values on closer samples, or with shorter steps."""
@@ -426,15 +417,6 @@ class Search:
             if n in fine and not np.isclose(coarse[n], fine[n], rtol=SAMPLING_TOLERANCE, atol=least, equal_nan=True):
                 return False
         return True
-
-    def _report_start(self, simulator: Simulator) -> None:
-        """Report cases in which the loop never settles with the given gains: one of them may be mistyped."""
-        times = [row["SettlingTime"] for row in simulator.table(self.space.start, self.spec)]
-        bad = [k for k, t in enumerate(times) if not np.isfinite(t)]
-        if bad:
-            word = "runs away" if np.isinf(times[bad[0]]) else "never settles"
-            where = f"{simulator.cases[bad[0]].label}, {len(bad)} of {len(times)} cases"
-            self.progress(f"with the given gains the loop {word} at {where}; searching on")
 
     def certify_roundings(self, found: SearchResult, margin: float) -> TuningResult:
         """Certify roundings of the gains found, until one holds; otherwise the last one's result."""
@@ -491,7 +473,7 @@ class Search:
             yield found.point
             return
         nearest = self.space.round_point(found.point, digits)
-        points, most = nearest[None], found.optimum * (1 + MAX_CERTIFIED_EXCESS)
+        points, most = nearest[None], found.optimum * (1 + SAME_OBJECTIVE)
         for _ in range(ROUNDING_ROUNDS):
             values = simulator.values(points, spec)
             order, rows = np.argsort(compute_merits(values, spec, self.task.horizon)), to_records(values)
@@ -546,10 +528,10 @@ def relax(search: Search, result: TuningResult) -> TuningResult:
         found = _continue_from_feasible(search, second.point)
         if found.status.converged or found.status.code is Code.INTERRUPTED:
             return found
-    method, points = (
-        search.method.shorten(RELAXATION_MARGIN),
-        _rank_points(search, end_point(result, search.space), second.point),
-    )
+    method, stable = search.method.shorten(RELAXATION_MARGIN), spec.with_stability()
+    points = [end_point(result, search.space), second.point]
+    excess = limit_excess(search.simulator.values(np.array(points), stable), stable)
+    points = [points[k] for k in np.argsort(excess, kind="stable").tolist()]  # the one closest to the limits first
     for q in spec.limits:
         search.progress(f"finding how far {metric_name(q)} alone has to give way")
         found = search.with_specification(relaxation_specification(spec, q, search.task.references), method).run(
@@ -575,13 +557,6 @@ def relax(search: Search, result: TuningResult) -> TuningResult:
     counts = {"confirmation.simulations": float(second.simulations), "confirmation.share": second.share}
     closest = replace(closest, stats={**result.stats, **closest.stats, **counts})
     return with_relaxations(closest, rows, describe_confirmation(second.simulations))
-
-
-def _rank_points(search: Search, *points: Array) -> list[Array]:
-    """Points, the one closest to the limits first."""
-    stable = search.spec.with_stability()
-    excess = limit_excess(search.simulator.values(np.array(points), stable), stable)
-    return [points[k] for k in np.argsort(excess, kind="stable").tolist()]
 
 
 def _interrupt(result: TuningResult) -> TuningResult:
@@ -700,12 +675,9 @@ def find_candidates(
         lambda _: False,
         lambda excess: progress(f"searching for other designs that keep all limits: {_describe_closest(excess)}"),
     )
-    chosen = list[Array]()
-    for k in np.argsort(rooms, kind="stable").tolist():
-        unit = space.to_unit(kept[k])
-        if all(np.max(np.abs(unit - space.to_unit(other))) > CANDIDATE_DISTANCE for other in chosen):
-            chosen.append(kept[k])
-    return chosen[:MAX_CANDIDATES], count
+    best = np.reshape(kept, (-1, len(space.names)))[np.argsort(rooms, kind="stable")]
+    unit = np.reshape([space.to_unit(point) for point in best], best.shape)
+    return list(best[distinct_points(unit, NEARBY)][:MAX_CANDIDATES]), count
 
 
 def _minimise_excess(

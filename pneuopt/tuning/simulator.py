@@ -11,7 +11,6 @@ which the ripple is read.
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +23,6 @@ from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
 from pneuopt.dynamics.tolerances import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.margins import (
-    MarginFunction,
     batch_margin_function,
     first_largest,
     lowest_noise_frequency,
@@ -54,11 +52,8 @@ from pneuopt.tuning.space import (
     starts_before_step,
 )
 from pneuopt.tuning.tolerances import (
-    COARSE_SAMPLES_A_PERIOD,
     KEPT_STATES,
-    MAX_CHUNK_LANES,
     MAX_LOOP_SUBSTEPS,
-    MAX_MIXED_LANES,
     MAX_SAMPLE_ANGLE,
     STIFFEST_CORNERS,
 )
@@ -111,72 +106,59 @@ class PointFinder:
 
         Each grid comes with its lanes; p (m, n_parameters) and averaging times (m,) [s], 0 without, are the lanes'.
         """
-        found = [self._points(grid, rows, p, periods, response_points) for grid, rows in grids]
-        x, u = (np.empty((len(a), len(p), a.shape[2])) for a in found[0])
-        for (_, rows), (own_x, own_u) in zip(grids, found, strict=True):
-            x[:, rows], u[:, rows] = own_x, own_u
+        plant, is_curved = self.loop.plant, not is_affine(self.loop.plant)
+        slides, order = is_curved and plant.axis is not None, list(self.loop.parameters)
+        count = 1 + is_curved + slides
+        x, u = (np.zeros((count, len(p), len(signals))) for signals in (plant.states, plant.inputs))
+        for grid, rows in grids:
+            own = response_points.select(rows)
+            end, reach = self._at_end(grid, p[rows], periods[rows], own)
+            states = list[Array]()
+            if is_curved:  # before the step, with the dither switched off
+                quiet, held, none = p[rows], np.zeros((len(rows), 1, grid.u.shape[1])), np.zeros((len(rows), 1))
+                quiet[:, [order.index(n) for n in (DITHER_AMPLITUDE, DITHER_OFFSET) if n in order]] = 0.0
+                held[:, 0, 0] = grid.reference.origin
+                start = own.states[:, 0]
+                control = self.rollout.run(start, held, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
+                states.append(np.column_stack([start[:, : len(plant.states)], control]))
+            if slides:
+                states.append(self._sliding(grid, p[rows], periods[rows], own, reach))
+            along = np.array([*states, end])
+            x[:, rows] = along[:, :, :-1]
+            disturbances = dict(zip(names(self.loop.inputs), grid.u[-1].tolist(), strict=True))
+            for k, name in enumerate(names(plant.inputs)):
+                u[:, rows, k] = along[:, :, -1] if name == self.loop.command.name else disturbances[name]
+                if name != self.loop.command.name and is_curved:
+                    u[0, rows, k] = 0.0  # the disturbance has not begun
         return x, u
 
-    def _points(
-        self, grid: ReferenceGrid, rows: Indices, p: Array, periods: Array, response_points: ResponsePoints
-    ) -> tuple[Array, Array]:
-        """Points of lanes on one grid, states and inputs, shapes (k, m, n)."""
-        own, p = response_points.select(rows), p[rows]
-        states, (end, reach) = list[Array](), self._at_end(grid, p, periods[rows], own)
-        if not is_affine(self.loop.plant):
-            states.append(self._at_start(grid, p, own))
-            if self.loop.plant.axis is not None:
-                states.append(self._sliding(grid, p, periods[rows], own, reach))
-        states.append(end)
-        along, plant = np.array(states), self.loop.plant
-        u = np.zeros((len(along), len(p), len(plant.inputs)))
-        disturbances = dict(zip(names(self.loop.inputs), grid.u[-1].tolist(), strict=True))
-        for k, name in enumerate(names(plant.inputs)):
-            u[:, :, k] = along[:, :, -1] if name == self.loop.command.name else disturbances[name]
-            if name != self.loop.command.name and len(along) > 1:
-                u[0, :, k] = 0.0  # the disturbance has not begun
-        return along[:, :, :-1], u
-
-    def _at_start(self, grid: ReferenceGrid, p: Array, own: ResponsePoints) -> Array:
-        """The plant's state and the command before the step, shape (m, n_plant_states + 1), dither switched off."""
-        order, quiet = list(self.loop.parameters), p.copy()
-        quiet[:, [order.index(n) for n in (DITHER_AMPLITUDE, DITHER_OFFSET) if n in order]] = 0.0
-        u = np.zeros((len(p), 1, grid.u.shape[1]))
-        u[:, 0, 0] = grid.reference.origin
-        none = np.zeros((len(p), 1))
-        control = self.rollout.run(own.states[:, 0], u, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
-        return np.column_stack([own.states[:, 0, : len(self.loop.plant.states)], control])
-
     def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints, reach: Array) -> Array:
-        """The plant's state and the command at the fastest sample, without ripple."""
-        begin = np.maximum(own.fastest - np.round(periods / 2 / grid.spacing).astype(np.intp), 0)
-        out, ends = self._run_up_to(grid, p, begin, own, periods > 0)
-        for period, rows in _by_period(periods):
-            along = self._period(grid, ends[rows], p[rows], grid.t[begin[rows]], period)
-            share = (grid.t[own.fastest[rows]] - grid.t[begin[rows]]) / period
-            _put_finite(out, rows, move_towards(_at(along, share), _mean(along), reach[rows]))
-        return out
+        """The plant's state and the command at the fastest sample, without ripple.
 
-    def _run_up_to(
-        self, grid: ReferenceGrid, p: Array, last: Indices, own: ResponsePoints, goes_on: Mask
-    ) -> tuple[Array, Array]:
-        """The plant's state and the command at a sample of each lane, and the loop's state there.
-
-        Lanes wait for the latest between two samples of a held controller, which would act again at a sample; it has
-        not acted yet in lanes that go on from there.
+        Lanes are run up to it, or to half a period before it, and wait there for the latest between two samples of a
+        held controller, which would act again at a sample; it has not acted yet in lanes that go on from there.
         """
-        kept, rows = last // KEPT_STATES, np.arange(len(p))
-        left = (last - kept * KEPT_STATES)[:, None]
-        k, (u, t, h) = np.arange(left.max() + 1), grid.pad(len(grid.t))
-        at = kept[:, None] * KEPT_STATES + np.minimum(k, left)
-        waits = k + goes_on[:, None] > left
+        begin = np.maximum(own.fastest - np.round(periods / 2 / grid.spacing).astype(np.intp), 0)
+        kept, lanes = begin // KEPT_STATES, np.arange(len(p))
+        left = (begin - kept * KEPT_STATES)[:, None]
+        number, (u, t, h) = np.arange(left.max() + 1), grid.pad(len(grid.t))
+        at = kept[:, None] * KEPT_STATES + np.minimum(number, left)
+        waits = number + (periods > 0)[:, None] > left
         instants = t[at] + (0.5 * grid.spacing * waits if self.loop.pid.sample_time is not None else 0.0)
         with np.errstate(all="ignore"):
             substeps = rk4_substeps(self.rate, grid.spacing)
-            steps = np.where(k < left, h[at], 0.0)
-            run = self.rollout.run(own.states[rows, kept], u[at], p, instants, steps, substeps=substeps)
-        plant = run.x_end[:, : len(self.loop.plant.states)]
-        return np.column_stack([plant, run.y[:, -1, CONTROL_OUTPUT]]), run.x_end
+            steps = np.where(number < left, h[at], 0.0)
+            run = self.rollout.run(own.states[lanes, kept], u[at], p, instants, steps, substeps=substeps)
+        ends = run.x_end
+        out = np.column_stack([ends[:, : len(self.loop.plant.states)], run.y[:, -1, CONTROL_OUTPUT]])
+        for period, rows in _by_period(periods):
+            along = self._period(grid, ends[rows], p[rows], grid.t[begin[rows]], period)
+            share = (grid.t[own.fastest[rows]] - grid.t[begin[rows]]) / period
+            place, lane = share * (along.shape[1] - 1), np.arange(len(along))
+            k = np.minimum(place.astype(np.intp), along.shape[1] - 2)
+            there = along[lane, k] + (place - k)[:, None] * (along[lane, k + 1] - along[lane, k])
+            _put_finite(out, rows, move_towards(there, _mean(along), reach[rows]))
+        return out
 
     def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints) -> tuple[Array, Array]:
         """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.
@@ -217,13 +199,6 @@ def _by_period(periods: Array) -> Iterator[tuple[float, Indices]]:
 
 def _mean(along: Array) -> Array:
     return np.asarray(np.trapezoid(along, axis=1) / (along.shape[1] - 1))
-
-
-def _at(along: Array, share: Array) -> Array:
-    """Each lane's values a share of its period after the first, linear between instants, shape (m, n_values)."""
-    at, lane = share * (along.shape[1] - 1), np.arange(len(along))
-    k = np.minimum(at.astype(np.intp), along.shape[1] - 2)
-    return np.asarray(along[lane, k] + (at - k)[:, None] * (along[lane, k + 1] - along[lane, k]))
 
 
 def _put_finite(out: Array, rows: Indices, values: Array) -> None:
@@ -354,7 +329,12 @@ class Simulator:
         self._grid_index = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
         self.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in self.grids]
-        self.robustness = self._margin_function(references)  # about `operating_points`
+        horizon, h = max(r.horizon for r in references), loop.pid.sample_time
+        slowest, lowest = 1 / horizon, lowest_noise_frequency(horizon)
+        fastest = max(self._rate, 1e3 * slowest, MAX_SAMPLE_ANGLE / h if h else 0.0)
+        # from the frequency on at which a slow integral swings against a resting drive
+        slow, fast = np.geomspace(3e-5 * slowest, 0.97 * lowest, 60), np.geomspace(lowest, fastest, 150)
+        self.robustness = batch_margin_function(loop, np.concatenate([slow, fast]), lowest)  # about `operating_points`
         self._find_points = PointFinder(loop, self.rollout, self._rate)
 
     def coarse(self, spec: Specification, bands: Sequence[Band] = ()) -> "Simulator":
@@ -370,7 +350,7 @@ class Simulator:
         )
         if not self._is_refined:
             part.grids = reference_grids(
-                self.loop, [g.reference for g in self.grids], self.space.parameters, COARSE_SAMPLES_A_PERIOD
+                self.loop, [g.reference for g in self.grids], self.space.parameters, SAMPLES_A_DITHER_PERIOD // 2
             )
         part.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in part.grids]
         return part
@@ -392,8 +372,14 @@ class Simulator:
         """
         if self.loop.pid.sample_time is not None or any(self.dither_periods()):
             return self
+
+        def read_signal(case: int, grid: ReferenceGrid) -> Array | None:
+            p, start = self.lanes(point[None], np.zeros(1, dtype=np.intp), np.full(1, case))
+            found, sound = self.sampled.run(grid, start, p, rk4_substeps(self._rate, grid.spacing))
+            return found.y[0, :, SIGNAL_OUTPUT] if sound[0] else None
+
         part = copy.copy(self)
-        part.grids = refine_grids(self.grids, self.cases_by_grid(), partial(self._signal, point))
+        part.grids = refine_grids(self.grids, self.cases_by_grid(), read_signal)
         part._is_refined = part.grids is not self.grids
         return part if part._is_refined else self
 
@@ -406,12 +392,6 @@ class Simulator:
         part.substeps = [rk4_substeps(part._rate, grid.spacing) for grid in part.grids]
         part._find_points = PointFinder(self.loop, self.rollout, part._rate)
         return part
-
-    def _signal(self, point: Array, case: int, grid: ReferenceGrid) -> Array | None:
-        """The measured signal of a case at the samples of a grid; None where it runs away."""
-        p, start = self.lanes(point[None], np.zeros(1, dtype=np.intp), np.full(1, case))
-        found, sound = self.sampled.run(grid, start, p, rk4_substeps(self._rate, grid.spacing))
-        return found.y[0, :, SIGNAL_OUTPUT] if sound[0] else None
 
     def cases_by_grid(self) -> list[Mask]:
         """Which cases run on each grid, that is on each reference: a mask of shape (n_cases,) a grid."""
@@ -509,14 +489,17 @@ class Simulator:
         u, t, h = (np.array(arrays)[place] if len(used) > 1 else arrays[0] for arrays in padded)
         return u, t, h, max(self.substeps[g] for g in used)
 
-    def _chunks(self, case: Indices) -> Iterator[Indices]:
-        """Indices of lanes that run together: all at once if they are few, otherwise those on the same grid."""
-        if 0 < len(case) <= MAX_MIXED_LANES:
+    def _chunks(self, case: Indices, few: int = 32, most: int = 128) -> Iterator[Indices]:
+        """Indices of lanes that run together: all at once if they are few, otherwise those on the same grid.
+
+        So few are padded to the longest record; more than `most` do not fit a processor's cache.
+        """
+        if 0 < len(case) <= few:
             yield np.arange(len(case))
             return
         for g in np.unique(self._grid_index[case]).tolist():
             own = np.flatnonzero(self._grid_index[case] == g)
-            yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
+            yield from np.split(own, np.arange(most, len(own), most))
 
     def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: Band) -> Responses:
         """The responses of candidates on every case that ran elsewhere; `shape` is (m, n_cases).
@@ -549,14 +532,6 @@ class Simulator:
         """Samples of the largest speed, as `ResponsePoints` has them; zeros for a plant without an axis."""
         k = speed_output(self.loop, self.sampled.channels)
         return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period)
-
-    def _margin_function(self, references: Sequence[Reference]) -> MarginFunction:
-        """Margins of many loops, read from the frequency on at which a slow integral swings against a resting drive."""
-        horizon, h = max(r.horizon for r in references), self.loop.pid.sample_time
-        slowest, lowest = 1 / horizon, lowest_noise_frequency(horizon)
-        fastest = max(self._rate, 1e3 * slowest, MAX_SAMPLE_ANGLE / h if h else 0.0)
-        slow, fast = np.geomspace(3e-5 * slowest, 0.97 * lowest, 60), np.geomspace(lowest, fastest, 150)
-        return batch_margin_function(self.loop, np.concatenate([slow, fast]), lowest)
 
     def _fastest_eigenvalue(self, references: Sequence[Reference]) -> float:
         """The rate of the fastest mode over the gains' box and all plants [1/s].

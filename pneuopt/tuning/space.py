@@ -45,7 +45,6 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.tolerances import (
     BOUND_DISTANCE,
     MAX_LOOP_SUBSTEPS,
-    MAX_ROUNDING_POINTS,
     RUNAWAY_LEVEL,
     SEARCH_TOLERANCE,
     WORST_MERIT,
@@ -137,10 +136,10 @@ class Space:
             found += [np.where(np.arange(len(rounded)) == k, v, rounded) for v in sides if low <= v <= up]
         return np.reshape(found, (-1, len(rounded)))
 
-    def neighbourhood(self, rounded: Array, digits: int) -> Array:
+    def neighbourhood(self, rounded: Array, digits: int, most: int = 5**4) -> Array:
         """The points that differ from a rounded one by up to two last places in every coordinate, shape (m, n).
 
-        Where they are more than `MAX_ROUNDING_POINTS`, that many are drawn at random.
+        Where they are more than `most`, those of four gains, that many are drawn at random.
 
         Examples
         --------
@@ -150,8 +149,8 @@ class Space:
         [0.3998, 0.3999, 0.4, 0.4001]
         """
         n, sides = len(rounded), np.arange(-2, 3)
-        few = len(sides) ** n <= MAX_ROUNDING_POINTS
-        drawn = np.random.default_rng(0).integers(-2, 3, (MAX_ROUNDING_POINTS, n))
+        few = len(sides) ** n <= most
+        drawn = np.random.default_rng(0).integers(-2, 3, (most, n))
         offsets = np.array(list(itertools.product(sides, repeat=n))) if few else np.unique(drawn, axis=0)
         places = np.array([_last_place(value, digits) for value in rounded.tolist()])
         points = [[_round_digits(v, digits) for v in row] for row in (rounded + offsets * places).tolist()]
@@ -206,6 +205,13 @@ def whole_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     return Space(loop.complete(parameters).select(loop.parameters), ())
 
 
+def shapes_linear_loop(loop: ClosedLoop, n: str) -> bool:
+    """Whether the linearised loop depends on a parameter of the controller."""
+    section, _, name = n.partition(".")
+    acting = {"dither", "position_loop", "schedule", *(part.section for part in loop.controller.acting_always)}
+    return section in acting or (section == "pid" and name in loop.pid.form.gains)
+
+
 def clip_level(loop: ClosedLoop, p: ParameterSet) -> float:
     """The largest size of a command that the controller's own limits let through [its unit]; inf without limits."""
     return max(abs(p.value("pid.lower")), abs(p.value("pid.upper"))) if loop.pid.limits else float("inf")
@@ -243,23 +249,18 @@ def rk4_substeps(rate: float, h: float) -> int:
 
 
 def starts_before_step(cases: Sequence[TuningCase], loop: ClosedLoop, space: Space) -> list[Array | None]:
-    """Of each case the state before the step; references that begin alike share it, as a rest takes milliseconds."""
-    found = dict[tuple[Hashable, ...], Array | None]()
+    """Of each case the state before the step (n_states,), None where it depends on the gains.
+
+    References that begin alike share it, as a rest takes milliseconds.
+    """
+    found, scale = dict[tuple[Hashable, ...], Array | None](), np.array([q.nominal for q in loop.states])
     keys = [(case.scenario, case.reference.origin, *sorted(case.reference.start.items())) for case in cases]
     for key, case in zip(keys, cases, strict=True):
         if key not in found:
-            found[key] = _gain_independent_rest(case, loop, space)
+            other = [space.from_unit(np.full(len(space.names), 0.7))] if space.names else []
+            first, *moved = (case.initial(loop, space.parameters_at(point)) for point in (space.start, *other))
+            found[key] = first if all(np.all(np.abs(first - x) <= 1e-9 * scale) for x in moved) else None
     return [found[key] for key in keys]
-
-
-def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> Array | None:
-    """The state before the step, shape (n_states,); None where it depends on the gains."""
-    if not space.names:
-        return case.initial(loop, space.parameters)
-    other = space.from_unit(np.full(len(space.names), 0.7))
-    first, second = (case.initial(loop, space.parameters_at(point)) for point in (space.start, other))
-    scale = np.array([q.nominal for q in loop.states])
-    return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
 
 
 # Indices of the outputs that are run: the measured signal, the command, then the meter's channels one after another;
@@ -509,23 +510,19 @@ def refine_grids(
     """
     finer = []
     for grid, own in zip(grids, cases, strict=True):
-        found = [_resolve(grid, case, read).t for case in np.flatnonzero(own).tolist()]
+        reference, found = grid.reference, list[Array]()
+        change = reference.final, reference.nominal_size, reference.at
+        for case in np.flatnonzero(own).tolist():
+            closer = grid
+            for _ in range(MAX_REFINEMENTS):
+                signal = read(case, closer)
+                instants = signal if signal is None else refine_instants(closer.t, signal, *change, SEARCH_TOLERANCE)
+                if instants is None:
+                    break
+                closer = closer.at(instants)
+            found.append(closer.t)
         t = np.unique(np.concatenate(found))
         least = 1e-6 * grid.spacing  # the same instant, but for rounding
         finer.append(grid.at(spread_instants(grid.t, t[np.append(True, np.diff(t) > least)], grid.reference.at)))
     more = any(len(new.t) > len(old.t) for new, old in zip(finer, grids, strict=True))
     return finer if more else grids
-
-
-def _resolve(grid: ReferenceGrid, case: int, read: Callable[[int, ReferenceGrid], Array | None]) -> ReferenceGrid:
-    """The samples of a case, with others where its response changes fast."""
-    reference = grid.reference
-    for _ in range(MAX_REFINEMENTS):
-        signal = read(case, grid)
-        if signal is None:
-            break
-        finer = refine_instants(grid.t, signal, reference.final, reference.nominal_size, reference.at, SEARCH_TOLERANCE)
-        if finer is None:
-            break
-        grid = grid.at(finer)
-    return grid

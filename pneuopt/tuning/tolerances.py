@@ -3,14 +3,15 @@
 # Objectives
 
 LEAST_IMPROVEMENT = 1e-3  # relative difference of two objectives from which on one is better and the optima are two
-MAX_CERTIFIED_EXCESS = 0.01  # relative difference, up or down, of certified and claimed objective that may be certified
+SAME_OBJECTIVE = (
+    0.01  # relative difference of two objectives that count as one: of claim and certificate, of two starts
+)
 ACTIVE_ROOM = 0.02  # room left of a limit, a fraction of it, within which the limit counts as active
 LIMIT_TOLERANCE = 1e-4  # relative excess over a limit that is rounding, and with which a search counts as successful
 VIOLATION_PENALTY = 20.0  # weight of a limit's relative violation beside that of never settling
 WORST_MERIT = 1e6  # largest objective that a search tells apart [s, %, V]; broken limits are graded beyond it
 UNSETTLED_EXCESS = 10.0  # relative excess over its limits that a response counts as which never settles
 RUNAWAY_LEVEL = 1e12  # size of an output [its unit, Pa too] from which on a response counts as running away
-MAX_TOLD = 3  # defects, and parameters to tune over, that a message names
 
 # Feasibility
 
@@ -18,26 +19,23 @@ LEAST_GROWTH = 1e-3  # growth over the horizon, in its logarithm, below which no
 JUST_BELOW = 0.999  # of a real pole: where the poles beyond are counted, far from rounding
 MAX_CORNER_NAMES = 10  # parameters whose corners, twice as many with each, are proved to be unstable
 POINTS_INSIDE = 100  # points within the bounds, beside the corners, where a dither may stabilise the loop
-BISECTION_STEPS = 10  # for the largest part of a reference that can be held, each an equilibrium
 
 # Search and certificate
 
 MARGINS_TO_TRY = 3  # attempts of a search, each with twice the margin before, until a design is certified
 MAX_CERTIFIED_POINTS = 5  # rounded designs certified at each margin, each an independent simulation of every case
 ROUNDING_ROUNDS = 3  # rounds in which the neighbours of the best rounded design are simulated
-MAX_ROUNDING_POINTS = 625  # further roundings simulated: 5^4, within two last places of four gains
 BOUND_DISTANCE = 1e-6  # share of a gain's range from its bound, within which it is rounded to the bound
 HORIZON_FACTORS = (4.0, 2.8, 2.0, 1.4)  # horizons after which hunting and creep are sought; the first the stroke allows
 MAX_REFINED_SEARCHES = 3  # searches on closer samples or with shorter steps, until figures are resolved
 SAMPLING_TOLERANCE = 5e-3  # change of a requirement on closer samples, of value and limit, that repeats a search
 SEARCH_TOLERANCE = 5.0  # multiple of the tolerances of a certificate's readings that a search's samples keep
 MEMBERS_A_GAIN, TRIALS_A_GAIN = 15, 900  # population and trials a free gain of the confirming second search
-MAX_CANDIDATES, CANDIDATE_DISTANCE = 8, 0.05  # its designs that are certified, and how far they lie apart [of a range]
+MAX_CANDIDATES = 8  # its designs that are certified
 
 # Relaxation
 
 RELAXATION_MARGIN = 0.002  # margin of the search for the least relaxation of a limit, a fraction
-RELAXED_DIGITS = 3  # significant digits of a limit that is named as relaxed, rounded away from what is asked
 MAX_LOCAL_SIMULATIONS = 200  # simulations of the local search for the relaxation of all limits together
 
 # Front
@@ -61,16 +59,12 @@ PROGRAM_MARGIN = 0.005  # share by which the programs' limits are tighter, for a
 SETTLING_RADIUS_RATIO = 5.0  # trust region of Ts over that of the gains, both fractions of their ranges
 NEAR_LIMIT = 0.75  # share of a limit on a margin from which on the margin has derivatives, a frequency response a gain
 DIFFERENCE_STEP = 1e-4  # step of the difference quotients of margins and rest, a fraction of a gain's range
-MAX_SENSITIVITY_LANES = 64  # lanes with sensitivities that run at a time, as fit a processor's cache
-NODES = 2000  # instants at which a response is read, at most
 
 # Racing
 
 MEMORY_OF_KILLS = 0.95  # share of its weight that a case's victory keeps from race to race, which orders the cases
-MAX_RECORDED_NUMBERS = 2**25  # numbers of 8 bytes that a race records, at most
 MEMORY_SIZE = 6  # entries of the memory of successful step lengths and crossover rates
 BEST_SHARE = 0.15  # share of the population towards whose points trials move
-SIMULATION_PEAK_MARGIN = 1 / 5  # share of the margin for limits on peaks, of which coarse samples miss as much
 START_SHARES = (0.5, 0.35)  # shares of the trials that the starts get on coarse samples; the rest is for fine ones
 BAND_SHARES = (0.4, 0.25)  # shares of a start's trials over all bands, and over the nearest wider one
 STALLED_GENERATIONS = 25  # generations without `LEAST_IMPROVEMENT` of the best and the median merit that end a phase
@@ -79,19 +73,15 @@ FINE_MEMBERS = 20  # members of the phase on fine samples, which rank points ane
 FEW_BEST, NO_DITHER = 6, 0.02  # best points that begin the second start, and its dither's amplitude [of its range]
 POLISHED, POLISHED_NEARBY = 2, 4  # points that gradients improve at a time; of a search near its start
 MIN_DISTANCE = 0.03  # how far apart they lie, a share of a gain's range
-AGREEMENT = 0.01  # relative difference of two starts' merits that count as one optimum
 LAGGING = 1.3  # merit over the best from which on a start is given up, and gradients leave a point
 CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15  # settling times, or share of the horizon, of a response that a race sees
 LEAST_SHORT_TRIALS = 400  # trials a free gain of a short search; with 200 a relaxation came out 4 % too large
 LEAST_MEMBERS, SHORT_MEMBERS = 5, 0.6  # members of a search, of which a trial mixes four; share of them in a short one
-NEARBY = 0.05  # spread about a start that is close, a share of each range
+NEARBY = 0.05  # share of each range by which points near a start spread, and beyond which two candidates lie apart
 
 # Simulator
 
 KEPT_STATES = 64  # samples between two states that a run keeps, from which a second one sets out
-MAX_MIXED_LANES = 32  # lanes up to which different references run together, the shorter ones padded
-MAX_CHUNK_LANES = 128  # lanes that run at a time, as fit a processor's cache
-COARSE_SAMPLES_A_PERIOD = 10  # samples of a dither period during a search; settling times of t32.py shift by 0.1 ms
 STIFFEST_CORNERS = 8  # corners of the box, fastest on the nominal plant, whose fastest mode counts on other plants
 MAX_SAMPLE_ANGLE = 20.0  # highest frequency at which a sampled loop is read, times its sample time [rad]
 MAX_LOOP_SUBSTEPS = 100  # RK4 steps between two samples, at most: stiffer loops are refused with their cause
@@ -99,7 +89,6 @@ MAX_LOOP_SUBSTEPS = 100  # RK4 steps between two samples, at most: stiffer loops
 # Two phase
 
 MAX_STEPS_A_SEGMENT = 3.5  # RK4 steps between two nodes for `TwoPhase`: the published loop takes 3; 4 to 16 failed
-EXACT_PEAK_MARGIN = 1 / 300  # share of the margin for limits on peaks, which the exact problem does not miss
 MIN_STARTS = 3  # starts after which the search ends if most of them have failed
 
 # Result

@@ -150,7 +150,10 @@ def tune(
     specification = specify(minimise, subject_to)
     task = prepare_task(loop, references, parameters, specification, scenarios, accept, max_steps)
     check_rig(rig, task)
-    _warn_of_swing(task)
+    settles = task.spec.concerns(SettlingTime)
+    swing = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band) if settles else None
+    if swing is not None:
+        warnings.warn(swing, PhysicsWarning, stacklevel=2)
     search, result, is_stopped = _search(task, method, ProgressReporter(progress, "tune"))
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     if result.status.code is Code.NOT_CERTIFIED:
@@ -265,7 +268,24 @@ def _prove_further(
         except KeyboardInterrupt:
             result = _interrupt(task, result, "the simulation of the rig was interrupted")
     if result.status.converged:
-        result = _try_on_plants(task, result, plants, progress)
+        chosen = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
+        count = len(chosen.scenarios if isinstance(chosen, ExpectedPlants) else chosen)
+        try:
+            if count:
+                progress(f"trying the design on {count} plants")
+                found = validate_design(
+                    task.loop,
+                    task.references,
+                    result.parameters,
+                    minimise=task.spec,
+                    scenarios=chosen,
+                    accept=task.accept,
+                )
+                result = replace(result, validation=found)
+        except KeyboardInterrupt:
+            result = _interrupt(task, result, "the trial on other plants was interrupted")
+        except ConvergenceError as error:
+            result = replace(result, status=result.status.with_details(f"not tried on other plants: {error}"))
     return replace(result, stats={**result.stats, "seconds": time.perf_counter() - begun})
 
 
@@ -276,15 +296,6 @@ def _interrupt(task: TuningTask, result: TuningResult, reason: str) -> TuningRes
     lead = f"it keeps every limit on the model: {result.status.verdict}"
     sentences = (lead, f"{reason}: {UNTRIED}", *result.status.sentences[1:], "run again for an answer")
     return result.refuse(Status(Code.INTERRUPTED, sentences), task.space.parameters, task.space.names)
-
-
-def _warn_of_swing(task: TuningTask) -> None:
-    """Warn, in the name of the caller's caller, of a dither that moves the signal out of its settling band."""
-    if not task.spec.concerns(SettlingTime):
-        return
-    message = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
-    if message is not None:
-        warnings.warn(message, PhysicsWarning, stacklevel=3)
 
 
 def _search(task: TuningTask, method: Method | None, progress: ProgressCallback) -> tuple[Search, TuningResult, bool]:
@@ -306,26 +317,6 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback)
     if result.status.converged and worse:
         return search, result, found.status.code is Code.INTERRUPTED
     return other, found, False
-
-
-def _try_on_plants(
-    task: TuningTask, result: TuningResult, plants: ExpectedPlants | Scenarios | None, progress: ProgressCallback
-) -> TuningResult:
-    """The result with its validation; where that is interrupted or stops, the status says so."""
-    chosen = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
-    count = len(chosen.scenarios if isinstance(chosen, ExpectedPlants) else chosen)
-    if not count:
-        return result
-    progress(f"trying the design on {count} plants")
-    try:
-        found = validate_design(
-            task.loop, task.references, result.parameters, minimise=task.spec, scenarios=chosen, accept=task.accept
-        )
-    except KeyboardInterrupt:
-        return _interrupt(task, result, "the trial on other plants was interrupted")
-    except ConvergenceError as error:
-        return replace(result, status=result.status.with_details(f"not tried on other plants: {error}"))
-    return replace(result, validation=found)
 
 
 def check_rig(rig: Rig | None, task: TuningTask) -> None:
@@ -397,24 +388,6 @@ def _breaks(task: TuningTask, found: "pd.DataFrame") -> Iterator[str]:
             yield f"on the rig {metric_name(q)} is {value} at {worst}, the limit is {limit}"
 
 
-def _remedies(task: TuningTask, result: TuningResult, found: "pd.DataFrame") -> Iterator[str]:
-    """With which limit the search would leave the room that the rig needs, if the rig adds as much again.
-
-    A relaxed limit is named only where the loop settles on the rig, for it mends nothing else.
-    """
-    settles = bool(np.isfinite(found.loc["SettlingTime"].to_numpy(dtype=float)).all())
-    for q in task.spec.limits:
-        n = metric_name(q)
-        on_rig, smooth = (max(_requirement_rows(n, f).values(), default=-np.inf) for f in (found, result.certified))
-        room = upper_limit(q) - (on_rig - smooth)
-        if np.isfinite(on_rig) and on_rig > upper_limit(q) and q.metric.sense is Sense.AT_MOST:
-            added = f"the rig adds {_shown(q, on_rig - smooth, task)} to {n}"
-            if room > 0:
-                yield f"{added}: tune with at most {_shown(q, room, task)}"
-            elif settles:
-                yield f"{added}: relax its limit"
-
-
 def _requirement_rows(metric: str, found: "pd.DataFrame") -> dict[str, float]:
     """A requirement's value by case; empty where there is no such metric."""
     rows = {str(case): row for case, row in found.to_dict().items() if metric in row}
@@ -430,9 +403,21 @@ def _shown(requirement: Requirement, value: float, task: TuningTask) -> str:
 def _reject(
     task: TuningTask, result: TuningResult, found: "pd.DataFrame | None", breaks: tuple[str, ...]
 ) -> TuningResult:
-    """The result of a design that the rig refutes: the given gains stand."""
-    smooth = f"on the smooth model it is certified: {result.status.verdict}"
-    remedies = () if found is None else tuple(_remedies(task, result, found))
+    """The result of a design that the rig refutes: the given gains stand.
+
+    A relaxed limit is named only where the loop settles on the rig, for it mends nothing else.
+    """
+    smooth, remedies = f"on the smooth model it is certified: {result.status.verdict}", list[str]()
+    if found is not None:
+        settles = bool(np.isfinite(found.loc["SettlingTime"].to_numpy(dtype=float)).all())
+        for q in task.spec.limits:  # the room that the rig needs if it adds as much again
+            n, allowed = metric_name(q), upper_limit(q)
+            ours, theirs = (max(_requirement_rows(n, f).values(), default=-np.inf) for f in (result.certified, found))
+            added, room = theirs - ours, allowed - (theirs - ours)
+            broken = np.isfinite(theirs) and theirs > allowed and q.metric.sense is Sense.AT_MOST
+            if broken and (room > 0 or settles):
+                remedy = f"tune with at most {_shown(q, room, task)}" if room > 0 else "relax its limit"
+                remedies.append(f"the rig adds {_shown(q, added, task)} to {n}: {remedy}")
     status = Status(Code.NOT_CERTIFIED, (*breaks, smooth, *remedies))
     return replace(result.refuse(status, task.space.parameters, task.space.names), on_rig=found)
 

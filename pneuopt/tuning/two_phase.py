@@ -32,10 +32,11 @@ from pneuopt.evaluation.requirements import (
     metric_name,
     upper_limit,
 )
+from pneuopt.evaluation.response import TuningCase
 from pneuopt.evaluation.specification import Specification
 from pneuopt.evaluation.tolerances import TAIL_SHARE
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import require
+from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, as_tuple, check_argument, check_number
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.shooting.full_space import (
@@ -50,8 +51,8 @@ from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Wh
 from pneuopt.tuning.method import Agreement, SearchResult, TuningTask, check_method_options, compare_starts
 from pneuopt.tuning.racing import WIDEN_BOUNDS, Racing
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue, rk4_substeps
-from pneuopt.tuning.tolerances import EXACT_PEAK_MARGIN, LEAST_IMPROVEMENT, MAX_STEPS_A_SEGMENT, MIN_STARTS
+from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue, rk4_substeps, starts_before_step
+from pneuopt.tuning.tolerances import LEAST_IMPROVEMENT, MAX_STEPS_A_SEGMENT, MIN_STARTS
 
 # Parameters on which the average of a linear loop does not depend.
 PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
@@ -88,7 +89,7 @@ class TwoPhase:
     digits: int | None = 4
     solver: FullSpace = field(default_factory=lambda: FullSpace(max_iterations=400, first_barrier=1e-2))
 
-    peak_margin: ClassVar[float] = EXACT_PEAK_MARGIN
+    peak_margin: ClassVar[float] = 1 / 300  # the exact problem misses no peak
     parameters_without_effect: ClassVar[tuple[str, ...]] = PARAMETERS_WITHOUT_EFFECT
 
     def __post_init__(self) -> None:
@@ -142,11 +143,22 @@ class TwoPhase:
     ) -> SearchResult:
         """Solve from every start and return the best optimum; see `Method.find`."""
         method = self if attempt == 0 else replace(self, starts=1)
-        space = Space(task.space.parameters_at(start), task.space.names)
-        optima = _solve_stable(task, replace(task, space=space, spec=spec), method, progress)
+        loop, space = task.loop, Space(task.space.parameters_at(start), task.space.names)
+        # Rows that limit the sensitivity make the problem several times as large. Where nobody asked for them they are
+        # left out first: most optima are stable all the same.
+        plain, free_loop = _without_stability(task, spec), without_clip(loop)
+        most = math.inf if plain is spec else spec.limit(MaxSensitivity)
+
+        def is_allowed(solution: Solution) -> bool:
+            found = margins(open_loop(free_loop, solution.parameters.select(free_loop.parameters)))
+            return found.stable and found.max_sensitivity <= most
+
+        optima = solve_two_phase(loop, task.references, space, plain, method, progress, is_allowed)
+        if plain is not spec and not optima.agreement.converged:
+            optima = solve_two_phase(loop, task.references, space, spec, method, progress, is_allowed)
         best, values = optima.best, optima.best.parameters
         stats = {"iterations": best.stats.get("iterations", 0.0)}
-        point, cost = np.array([values.value(n) for n in task.space.names]), best.stats.get("cost", np.nan)
+        point, cost = np.array([values.value(n) for n in task.space.names]), best.cost
         active = tuple(best.multipliers)
         return SearchResult(point, best.status, active, stats, optimum=cost, agreement=optima.agreement)
 
@@ -199,26 +211,6 @@ def _inexact_requirements(spec: Specification) -> list[str]:
     return [n for n in spec.metric_names if not METRICS[n].exact]
 
 
-def _solve_stable(task: TuningTask, tightened: TuningTask, method: TwoPhase, progress: ProgressCallback) -> Optima:
-    """Solve the two-phase problem for a stable loop.
-
-    Rows that limit the sensitivity make the problem several times as large. Where nobody asked for them they are left
-    out first: most optima are stable all the same.
-    """
-    loop, references, space, spec = tightened.loop, tightened.references, tightened.space, tightened.spec
-    plain = _without_stability(task, spec)
-    free_loop, most = without_clip(loop), math.inf if plain is spec else spec.limit(MaxSensitivity)
-
-    def is_allowed(solution: Solution) -> bool:
-        found = margins(open_loop(free_loop, solution.parameters.select(free_loop.parameters)))
-        return found.stable and found.max_sensitivity <= most
-
-    optima = solve_two_phase(loop, references, space, plain, method, progress, is_allowed)
-    if plain is spec or optima.agreement.converged:
-        return optima
-    return solve_two_phase(loop, references, space, spec, method, progress, is_allowed)
-
-
 def _without_stability(task: TuningTask, spec: Specification) -> Specification:
     """The specification without a limit on the sensitivity that nobody asked for."""
     return spec if task.spec.concerns(MaxSensitivity) else spec.without(MaxSensitivity)
@@ -247,17 +239,17 @@ def solve_two_phase(
         point = space.from_unit(rng.random(len(space.names))) if k else space.start
         gains = dict(zip(space.names, point.tolist(), strict=True))
         found.append(solve_from(problem, parameters.with_values(gains)))
-        value, ended = _objective_value(found[-1]), found[-1].status.code.value
-        report_progress(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
+        ended = found[-1].status.code.value
+        report_progress(f"start {k + 1} of {method.starts}: objective {found[-1].cost:.4g}, {ended}")
         good += [s for s in found[-1:] if s.status.converged and is_allowed(s)]
     failed = [math.inf] * (len(found) - len(good))
-    agreement = compare_starts([*map(_objective_value, good), *failed], LEAST_IMPROVEMENT)
+    agreement = compare_starts([*(s.cost for s in good), *failed], LEAST_IMPROVEMENT)
     if not good:
-        closest = min(found, key=lambda s: s.stats.get("largest_violation", math.inf))
+        closest = min(found, key=lambda s: s.largest_violation)
         unstable = Status(Code.INFEASIBLE, ("every optimum found is an unstable loop, or nearly so", WIDEN_BOUNDS))
         closest = replace(closest, status=unstable) if closest.status.converged else closest
         return Optima(closest, agreement)
-    return Optima(min(good, key=_objective_value), agreement)
+    return Optima(min(good, key=lambda s: s.cost), agreement)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,11 +281,6 @@ def two_phase_path(
     return TwoPhasePath(problem, space.names, band_number(spec.band))
 
 
-def _objective_value(solution: Solution) -> float:
-    """The objective that a solution reached."""
-    return float(solution.stats["cost"])
-
-
 # Requirements that the problem has an equation for, beside the settling time, which is its free duration.
 EXACT_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.exact and kind is not SettlingTime)
 # Upper bounds of the unknowns that stand for terms of the objective, as `Specification.limit` counts (fractions of the
@@ -320,14 +307,17 @@ def transcribe_two_phase(
     parameters = (averaged | extra).select(system.parameters)
     phases = [p for i, r in enumerate(references) for p in _reference_phases(loop, space, i, r, nodes)]
     parameters = parameters | _durations(references, spec, extra[SETTLING_PARAMETER])
-    limits = [
-        *_horizon_limits(references, parameters),
-        *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)),
-        *_sensitivity_limit(free_loop, averaged, space, spec, parameters),
-    ]
-    q, weights = ca.SX.sym("q", len(parameters)), {k.metric.name: spec.weight(k) for k in REQUIREMENT_KINDS}
+    q, at, limits = ca.SX.sym("q", len(parameters)), list(parameters).index, list[Limit]()
+    for i, reference in enumerate(references):
+        if parameters[_settled_duration(i)].free:  # as the settling time is: together they end with the horizon
+            end, record = q[at(SETTLING_PARAMETER)] + q[at(_settled_duration(i))], reference.horizon - reference.at
+            function = ca.Function("limit", [q], [end])
+            limits.append(Limit(f"horizon {i}", function, record, record, Where.PARAMETERS))
+    limits += [q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)]
+    limits += _sensitivity_limit(free_loop, averaged, space, spec, parameters)
+    weights = {k.metric.name: spec.weight(k) for k in REQUIREMENT_KINDS}
     costs = tuple(  # of the unknowns that stand for the objective's terms
-        Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
+        Cost(n, ca.Function("cost", [q], [q[at(n)]]), Where.PARAMETERS, weight=weight)
         for n, weight in weights.items()
         if METRICS[n].exact and weight > 0
     )
@@ -385,22 +375,6 @@ def _settled_duration(i: int) -> str:
     return f"rest.{i}"
 
 
-def _horizon_limits(references: Sequence[Reference], parameters: ParameterSet) -> list[Limit]:
-    """The settled phase ends with the horizon, where its duration is unknown because the settling time is."""
-    q, names_ = ca.SX.sym("q", len(parameters)), list(parameters)
-    return [
-        Limit(
-            f"horizon {i}",
-            ca.Function("limit", [q], [q[names_.index(SETTLING_PARAMETER)] + q[names_.index(_settled_duration(i))]]),
-            r.horizon - r.at,
-            r.horizon - r.at,
-            Where.PARAMETERS,
-        )
-        for i, r in enumerate(references)
-        if parameters[_settled_duration(i)].free
-    ]
-
-
 def _extend_system(
     loop: ClosedLoop, extra: ParameterSet, space: Space, references: Sequence[Reference], nodes: tuple[int, int]
 ) -> DiscreteSystem:
@@ -424,7 +398,11 @@ def _reference_phases(
     loop: ClosedLoop, space: Space, i: int, reference: Reference, nodes: tuple[int, int]
 ) -> list[Phase]:
     """The phases of reference i: before the step, where there is such a time, transient and settled."""
-    start = _state_before_step(loop, space, reference)
+    (start,) = starts_before_step([TuningCase(reference)], loop, space)
+    if start is None:
+        message = "before the step the loop rests in a state that depends on its gains"
+        needs = "a load): the two-phase problem needs one that does not; step from zero, or use method=Racing()"
+        raise InputError(f"{message} (reference {reference.initial:g}, or {needs}")
     disturbed = {disturbance_input(n): v for n, v in reference.disturbance.items()}
     after = [disturbed.get(n, 0.0) for n in names(loop.inputs)[1:]]
 
@@ -437,21 +415,6 @@ def _reference_phases(
     before = [make_phase("before", nodes[0], reference.initial, f"before.{i}", start)] if moved else []
     transient = make_phase("transient", nodes[0], reference.final, SETTLING_PARAMETER, None if moved else start)
     return [*before, transient, make_phase("settled", nodes[1], reference.final, _settled_duration(i), None)]
-
-
-def _state_before_step(loop: ClosedLoop, space: Space, reference: Reference) -> Array:
-    """The loop's state before the step, shape (n_states,); `InputError` where it depends on the gains."""
-    first = loop.initial(space.parameters, reference=reference.initial, start=reference.start)
-    for share in (0.3, 0.8):
-        gains = space.parameters_at(space.from_unit(np.full(len(space.names), share)))
-        other = loop.initial(gains, reference=reference.initial, start=reference.start)
-        scale = np.array([q.nominal for q in loop.states])
-        require(
-            bool(np.all(np.abs(first - other) <= 1e-9 * scale)),
-            f"before the step the loop rests in a state that depends on its gains (reference {reference.initial:g}, or "
-            "a load): the two-phase problem needs one that does not; step from zero, or use method=Racing()",
-        )
-    return first
 
 
 def _path_limits(

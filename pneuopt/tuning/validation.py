@@ -23,9 +23,9 @@ from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet, check_parameters
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.results import Result
+from pneuopt.tuning.relaxation import round_outwards
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import MAX_TOLD, RELAXED_DIGITS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -160,11 +160,10 @@ def validate_design(
     ends = {f"{a.label} {side}": v for a in expected.axes for side, v in (("low", a.low), ("high", a.high))}
     by_case, restless = _simulate_plants(loop, steps, full, spec, {**expected.scenarios, **ends})
     restless = [n for n in restless if n in expected.scenarios]
-    values = _worst_by_plant(by_case, [n for n in expected.scenarios if n not in restless], steps)
+    shown = [name for name in METRICS if name in spec.metric_names]
+    values, worst = _worst_figures(by_case, [n for n in expected.scenarios if n not in restless], steps, shown)
     by_plant = {str(n): {str(m): float(v) for m, v in row.items()} for n, row in values.to_dict().items()}
     breaks = {n: find_breaks(row, spec, accept) for n, row in by_plant.items()} | dict.fromkeys(restless, (NO_REST,))
-    shown = [name for name in METRICS if name in spec.metric_names]
-    worst = {n: _worst_case(by_case, values, n, steps) for n in shown}
     certified, findings = _certify(loop, full, spec, expected.scenarios, steps, list(dict.fromkeys(worst.values())))
     for plant, words in findings:
         own = [w for w in words if Defect(w) not in accept and w not in breaks[plant]]
@@ -225,7 +224,12 @@ def _simulate_plants(
     try:
         simulator = Simulator(loop, steps, space, scenarios, spec)
     except (ConvergenceError, InputError):
-        restless = [n for n in scenarios if not _rests(loop, steps, parameters, n, scenarios)]
+        for n, values in scenarios.items():
+            try:
+                for step in steps:
+                    TuningCase(step, n, values).initial(loop, parameters)
+            except (ConvergenceError, InputError):
+                restless.append(n)
         left = {n: values for n, values in scenarios.items() if n not in restless}
         if not restless or not left:
             raise
@@ -233,18 +237,6 @@ def _simulate_plants(
     rows = simulator.table(np.zeros(0), spec)
     found = pd.DataFrame({case.label: row for case, row in zip(simulator.cases, rows, strict=True)})
     return found.loc[[n for n in METRICS if n in (*spec.metric_names, *LANE_DEFECTS)]], restless
-
-
-def _rests(
-    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, plant: str, scenarios: Scenarios
-) -> bool:
-    """Whether the loop rests, or moves steadily, on a plant before each step."""
-    try:
-        for step in steps:
-            TuningCase(step, plant, scenarios[plant]).initial(loop, parameters)
-    except (ConvergenceError, InputError):
-        return False
-    return True
 
 
 def _certify(
@@ -269,22 +261,27 @@ def _certify(
     return pd.DataFrame(metrics), defects
 
 
-def _worst_case(by_case: "pd.DataFrame", values: "pd.DataFrame", metric: str, steps: Sequence[Reference]) -> str:
-    """The case in which a metric is worst."""
-    plant = str(values.columns[_rank_order(values.loc[metric].to_numpy(dtype=float), metric)[-1]])
-    own = [TuningCase(step, plant).label for step in steps]
-    return own[int(_rank_order(by_case.loc[metric, own].to_numpy(dtype=float), metric)[-1])]
+def _worst_figures(
+    by_case: "pd.DataFrame", plants: Sequence[str], steps: Sequence[Reference], shown: Sequence[str]
+) -> tuple["pd.DataFrame", dict[str, str]]:
+    """The worst of each plant's metrics over its references, a column a plant, and the worst case of those shown.
 
-
-def _worst_by_plant(by_case: "pd.DataFrame", plants: Sequence[str], steps: Sequence[Reference]) -> "pd.DataFrame":
-    """The worst of each plant's metrics over its references, a column a plant; NaN is the worst."""
+    NaN is the worst.
+    """
     import pandas as pd
 
     columns = {str(label): number for number, label in enumerate(by_case)}
     own = np.array([[columns[TuningCase(step, plant).label] for step in steps] for plant in plants])
     table = by_case.to_numpy(dtype=float)[:, own]
-    worst = [[row[_rank_order(row, str(n))[-1]] for row in rows] for n, rows in zip(by_case.index, table, strict=True)]
-    return pd.DataFrame(worst, index=by_case.index, columns=list(plants))
+    rows = {
+        str(n): [row[_rank_order(row, str(n))[-1]] for row in found]
+        for n, found in zip(by_case.index, table, strict=True)
+    }
+    cases = dict[str, str]()
+    for n in shown:
+        labels = [TuningCase(step, plants[_rank_order(np.array(rows[n]), n)[-1]]).label for step in steps]
+        cases[n] = labels[int(_rank_order(by_case.loc[n, labels].to_numpy(dtype=float), n)[-1])]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=list(plants)), cases
 
 
 def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
@@ -344,63 +341,38 @@ def advise(
     broken: Mapping[str, tuple[str, ...]],
     certified: "pd.DataFrame",
     axes: Mapping[CorrelatedParameters, "pd.DataFrame"],
+    most: int = 3,
 ) -> tuple[tuple[str, ...], tuple[CorrelatedParameters, ...]]:
     """Advice where a design breaks on plants, a sentence each, and what to tune over.
 
-    `axes` are the metrics with one thing that varies alone at its low and its high end, a column each.
+    It says with which limits the same gains hold on all plants but those where no limit helps, and what breaks a limit
+    on its own, or comes nearest to it, the worst first, at most so many. `axes` are the metrics with one thing that
+    varies alone at its low and its high end, a column each.
     """
     if not broken:
         return (), ()
-    suggested, reason = _culprits(spec, axes)
-    names = " and ".join(a.label for a in suggested)
-    remedy = f"{reason}: {names}; tune over that too" if names else "tune over such plants: add them to the scenarios"
-    return (*_relaxation(loop, spec, plants, broken, certified), remedy), suggested
-
-
-def _relaxation(
-    loop: ClosedLoop,
-    spec: Specification,
-    plants: "pd.DataFrame",
-    broken: Mapping[str, tuple[str, ...]],
-    certified: "pd.DataFrame",
-) -> list[str]:
-    """With which limits the same gains hold on all plants but those where no limit helps."""
     lost = [n for n, found in broken.items() if DEFECT_WORDS & set(found)]
     sound = plants.loc[[n for n in plants.index if n not in lost]]
-    limits = [q for q in spec.limits if any(metric_name(q) in broken.get(str(n), ()) for n in sound.index)]
-    own = [str(c) for c in certified if not any(str(c).endswith(f"[{n}]") for n in lost)]
-    texts = [_relaxed_limit(q, [*sound[metric_name(q)], *certified[own].T[metric_name(q)]], loop) for q in limits]
+    own, texts = [str(c) for c in certified if not str(c).endswith(tuple(f"[{n}]" for n in lost))], list[str]()
+    for q in (q for q in spec.limits if any(metric_name(q) in broken.get(str(n), ()) for n in sound.index)):
+        metric, least = q.metric, q.metric.sense is Sense.AT_LEAST
+        worst = max([*sound[metric.name], *certified[own].T[metric.name]], key=metric.requirement_value)
+        value, asked = round_outwards(worst, upwards=not least), metric.factor * (user_limit(q) or 0.0)
+        unit = metric.shown_unit(loop.command.unit, loop.feedback.unit)
+        texts.append(f"{metric.name} {'>=' if least else '<='} {value:g} {unit}".strip() + f" (now {asked:.4g})")
     sentences = [f"with {' and '.join(texts)} these gains hold on {len(sound)} of {len(plants)}"] if texts else []
     count = f"{len(lost)} plant{'s' if len(lost) > 1 else ''}"
-    return [*sentences, *([f"no relaxed limit helps on {count}, where the loop fails"] if lost else [])]
-
-
-def _relaxed_limit(requirement: Requirement, values: Sequence[float], loop: ClosedLoop) -> str:
-    """The limit that the worst value keeps, rounded away from what is asked: "Overshoot <= 4.44 %"."""
-    metric, least = requirement.metric, requirement.metric.sense is Sense.AT_LEAST
-    worst = max(values, key=metric.requirement_value)
-    digit = 10.0 ** (math.floor(math.log10(abs(worst))) + 1 - RELAXED_DIGITS)
-    value = (math.floor if least else math.ceil)(worst / digit) * digit
-    unit = metric.shown_unit(loop.command.unit, loop.feedback.unit)
-    asked = metric.factor * (user_limit(requirement) or 0.0)
-    return f"{metric.name} {'>=' if least else '<='} {value:.{RELAXED_DIGITS}g} {unit}".strip() + f" (now {asked:.4g})"
-
-
-def _culprits(
-    spec: Specification, axes: Mapping[CorrelatedParameters, "pd.DataFrame"]
-) -> tuple[tuple[CorrelatedParameters, ...], str]:
-    """What breaks a limit on its own, the worst first; else what comes nearest to it."""
-    ends = {a: [{str(n): v for n, v in row.items()} for row in found.to_dict().values()] for a, found in axes.items()}
-    worst = {a: max((_worst_excess(row, spec) for row in rows), default=math.inf) for a, rows in ends.items()}
+    sentences += [f"no relaxed limit helps on {count}, where the loop fails"] if lost else []
+    worst = dict[CorrelatedParameters, float]()
+    for a, found in axes.items():
+        ends = [{str(n): v for n, v in row.items()} for row in found.to_dict().values()]
+        works = ends and all(math.isfinite(row[n]) for row in ends for n in LANE_DEFECTS)  # it rests and settles
+        shares = [share for row in ends for share in spec.excess(requirement_values(row)).values()] if works else []
+        worst[a] = max(shares, default=-math.inf) if works else math.inf
     order = sorted(worst, key=lambda a: -worst[a])
     alone = [a for a in order if worst[a] > 0]
-    if alone:
-        return tuple(alone[:MAX_TOLD]), "what breaks it most, each alone"
-    return tuple(order[:MAX_TOLD]), "nothing breaks it alone, most is done by"
-
-
-def _worst_excess(row: Mapping[str, float], spec: Specification) -> float:
-    """By what share the worst limit is exceeded; infinite where the loop never settles or is unstable."""
-    if not all(math.isfinite(row[n]) for n in LANE_DEFECTS):
-        return math.inf
-    return max(spec.excess(requirement_values(row)).values(), default=-math.inf)
+    reason = "what breaks it most, each alone" if alone else "nothing breaks it alone, most is done by"
+    suggested = tuple((alone or order)[:most])
+    names = " and ".join(a.label for a in suggested)
+    remedy = f"{reason}: {names}; tune over that too" if names else "tune over such plants: add them to the scenarios"
+    return (*sentences, remedy), suggested

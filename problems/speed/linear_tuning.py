@@ -57,7 +57,7 @@ def main() -> "DataFrame":
     many = solve_two_phase(loop, [STEP], space, TIGHT, replace(METHOD, starts=STARTS), lambda _: None)
     begun = time.process_time()
     best = solve_two_phase(loop, [STEP], space, TIGHT, METHOD, lambda _: None).best
-    spent, optimum = time.process_time() - begun, best.stats["cost"]
+    spent, optimum = time.process_time() - begun, best.cost
     simulator = Simulator(loop, [STEP], space, spec=SPEC)
     traces = [evolved(simulator, optimum * (1 + SAME), CAP * spent, seed) for seed in SEEDS]
     same, near = (median([reached(trace, optimum * (1 + k)) for trace in traces]) / spent for k in (SAME, NEAR))

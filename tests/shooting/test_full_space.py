@@ -98,7 +98,7 @@ def test_identification_agrees_with_single_shooting() -> None:
     expected, cost = single_shooting(problem)
     found = [solution.parameters.value(n) for n in ("stiffness", "damping", "bias[a]", "bias[b]")]
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
-    assert solution.stats["cost"] == pytest.approx(cost, rel=1e-8)
+    assert solution.cost == pytest.approx(cost, rel=1e-8)
     assert found == pytest.approx([30, 2, 0.5, -1.0], rel=0.05)
     assert solution.stats["largest_gap"] < 1e-8
     assert solution.multipliers == {}
@@ -207,9 +207,11 @@ def test_nan_is_named_by_state_and_phase() -> None:
 def test_a_nan_cost_is_named() -> None:
     problem = settling(0.02)
     bad = Cost("energy", ca.Function("f", [q := ca.SX.sym("q", 3)], [ca.log(q[2] - 1.5)]), Where.PARAMETERS)
-    status = solve_full_space(replace(problem, costs=(bad,))).status
-    assert status.code is Code.DIVERGED
-    assert "'energy'" in status.message
+    solution = solve_full_space(replace(problem, costs=(bad,)))
+    assert solution.status.code is Code.DIVERGED
+    assert "'energy'" in solution.status.message
+    assert np.isnan(solution.cost)
+    assert np.isinf(solution.largest_violation)
 
 
 @pytest.mark.parametrize("fields", [{"max_iterations": 0}, {"tolerance": 0.0}, {"max_seconds": -1.0}])

@@ -320,8 +320,9 @@ def test_the_best_settling_time_is_the_one_that_is_measured() -> None:
         assert point.z[-1] * posed.horizon == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("sample_time", [None, 1e-3])
-def test_a_tolerance_spreads_the_candidate(sample_time: float | None) -> None:
+@pytest.mark.parametrize(("sample_time", "share"), [(None, 0.01), (1e-3, 0.015)])
+def test_a_tolerance_spreads_the_candidate_not_the_start(sample_time: float | None, share: float) -> None:
+    """The peak 1.1 Kp is held to 11, wherever the search began; the slowest is 10 % below the gain found."""
     loop, given = integrator(sample_time)
     best = tune(
         loop,
@@ -335,7 +336,7 @@ def test_a_tolerance_spreads_the_candidate(sample_time: float | None) -> None:
     )
     assert best.parameters.value("pid.Kp") == pytest.approx(10.0, rel=0.01)
     assert best.certified["0 to 1 [pid.Kp high]"]["PeakControl"] <= 11.0
-    assert best.certified["0 to 1 [pid.Kp low]"]["SettlingTime"] == pytest.approx(math.log(50) / 9.0, rel=0.015)
+    assert best.certified["0 to 1 [pid.Kp low]"]["SettlingTime"] == pytest.approx(math.log(50) / 9.0, rel=share)
 
 
 IN_CORNERS = (Overshoot(0.05), MaxSensitivity(1.5), SteadyStateError(0.02))

@@ -347,7 +347,7 @@ def test_many_points_are_raced_in_parts(monkeypatch: pytest.MonkeyPatch) -> None
     merits, worst = race.merits(given)
     rivals = np.full(len(given), np.median(merits))
     whole, _ = race.race(given, rivals, worst)
-    monkeypatch.setattr("pneuopt.tuning.racing.MAX_RECORDED_NUMBERS", 50_000)
+    monkeypatch.setattr("pneuopt.tuning.racing.Race.most_numbers", 50_000)
     parts, _ = race.race(given, rivals, worst)
     assert np.array_equal(whole, parts)
 

@@ -32,7 +32,7 @@ from pneuopt.tuning.result import Refusal, TuningResult
 from pneuopt.tuning.search import Search, _excess, confirm_infeasible, confirm_refusal, find_candidates, relax
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, search_space
-from pneuopt.tuning.tolerances import CANDIDATE_DISTANCE, MAX_CANDIDATES
+from pneuopt.tuning.tolerances import MAX_CANDIDATES, NEARBY
 from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
 SMALL = Racing(members=10, trials=10, polish=0)
@@ -114,7 +114,7 @@ def test_candidates_lie_within_the_limits_and_apart() -> None:
     assert np.linalg.norm(points[0] - 0.3) < 0.01
     assert max(float(np.linalg.norm(p - 0.3)) for p in points) <= 0.2
     gaps = [np.max(np.abs(a - b)) for k, a in enumerate(points) for b in points[:k]]
-    assert min(gaps) > CANDIDATE_DISTANCE
+    assert min(gaps) > NEARBY
 
     def far(at: Array) -> Array:
         return np.asarray(1.0 + at.sum(axis=1))
