@@ -41,6 +41,7 @@ from pneuopt.evaluation.metric import (
 )
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
 from pneuopt.quantities.errors import require
+from pneuopt.quantities.units import ANR_DENSITY
 
 PUSH = "load.force"  # the disturbance against which a loop is stiff
 AIR_CHANNEL, POWER_CHANNEL = "air", "power"  # of a meter: mass flow from the supply [kg/s], power from the source [W]
@@ -101,7 +102,7 @@ def air_rows(record: StepRecord) -> ValuesAndSlopes:
     1.6878
     """
     mass, slopes = record.integrate_meter(AIR_CHANNEL)
-    factor = 1e3 / 1.185  # [l/kg]: air of ISO 8778 (ANR: 100 kPa, 20 degC, 65 % humidity) has 1.185 kg/m^3
+    factor = 1e3 / ANR_DENSITY  # [l/kg]
     return factor * mass, factor * slopes
 
 
