@@ -49,9 +49,6 @@ POLE_ROUNDING = 1e-13  # share of a matrix's size by which rounding moves its we
 MOST_POLE_ROUNDING = 1e-7  # share of the fastest pole beyond which rounding moves no double pole at zero
 NOISE_ANGLE = 0.3  # of the slowest noise that counts, over a horizon [rad]: slower noise is a drift
 FLAT = 1e-3  # relative change of a response over a grid's two lowest frequencies, below which it is that at rest
-SPREAD_FREQUENCIES = 48  # of a batch's sensitivity, beside those about the poles: fewer miss a broad maximum
-PEAK_REFINEMENTS, PEAK_GRID_POINTS = 4, 9  # finer grids about a batch's two highest peaks, and the points of each
-LOOPS_AT_A_TIME = 128  # more do not fit the processor's cache
 
 # The certificate
 
