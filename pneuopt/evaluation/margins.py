@@ -112,7 +112,7 @@ class GridResponse:
 
     @classmethod
     def of(cls, open_loop: Linearisation) -> "GridResponse":
-        """Of an open loop with one input and one output."""
+        """Response of an open loop with one input and one output."""
         omega = frequency_grid(open_loop)
         return cls(omega, frequency_response(open_loop, omega))
 
@@ -489,7 +489,7 @@ def worst_margins(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def counted_points(metric: str, count: int) -> int:
-    """How many of the last of so many operating points count for a metric.
+    """Number of the last of so many operating points that count for a metric.
 
     A noise gain does not count before the step: a body that sticks answers a constant error of its speed's measurement
     by a command that grows without bound.
@@ -617,7 +617,7 @@ def _mark_unstable(found: dict[str, Array], closed: Array, poles: ComplexArray) 
 
 
 def _pid_responses(gains: Array, plant: Callable[[Array], ComplexArray]) -> tuple[Responses, Array]:
-    """Of loops with a PID alone, and what a noise gain is at infinity, shape (m,)."""
+    """Responses of loops with a PID alone, and their noise gain at infinity, shape (m,)."""
     Kp, Ki, Kd, Tf = gains[..., None]
 
     def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
@@ -631,12 +631,16 @@ def _read_responses(
     responses: Responses, noise_at_infinity: Array, w: Array, lowest_noise: float, only: Collection[str]
 ) -> dict[str, Array]:
     """Margins and peaks of loops on frequencies of shape (n,), crossings interpolated and peaks refined."""
+
+    def magnitudes(size: Callable[[ComplexArray, ComplexArray], Array], w: Array) -> Array:
+        return size(*responses(w))
+
     (L, C), noisy = responses(w), int(np.searchsorted(w, (1 - 1e-9) * lowest_noise))
     with np.errstate(all="ignore"):
         found = {n: crossing(L) for n, crossing in _MARGIN_FUNCTIONS.items() if n in only}
         for n, size in ((n, size) for n, size in _PEAK_FUNCTIONS.items() if n in only):
             k = noisy if n == NOISE_GAIN else 0
-            found[n] = _refine_peaks(lambda w, size=size: size(*responses(w)), w[k:], size(L[:, k:], C[:, k:]))
+            found[n] = _refine_peaks(partial(magnitudes, size), w[k:], size(L[:, k:], C[:, k:]))
     if NOISE_GAIN in only:
         found[NOISE_GAIN] = np.maximum(found[NOISE_GAIN], noise_at_infinity)
     return found

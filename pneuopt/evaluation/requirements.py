@@ -114,7 +114,7 @@ def travel_rows(record: StepRecord) -> ValuesAndSlopes:
 
 @final
 class OvershootDistance(AtMost):
-    """How far the response passes the reference's end [measured unit]; under a disturbance alone, either side.
+    """Distance of the response beyond the reference's end [measured unit]; under a disturbance alone, either side.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ class RiseTime(AtMost):
 
 @final
 class Overshoot(AtMost):
-    """How far the response passes the reference, as a fraction of the step."""
+    """Distance of the response beyond the reference, as a fraction of the step."""
 
     metric = Metric(
         "Overshoot",
