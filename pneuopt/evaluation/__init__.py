@@ -1,4 +1,4 @@
-"""What a loop is worth, without any optimiser: simulated responses, metrics, margins, limit cycles, air and energy.
+"""The worth of a loop, without any optimiser: simulated responses, metrics, margins, limit cycles, air and energy.
 
 Read `certificate.py` first: it says what holds of a design, and what is shared with the search that found it: the model
 and the metrics' definitions, and no step of the search. So this room imports neither shooting nor tuning, and no

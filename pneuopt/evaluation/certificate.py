@@ -87,7 +87,7 @@ if TYPE_CHECKING:
 
 
 class Defect(Enum):
-    """What can be wrong with gains whatever was asked of them; the value is the word that files use."""
+    """A fault of gains, whatever was asked of them; the value is the word that files use."""
 
     UNSTABLE = "unstable"
     GROWS = "grows"
@@ -119,7 +119,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(Result):
-    """What `certificate` found; prints its `summary()`.
+    """Findings of `certificate`; prints its `summary()`.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ def judge_evaluations(
 
 
 def report_margins(margins: "pd.DataFrame") -> Report:
-    """Where the loop's sensitivity is largest, operating point by operating point, off `Certificate.margins`."""
+    """Largest sensitivity of the loop, operating point by operating point, off `Certificate.margins`."""
     if margins.empty:
         return Report()
     worst = margins.groupby("point", sort=False)["MaxSensitivity"].max().to_dict()
@@ -225,7 +225,7 @@ def report_margins(margins: "pd.DataFrame") -> Report:
 
 
 def report_notes(notes: Sequence[str], shown: int = 4) -> Report:
-    """What a certificate notes beside its figures, the first few in full."""
+    """Notes of a certificate beside its figures, the first few in full."""
     more = len(notes) - shown
     rest = f"{more} more notes of this kind on other cases; --json FILE holds all, and so does `Certificate.notes`"
     return Report((*map(Line, notes[:shown]), *([Line(rest)] if more > 0 else [])))
@@ -233,7 +233,7 @@ def report_notes(notes: Sequence[str], shown: int = 4) -> Report:
 
 @dataclass(frozen=True, eq=False)
 class ContinuedResponse:
-    """What a response does from the step on, as far as it was simulated."""
+    """Response from the step on, as far as it was simulated."""
 
     loop: ClosedLoop
     reference: Reference
@@ -314,8 +314,11 @@ def continue_response(found: CaseEvaluation, band: float) -> ContinuedResponse:
     since = run.t >= reference.at - 1e-12 * max(1.0, reference.at)
     period = loop.dither_period(found.parameters)
     t, y, u = (run.t[since] - reference.at, run[loop.feedback.name][since], run["control"][since])
-    stable = bool(np.isfinite(found.metrics["MaxSensitivity"]))
-    continued = ContinuedResponse(loop, reference, period, t, y, u, contact=_limit_in_horizon(found), is_stable=stable)
+    stable, contact = bool(np.isfinite(found.metrics["MaxSensitivity"])), ""
+    for limit in loop.plant.validity_limits:  # beyond one that is met within the horizon there is no model
+        if not contact and np.any(limit.side * (limit.limit(found.parameters) - run[limit.state][1:]) <= 0):
+            contact = f"{limit.event} within the horizon"
+    continued = ContinuedResponse(loop, reference, period, t, y, u, contact=contact, is_stable=stable)
     left = MAX_CONTINUATION_INSTANTS
     while not continued.is_decided(band):
         inputs, instants = _next_inputs(found, run.t[-1], continued)
@@ -333,15 +336,6 @@ def continue_response(found: CaseEvaluation, band: float) -> ContinuedResponse:
         t, y, u = (np.concatenate(parts) for parts in zip(known, (t, y, u), strict=True))
         continued = replace(continued, t=t, signal=y, command=u, contact=str(met[0]) if met else "")
     return continued
-
-
-def _limit_in_horizon(found: CaseEvaluation) -> str:
-    """The validity limit that the response meets within its horizon, in words; beyond it there is no model."""
-    for limit in found.loop.plant.validity_limits:
-        values, edge = found.response[limit.state], limit.limit(found.parameters)
-        if np.any(limit.side * (edge - values[1:]) <= 0):
-            return f"{limit.event} within the horizon"
-    return ""
 
 
 def _next_inputs(found: CaseEvaluation, begin: float, continued: ContinuedResponse) -> tuple[Trajectory, Array]:
@@ -368,7 +362,7 @@ class Ending:
 
     @property
     def defect(self) -> Defect | None:
-        """How it ends where it neither settles nor rests where it may."""
+        """Defect of a response that neither settles nor rests where it may; None without one."""
         return self.description[0] if self.description else None
 
     @property
@@ -425,7 +419,7 @@ class Ending:
         return SettlingBand(0.0, self.band).contains(error)
 
     def returns(self, share: float) -> int:
-        """How often the mean leaves the band from this share of the record on, having been inside."""
+        """Number of times that the mean leaves the band, having been inside, from this share of the record on."""
         inside = self.is_inside(self.response.error[self.response.since(share)])
         return int(np.sum(inside[:-1] & ~inside[1:]))
 
@@ -491,7 +485,7 @@ class Ending:
         return {**metrics, **refuted, **higher}
 
     def notes(self, metrics: Mapping[str, float]) -> Iterator[str]:
-        """What a user should know of the ending and what is no defect."""
+        """Sentences on an ending that a user should know, and that name no defect."""
         response, band, begins = self.response, f"the band of {100 * self.band:.3g} %", f"at {self.case} the loop"
         if response.contact:
             yield f"at {self.case} the certificate ends {response.t[-1]:.3g} s after the step: {response.contact}"
@@ -520,7 +514,12 @@ def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Refer
     if count / 2 <= half * (1 + EDGE_ROUNDING):
         return None
     narrow = f"the settling band of +-{write_value(half, unit, 3)} is narrower than half"
-    change, wider = write_value(count, unit, 3), _wider_band(count / 2, size, band, unit)
+    measures = isinstance(band, Tolerance)
+    least, most = (count / 2, size) if measures else (count / 2 / size, 1.0)
+    digit = 10.0 ** (floor(log10(least)) - 2)
+    enough = ceil(least / digit * (1 - EDGE_ROUNDING)) * digit  # rounded up to three digits
+    shown = write_value(enough, unit, 3) if measures else f"{enough:.3g}"
+    change, wider = write_value(count, unit, 3), f"take band = {shown} or more, " if enough < most else "take "
     if sees_speed(loop):
         remedy = "a finer encoder or a longer filter of the sensor"
         return f"{narrow} the {change} by which one count changes the reading; {wider}{remedy}"
@@ -528,16 +527,6 @@ def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Refer
     tells = "tells inside from outside only by its dither's ripple" if ripple else "cannot tell inside from outside"
     remedy = "a larger step or a finer encoder"
     return f"{narrow} the encoder's count of {change}, the controller {tells}; {wider}{remedy}"
-
-
-def _wider_band(half: float, size: float, band: Band, measured: str) -> str:
-    """The words that name a wide enough band, rounded up to three digits; none where none is within the step."""
-    measures = isinstance(band, Tolerance)
-    least, most = (half, size) if measures else (half / size, 1.0)
-    unit = 10.0 ** (floor(log10(least)) - 2)
-    rounded = ceil(least / unit * (1 - EDGE_ROUNDING)) * unit
-    shown = write_value(rounded, measured, 3) if measures else f"{rounded:.3g}"
-    return f"take band = {shown} or more, " if rounded < most else "take "
 
 
 def sees_speed(loop: ClosedLoop) -> bool:

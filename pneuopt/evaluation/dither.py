@@ -59,7 +59,7 @@ VERDICT_TONES = {
 }
 
 
-class Criterion(NamedTuple):
+class DitherCriterion(NamedTuple):
     """A criterion on dithers: a metric's label and the changes of which the larger counts, absolute and relative."""
 
     label: str
@@ -68,13 +68,13 @@ class Criterion(NamedTuple):
     counts_in_hunting: bool = True
 
 
-CRITERIA: Mapping[str, Criterion] = {  # where some improve and others do not, the first that changes decides
-    "RemainingError": Criterion("largest error in the end, ripple included", 0.5, 0.05),  # [%]
-    "SettlingTimeRaw": Criterion("settling time, ripple included", 0.0, 0.05),
-    "SettlingTime": Criterion("settling time of the mean", 0.0, 0.05),
-    "SteadyStateError": Criterion("error of the mean in the end", 0.5, 0.0),  # [%]
-    "IAE": Criterion("integral of the error", 0.0, 0.05, counts_in_hunting=False),
-    "Overshoot": Criterion("overshoot", 1.0, 0.0, counts_in_hunting=False),  # [%]
+CRITERIA: Mapping[str, DitherCriterion] = {  # where some improve and others do not, the first that changes decides
+    "RemainingError": DitherCriterion("largest error in the end, ripple included", 0.5, 0.05),  # [%]
+    "SettlingTimeRaw": DitherCriterion("settling time, ripple included", 0.0, 0.05),
+    "SettlingTime": DitherCriterion("settling time of the mean", 0.0, 0.05),
+    "SteadyStateError": DitherCriterion("error of the mean in the end", 0.5, 0.0),  # [%]
+    "IAE": DitherCriterion("integral of the error", 0.0, 0.05, counts_in_hunting=False),
+    "Overshoot": DitherCriterion("overshoot", 1.0, 0.0, counts_in_hunting=False),  # [%]
 }
 NO_RIVAL = "gains tuned without dither may do as well: none were compared (tune_without_dither finds them)"
 PRICE_METRICS = {
@@ -204,8 +204,13 @@ def judge_dither(
     plain = plain.with_values({DITHER_AMPLITUDE: 0.0})
     before, after = (_read_endings(loop, steps, p, band) for p in (plain, full))
     effect = dither_effect(loop, steps[0], full, speed=after[0].speed)
-    pairs = zip(steps, after, strict=True)
-    objections = [text for step, found in pairs for text in _object_to_swing(step, found, effect)]
+    axis, signal, objections = loop.plant.axis or Axis(), loop.feedback, list[str]()
+    moving = {axis.speed: effect.speed, axis.position: effect.travel}.get(signal.name, nan)
+    for step, ending in zip(steps, after, strict=True):  # the swing in the end, or while the body moves
+        swing, size = max(ending.ripple, 0.0 if isnan(moving) else 2 * moving), abs(step.nominal_size)
+        if swing >= MAX_RIPPLE_SHARE * size:
+            swings = f"{signal.name} by {format_with_prefix(swing, signal.unit)} from peak to peak"
+            objections.append(f"worse: the dither swings {swings}, {100 * swing / size:.0f} % of the step")
     found = _compare(before, after, objections, is_tuned=without is not None)
     reasons = (*found.reasons, *explain_effect(loop, effect, full))
     return DitherVerdict(found.usefulness, reasons, found.table, effect, found.baseline, loop.command.unit)
@@ -287,7 +292,7 @@ def judge_compensators(
 
 @dataclass(frozen=True, eq=False)
 class DitheredEnding:
-    """How a response ends, its dither's ripple included."""
+    """Ending of a response, its dither's ripple included."""
 
     # Those of `evaluate`, with the settling times and the error of the continued response, infinite where it never
     # settles, and RemainingError, the largest error of the signal itself over the last cycles [% of the step].
@@ -298,7 +303,7 @@ class DitheredEnding:
     ripple_note: str | None  # sentence where only the mean settles
 
     def describe(self, which: str) -> Iterator[str]:
-        """What a table of metrics does not show, a sentence each; `which` is "with" or "without" the dither."""
+        """Sentences on an ending that a table of metrics does not show; `which` is "with" or "without" the dither."""
         response, cycle = self.ending.response, self.ending.cycle
         if cycle is not None:
             yield f"{which} it the loop ends in {cycle.describe(response.loop.feedback.unit)}"
@@ -379,7 +384,7 @@ def _format_metric(metric: str, value: float, loop: ClosedLoop) -> str:
 def _read_endings(
     loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, band: Band
 ) -> list[DitheredEnding]:
-    """How a loop's response to each reference ends."""
+    """Endings of a loop's responses, one for each reference."""
     return [read_ending(found, band) for found in evaluate_cases(loop, steps, parameters, band=band)]
 
 
@@ -404,7 +409,14 @@ def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
         means = period_mean(response.t, signal, response.reference.initial, response.period, response.times)
         swing = float(measure_ripple(response.times, signal[:, :k] - means, response.period)[0])
     metrics, note = {**found.metrics, **errors, **settled}, describe_ripple(found.metrics, size, share)
-    return DitheredEnding(metrics, ending, swing, _largest_speed(found), note)
+    axis, run, fastest = found.loop.plant.axis, found.response, None  # the largest mean speed within the horizon
+    if axis is not None and found.loop.feedback.name == axis.position and axis.speed in run:
+        speed, period = run[axis.speed], found.loop.dither_period(found.parameters)
+        if period is not None and period <= run.t[-1] - run.t[0]:
+            at = run.t[run.t <= run.t[-1] - period / 2]
+            speed = period_mean(run.t, speed[None], float(speed[0]), period, at)[0]
+        fastest = float(speed[np.abs(speed).argmax()])
+    return DitheredEnding(metrics, ending, swing, fastest, note)
 
 
 def begin_of_end(ending: Ending) -> float:
@@ -421,34 +433,11 @@ def begin_of_end(ending: Ending) -> float:
 
 
 def _settling_time(ending: Ending, within_horizon: float, t: Array, error: Array) -> float:
-    """That within the horizon, if the continuation does not refute it; else its own; infinite for never [s]."""
+    """Settling time within the horizon unless the continuation refutes it; else its own; infinite for never [s]."""
     inside = ending.is_inside(error)
     if isfinite(within_horizon) and inside[t > ending.response.horizon].all():
         return within_horizon
     return entry_for_good(t, inside)
-
-
-def _largest_speed(found: CaseEvaluation) -> float | None:
-    """The largest mean speed of a positioned body within the horizon [its unit]; None for other loops."""
-    axis, period, run = found.loop.plant.axis, found.loop.dither_period(found.parameters), found.response
-    if axis is None or found.loop.feedback.name != axis.position or axis.speed not in run:
-        return None
-    speed = run[axis.speed]
-    if period is not None and period <= run.t[-1] - run.t[0]:
-        at = run.t[run.t <= run.t[-1] - period / 2]
-        speed = period_mean(run.t, speed[None], float(speed[0]), period, at)[0]
-    return float(speed[np.abs(speed).argmax()])
-
-
-def _object_to_swing(reference: Reference, found: DitheredEnding, effect: DitherEffect) -> Iterator[str]:
-    """Objection to a dither that swings the signal by a large part of the step, in the end or while the body moves."""
-    loop = found.ending.response.loop
-    signal, axis = loop.feedback, loop.plant.axis or Axis()
-    moving = {axis.speed: effect.speed, axis.position: effect.travel}.get(signal.name, nan)
-    swing, size = max(found.ripple, 0.0 if isnan(moving) else 2 * moving), abs(reference.nominal_size)
-    if swing >= MAX_RIPPLE_SHARE * size:
-        text = f"worse: the dither swings {signal.name} by {format_with_prefix(swing, signal.unit)} from peak to peak"
-        yield f"{text}, {100 * swing / size:.0f} % of the step"
 
 
 def dither_effect(
@@ -506,10 +495,20 @@ def describe_swing(
 def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
     """Sentences on why the dither acts as it does: clipping, lag and dead zone, static friction, motion."""
     p, e, sentences = parameters, effect, list[str]()
-    sentences += _describe_clipping(loop, p)
     axis = loop.plant.axis or Axis()
-    if axis.final_element is not None and not isnan(e.valve_gain):
-        sentences.append(_describe_final_element(axis.final_element, e, p))
+    element = axis.final_element
+    low, high, whose = command_range(loop, p)
+    least, most = (p.value(DITHER_OFFSET) + side * p.value(DITHER_AMPLITUDE) for side in (-1, 1))
+    if least < low or most > high:
+        reached = f"offset and amplitude alone reach {least:.3g} to {most:.3g} {loop.command.unit}"
+        ends = f"{whose} ends at {low:.3g} and {high:.3g} {loop.command.unit}"
+        sentences.append(f"{reached}, and {ends}: the peaks are cut")
+    if element is not None and not isnan(e.valve_gain):
+        dead = p.value(element.dead_zone)
+        lag = f" at {p.value(element.bandwidth):.3g} Hz bandwidth" if element.bandwidth in p else ""
+        zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
+        follows = f"the {element.moving_part} follows {100 * e.valve_gain:.0f} % of the dither{lag}"
+        sentences.append(f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}")
     static = next((p.value(f"friction.{n}") for n in ("static", "coulomb") if f"friction.{n}" in p), nan)
     if not isnan(e.force):
         against = "" if isnan(static) else f" against a static friction of {static:.3g} {axis.force}"
@@ -520,9 +519,9 @@ def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: Parameter
         unit = next(q.unit for q in loop.plant.states if q.name == axis.speed)
         speed, travel = format_with_prefix(e.speed, unit), format_with_prefix(e.travel, unit.removesuffix("/s"))
         sentences.append(f"a moving {axis.noun} swings by +-{speed} and +-{travel}")
-    if axis.final_element is not None and not isnan(e.drive_frequency):
+    if element is not None and not isnan(e.drive_frequency):
         ratio = e.frequency / e.drive_frequency
-        natural = f"the {e.drive_frequency:.3g} Hz at which the load swings on the {axis.final_element.medium}"
+        natural = f"the {e.drive_frequency:.3g} Hz at which the load swings on the {element.medium}"
         sentences.append(f"the dither's {e.frequency:.3g} Hz are {ratio:.2g} times {natural}")
     return tuple(sentences)
 
@@ -544,7 +543,7 @@ def format_with_prefix(value: float, unit: str) -> str:
 def _operating_points(
     loop: ClosedLoop, axis: Axis, reference: Reference, speed: float | None
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """What is known of the plant where the body moves, half way of a step in position, and where it is held."""
+    """Known values of the plant where the body moves, half way of a step in position, and where it is held."""
     if loop.feedback.name == axis.position:
         half = (reference.initial + reference.final) / 2
         fast = reference.size / (reference.horizon - reference.at) if speed is None else speed
@@ -582,28 +581,6 @@ def _add_effect_at_rest(
     block[0, 0] = 0.0  # without friction
     rate = float(np.abs(np.linalg.eigvals(block)).max())
     return replace(found, spool=spool, valve_gain=spool / command, force=float(force), drive_frequency=rate / (2 * pi))
-
-
-def _describe_final_element(element: FinalElement, e: DitherEffect, p: ParameterSet) -> str:
-    """Sentence on how far the final element follows the dither, and on its dead zone."""
-    dead = p.value(element.dead_zone)
-    lag = f" at {p.value(element.bandwidth):.3g} Hz bandwidth" if element.bandwidth in p else ""
-    zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
-    follows = f"the {element.moving_part} follows {100 * e.valve_gain:.0f} % of the dither{lag}"
-    return f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}"
-
-
-def _describe_clipping(loop: ClosedLoop, p: ParameterSet) -> list[str]:
-    """Sentence where offset and amplitude alone exceed the limits of command or final element; none otherwise."""
-    low, high, whose = command_range(loop, p)
-    least, most = (p.value(DITHER_OFFSET) + side * p.value(DITHER_AMPLITUDE) for side in (-1, 1))
-    if low <= least and most <= high:
-        return []
-    unit = loop.command.unit
-    return [
-        f"offset and amplitude alone reach {least:.3g} to {most:.3g} {unit}, and {whose} ends at {low:.3g} and "
-        f"{high:.3g} {unit}: the peaks are cut"
-    ]
 
 
 def _try_rest(plant: System, p: ParameterSet, known: Mapping[str, float]) -> Rest | None:

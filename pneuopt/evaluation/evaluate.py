@@ -246,7 +246,7 @@ def metric_units(loop: ClosedLoop) -> dict[str, str]:
 
 
 def relevant_units(loop: ClosedLoop) -> dict[str, str]:
-    """As `metric_units`, less those of a dither or a position that the loop has not; the step's size has the key ""."""
+    """Units of `metric_units`, less those of a dither or position that the loop lacks; the step's size has key ""."""
     left_out = {n for n, metric in METRICS.items() if metric.positions and loop.controller.sensed_signal.order != 0}
     left_out |= set() if loop.dither is not None else set(DITHER_METRICS)
     units = {n: unit for n, unit in metric_units(loop).items() if n not in left_out}
@@ -283,7 +283,11 @@ def report_metrics(
     hunts = LIMIT_CYCLE_METRICS[0] in metrics.index and bool((metrics.loc[LIMIT_CYCLE_METRICS[0]] > 0).any())
     rows = []
     for metric in (m for m in units if m in metrics.index and (hunts or m not in LIMIT_CYCLE_METRICS)):
-        now, then = (_metric_values(frame, metric, several) for frame in (metrics, other))
+        now: list[float] = metrics.T[metric].tolist()
+        then: list[float] = other.T[metric].tolist() if other is not None and metric in other.index else []
+        if several:
+            worst = min if larger_is_better(metric) else max
+            now, then = ([nan if any(map(isnan, v)) else worst(v)] if v else [] for v in (now, then))
         cells = [metric_cell(metric, v) for v in now]
         if other is not None:
             beside_cells = [metric_cell(metric, v, 3) for v in then] or [""] * len(cells)
@@ -301,12 +305,3 @@ def metric_cell(metric: str, value: float, digits: int = 4, least_percent: float
     if percent_factor(metric) == 100 and 0 < abs(value) < least_percent:
         return f"<{TIED}{least_percent:g}"
     return format_number(value, digits)
-
-
-def _metric_values(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float]:
-    if frame is None or metric not in frame.index:
-        return []
-    values: list[float] = frame.T[metric].tolist()
-    worst = min if larger_is_better(metric) else max
-    unknown = any(isnan(v) for v in values)
-    return [nan if unknown else worst(values)] if several else values

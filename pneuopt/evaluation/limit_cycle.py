@@ -38,7 +38,6 @@ from pneuopt.evaluation.tolerances import (
     MIN_KEPT_ERROR,
     MIN_PUSH,
     MIN_RELATIVE_AMPLITUDE,
-    MIN_STANDSTILLS,
     PHASES_PER_CYCLE,
     READINGS_A_SECOND,
     SIMULATION_TOLERANCE,
@@ -241,7 +240,7 @@ class NoHunting:
 
 
 class RestKind(Enum):
-    """How a loop ends; the value is the word in tables."""
+    """Ending of a loop; the value is the word in tables."""
 
     RESTS = "rests"
     PUSHED = "pushed"
@@ -252,7 +251,7 @@ class RestKind(Enum):
 
 @dataclass(frozen=True)
 class RestCase:
-    """How a loop ends in one case.
+    """Ending of a loop in one case.
 
     Attributes
     ----------
@@ -287,7 +286,7 @@ class RestCase:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestCheck(Result):
-    """What `check_rest` found; prints its `summary()`.
+    """Findings of `check_rest`; prints its `summary()`.
 
     Attributes
     ----------
@@ -409,9 +408,13 @@ def check_rest(
 def _watch(loop: ClosedLoop, rig: Rig | None, case: TuningCase, parameters: ParameterSet, duration: float) -> RestCase:
     p, reference = case.case_parameters(parameters), case.reference
     start = case.initial(loop, parameters)
-    inputs = _hold_end(
-        loop_inputs(loop, reference, sample_spacing(loop, reference, p)), reference.at + duration, loop.pid.sample_time
-    )
+    inputs = loop_inputs(loop, reference, sample_spacing(loop, reference, p))
+    left = reference.at + duration - inputs.t[-1]
+    h = loop.pid.sample_time or max(left, 1e-9)
+    count = int(np.ceil(left / h - 1e-9))
+    if count > 0:  # the last values are held, sample by sample where the controller is sampled
+        t = np.concatenate([inputs.t, inputs.t[-1] + h * np.arange(1, count + 1)])
+        inputs = Trajectory(t, {n: np.append(inputs[n], np.full(count, inputs[n][-1])) for n in inputs})
     if rig is not None:
         recorded = record(rig, inputs, p, initial=start)
         run, events = recorded.truth, recorded.events
@@ -424,16 +427,6 @@ def _watch(loop: ClosedLoop, rig: Rig | None, case: TuningCase, parameters: Para
         found = simulate_stick_slip(loop, inputs, p, initial=start, t_out=t_out, rtol=rtol, atol=atol)
         run, events = found.trajectory, found.events
     return _read_rest(loop, case, run, [e for e in events if e.t >= reference.at], p)
-
-
-def _hold_end(inputs: Trajectory, until: float, sample_time: float | None) -> Trajectory:
-    """Inputs whose last values are held until an instant [s], sample by sample where the controller is sampled."""
-    h = sample_time or max(until - inputs.t[-1], 1e-9)
-    count = int(np.ceil((until - inputs.t[-1]) / h - 1e-9))
-    if count <= 0:
-        return inputs
-    t = np.concatenate([inputs.t, inputs.t[-1] + h * np.arange(1, count + 1)])
-    return Trajectory(t, {n: np.append(inputs[n], np.full(count, inputs[n][-1])) for n in inputs})
 
 
 def _read_rest(
@@ -471,16 +464,16 @@ def _read_rest(
 def _kind(
     error: Array, run: Trajectory, stands: Array, late_breaks: Sequence[Event], late: Mask, still: float
 ) -> RestKind:
-    """How a run ends; a body that moves by less than `still` over its second half only dies away."""
+    """Ending of a run; a body that moves by less than `still` over its second half only dies away."""
     if not late_breaks:
         if not run["stuck"][-1]:
             return RestKind.RESTS if np.ptp(error[late]) <= still else RestKind.MOVES
         command = run["control"]
         pushed = np.ptp(command[late]) > MIN_PUSH * np.abs(command).max()
         return RestKind.PUSHED if pushed else RestKind.RESTS
-    if len(stands) < MIN_STANDSTILLS:
+    if len(stands) < MIN_CYCLES:
         return RestKind.UNDECIDED
-    sizes = np.abs(np.interp(stands, run.t, error))[-MIN_STANDSTILLS:]
+    sizes = np.abs(np.interp(stands, run.t, error))[-MIN_CYCLES:]
     return RestKind.HUNTS if np.all(sizes[1:] >= MIN_KEPT_ERROR * sizes[:-1]) else RestKind.UNDECIDED
 
 
@@ -489,8 +482,15 @@ def _describe(loop: ClosedLoop, p: ParameterSet, kind: RestKind, error: Array, p
     unit = loop.feedback.unit
     off = write_value(float(abs(error[-1])), unit, 3)
     if kind is RestKind.HUNTS:
-        size, cycle = write_value(float(np.ptp(error) / 2), unit, 3), write_value(period, "s", 3)
-        return f"hunts by +-{size}, a cycle in {cycle}{_hunting_cause(loop, p)}"
+        size, cycle, cause = write_value(float(np.ptp(error) / 2), unit, 3), write_value(period, "s", 3), ""
+        static, coulomb = (p.value(n) if n in p else nan for n in ("friction.static", "friction.coulomb"))
+        if loop.gains(loop.parameter_vector(p))[1] and static > coulomb:  # an integral, friction that falls on sliding
+            cause = (
+                f": the integral pushes the stuck body until it breaks away, and its static friction, "
+                f"{static / coulomb:.3g} times Coulomb's, lets it jump beyond; give the integral a dead band wider "
+                "than the error at rest"
+            )
+        return f"hunts by +-{size}, a cycle in {cycle}{cause}"
     if kind is RestKind.PUSHED:
         return (
             f"sticks {off} from the reference, and its command still changes by {push:.2g} {loop.command.unit}/s: "
@@ -501,14 +501,3 @@ def _describe(loop: ClosedLoop, p: ParameterSet, kind: RestKind, error: Array, p
         RestKind.MOVES: f"still moves at the end, {off} from the reference",
         RestKind.UNDECIDED: f"slips on, {off} from the reference at the end: watch it longer, duration=",
     }[kind]
-
-
-def _hunting_cause(loop: ClosedLoop, p: ParameterSet) -> str:
-    """Why a loop hunts where it is an integral and a friction that falls once the body slides; empty otherwise."""
-    static, coulomb = (p.value(n) if n in p else nan for n in ("friction.static", "friction.coulomb"))
-    if not loop.gains(loop.parameter_vector(p))[1] or not static > coulomb:
-        return ""
-    return (
-        f": the integral pushes the stuck body until it breaks away, and its static friction, {static / coulomb:.3g} "
-        "times Coulomb's, lets it jump beyond; give the integral a dead band wider than the error at rest"
-    )

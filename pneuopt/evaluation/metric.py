@@ -35,9 +35,9 @@ from pneuopt.evaluation.tolerances import (
     EDGE_ROUNDING,
     FINAL_PERIODS,
     MIN_STAY_RATIO,
-    MIN_WAVE_PHASES,
     RIPPLE_ALLOWANCE,
     SAMPLE_SHARE,
+    SAMPLES_A_DITHER_PERIOD,
     TAIL_SHARE,
 )
 from pneuopt.quantities.arrays import Array, Mask
@@ -299,9 +299,13 @@ def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) ->
     """Centred means over a period at k instants, shape (m, k), of signals (m, n), linear in between, or `initial`."""
     steps = 0.5 * np.diff(t) * (y[:, 1:] + y[:, :-1])
     whole = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
-    ends = (_integral(t, y, whole, initial, at + side * period / 2) for side in (1, -1))
-    mean: Array = (next(ends) - next(ends)) / period
-    return mean
+    ends = list[Array]()
+    for to in (at + period / 2, at - period / 2):  # the integral from the first sample on
+        k = np.clip(np.searchsorted(t, to, side="right") - 1, 0, len(t) - 2)
+        ahead = to - t[k]
+        inside = whole[:, k] + ahead * (y[:, k] + 0.5 * ahead * (y[:, k + 1] - y[:, k]) / (t[k + 1] - t[k]))
+        ends.append(np.where(to < t[0], initial * (to - t[0]), inside))
+    return np.asarray((ends[0] - ends[1]) / period)
 
 
 def end_mean(t: Array, y: Array, period: float) -> Array:
@@ -362,14 +366,6 @@ class DitherPeriodMean:
         total = near * (shift(Y, m) - shift(Y, -m)) + far * (shift(Y, m + 1) - shift(Y, -m - 1))
         total += slope_near * (shift(y, m) + shift(y, -m)) + slope_far * (shift(y, m + 1) + shift(y, -m - 1))
         return np.asarray(total / self.period)
-
-
-def _integral(t: Array, y: Array, whole: Array, initial: float, at: Array) -> Array:
-    """Integral from the first sample to `at`, from the integrals `whole` up to each sample."""
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    ahead = at - t[k]
-    inside: Array = whole[:, k] + ahead * (y[:, k] + 0.5 * ahead * (y[:, k + 1] - y[:, k]) / (t[k + 1] - t[k]))
-    return np.where(at < t[0], initial * (at - t[0]), inside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,7 +443,7 @@ def wave_instants(t: Array, period: float) -> tuple[Array, Array]:
     """Instants in the last whole periods, and their weights in the mean over the periods, shape (periods, phases)."""
     length = t[-1] - t[0]
     count = max(1, min(int(max(FINAL_PERIODS, TAIL_SHARE * length / period)), int(length / period + 1e-9)))
-    phases = max(MIN_WAVE_PHASES, int(np.ceil(period / np.median(np.diff(t)) - 1e-9)))
+    phases = max(SAMPLES_A_DITHER_PERIOD, int(np.ceil(period / np.median(np.diff(t)) - 1e-9)))
     at = t[-1] + period * count * (np.arange(1 - count * phases, 1) / (count * phases))
     hann = np.sin(np.pi * (np.arange(count * phases) + 0.5) / (count * phases)).reshape(count, phases) ** 2
     return at, hann / hann.sum(axis=0)

@@ -35,7 +35,6 @@ from pneuopt.evaluation.tolerances import (
     LINE_TOLERANCE,
     MAX_INSTANTS,
     MIN_SETTLED_PERIODS,
-    PARTS_AT_A_TIME,
     SPREAD,
 )
 from pneuopt.quantities.arrays import Array, Indices
@@ -251,8 +250,7 @@ def batch_metrics(
         **_rise_metrics(smooth, initial, reference_final, steady, only),
         "SettlingTime": np.where(only_mean, nan, settled),
         "SettlingTimeRaw": settled_raw,
-        **(_overshoot_metrics(smooth, steady, reference_final, initial, only) if scale is None else {}),
-        **({} if scale is None else _deviation_metrics(smooth, reference_final, scale)),
+        **_peak_metrics(smooth, steady, reference_final, initial, scale, only),
         "SteadyStateValue": steady,
         **({"Ripple": np.maximum(ripple, np.ptp(tail(raw.t, raw.y), axis=1))} if _wants(only, "Ripple") else {}),
         **({"SettlingTimes": np.transpose(times)} if wider else {}),
@@ -322,9 +320,16 @@ def _rise_metrics(
     }
 
 
-def _overshoot_metrics(
-    record: Samples, steady: Array, reference: float, initial: float, only: Collection[str] | None
+def _peak_metrics(
+    record: Samples, steady: Array, reference: float, initial: float, scale: float | None, only: Collection[str] | None
 ) -> dict[str, Array]:
+    """The peak of a step and what lies beyond and below; of a disturbance its largest deviation, in place of a rise."""
+    if scale is not None:
+        k = np.argmax(np.abs(record.y - reference), axis=1)
+        peak, none = pick_samples(record.y, k), np.zeros(len(record.y))
+        beyond = 100 * np.abs(peak - reference) / abs(scale)
+        found = {"OvershootFinal": beyond, "Peak": peak, "PeakTime": record.t[k]}
+        return found | {"RiseTime": none, "Undershoot": none}
     if not _wants(only, "OvershootFinal", "Undershoot", "Peak", "PeakTime"):
         return {}
     size, change = reference - initial, steady - initial
@@ -338,15 +343,6 @@ def _overshoot_metrics(
         "Peak": peak,
         "PeakTime": record.t[k],
     }
-
-
-def _deviation_metrics(record: Samples, reference: float, size: float) -> dict[str, Array]:
-    """Peak deviation of a response to a disturbance, which takes the place of rise and overshoot."""
-    k = np.argmax(np.abs(record.y - reference), axis=1)
-    peak, none = pick_samples(record.y, k), np.zeros(len(record.y))
-    beyond = 100 * np.abs(peak - reference) / abs(size)
-    found = {"OvershootFinal": beyond, "Peak": peak, "PeakTime": record.t[k]}
-    return found | {"RiseTime": none, "Undershoot": none}
 
 
 def meter_channels(plant: System) -> tuple[str, ...]:
@@ -430,9 +426,8 @@ def refine_instants(
         coarse |= np.diff(t) ** 3 / 12 * _curvatures(t, integrand) > most
     fine = np.diff(t) > 8 * np.spacing(t[-1])
     chosen = np.flatnonzero(coarse & fine)
-    if not len(chosen) or len(t) + (PARTS_AT_A_TIME - 1) * len(chosen) > MAX_INSTANTS:
-        return None
-    return _divide(t, chosen)
+    finer = _divide(t, chosen) if len(chosen) else None
+    return None if finer is None or len(finer) > MAX_INSTANTS else finer
 
 
 def spread_instants(even: Array, needed: Array, start: float) -> Array:
@@ -452,9 +447,9 @@ def spread_instants(even: Array, needed: Array, start: float) -> Array:
         t = _divide(t, chosen)
 
 
-def _divide(t: Array, chosen: Indices) -> Array:
-    """Instants with those added that divide the chosen intervals."""
-    added = t[chosen, None] + np.diff(t)[chosen, None] * np.arange(1, PARTS_AT_A_TIME) / PARTS_AT_A_TIME
+def _divide(t: Array, chosen: Indices, parts: int = 8) -> Array:
+    """Instants with those added that divide the chosen intervals into so many parts."""
+    added = t[chosen, None] + np.diff(t)[chosen, None] * np.arange(1, parts) / parts
     return np.sort(np.concatenate([t, added.ravel()]))
 
 

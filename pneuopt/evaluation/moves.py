@@ -11,6 +11,7 @@ falling branch of a Stribeck curve; the shortest ones, each from a dwell, break 
 """
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil, copysign, inf, log
 
@@ -29,8 +30,6 @@ from pneuopt.evaluation.margins import margins
 from pneuopt.evaluation.response import TuningCase, check_travel, command_range
 from pneuopt.evaluation.tolerances import (
     ALLOWED_SHARE,
-    FIRST_GAIN,
-    FIRST_PUSH,
     GAIN_STEP,
     GUESS_SHARE,
     GUESSED_SENSITIVITY,
@@ -43,11 +42,6 @@ from pneuopt.evaluation.tolerances import (
     MARGIN_SHARE,
     MEDIUM,
     MOST_FACTOR,
-    MOST_TRIES,
-    MOVE_BISECTIONS,
-    PUSH_FACTOR,
-    PUSH_SAMPLES,
-    PUSH_TOLERANCE,
     REST_BEFORE,
     SETTLED_SHARE,
 )
@@ -117,9 +111,8 @@ def shortest_move(loop: ClosedLoop, move: Move, parameters: ParameterSet) -> Mov
     low, high = 0.0, 1.0
     while high < MOST_FACTOR and not can.find_obstacle(scale_move(move, high)):
         low, high = high, 2 * high
-    for _ in range(MOVE_BISECTIONS if low < MOST_FACTOR else 0):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if can.find_obstacle(scale_move(move, middle)) else (middle, high)
+    if low < MOST_FACTOR:
+        low = _bisect(lambda factor: not can.find_obstacle(scale_move(move, factor)), low, high)
     require(low > 0, f"reference {move.label}: {can.find_obstacle(move)}")
     return scale_move(move, ALLOWED_SHARE * low)
 
@@ -136,9 +129,17 @@ def scale_move(move: Move, factor: float) -> Move:
     return replace(move, speed=speed, acceleration=acceleration, jerk=jerk)
 
 
+def _bisect(holds: Callable[[float], bool], low: float, high: float, halvings: int = 20) -> float:
+    """The largest value for which a condition holds, given one for which it does and one for which it does not."""
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
+
+
 @dataclass(frozen=True, eq=False)
 class _Abilities:
-    """What a plant can at most, forwards along a move."""
+    """Abilities of a plant, forwards along a move."""
 
     loop: ClosedLoop
     parameters: ParameterSet  # of the case
@@ -151,20 +152,24 @@ class _Abilities:
         """The reason why a move cannot be made, with what can; empty where none is found."""
         half = move.duration / 2
         speed, acceleration = (float(np.abs(a).max()) for a in move.motion(move.at + np.linspace(0, half, 200))[1:])
-        return self._speed_obstacle(speed) or self._force_obstacle(move, acceleration, half)
-
-    def _speed_obstacle(self, speed: float) -> str:
-        """Where no command within the limits keeps up the speed."""
-        if self._moves_steadily(speed):
-            return ""
-        low, high = 0.0, speed
-        for _ in range(MOVE_BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self._moves_steadily(middle) else (low, middle)
-        most, wanted = (self._write(v, "/s") for v in (low, speed))
-        least, most_allowed, whose = self.limits
-        of = f"{whose}'s limits {least:.3g} and {most_allowed:.3g} {self.loop.command.unit}"
-        return f"it moves at {wanted}, within {of} the plant moves at {most} at most; lower its speed"
+        if not self._moves_steadily(speed):
+            most, wanted = (self._write(v, "/s") for v in (_bisect(self._moves_steadily, 0.0, speed), speed))
+            least, most_allowed, whose = self.limits
+            of = f"{whose}'s limits {least:.3g} and {most_allowed:.3g} {self.loop.command.unit}"
+            return f"it moves at {wanted}, within {of} the plant moves at {most} at most; lower its speed"
+        way, reached = abs(move.distance) / 2, float(self.push["acceleration"].max())
+        full = f"{self.limits[1 if self.side > 0 else 0]:.3g} {self.loop.command.unit}"
+        message = f"full command ({full}) from rest"
+        if acceleration > reached:
+            wanted, most = (self._write(v, "/s^2") for v in (acceleration, ALLOWED_SHARE * reached))
+            return f"it accelerates with {wanted}, {message} with {most}; lower its acceleration"
+        ahead = np.maximum.accumulate(self.push["way"])
+        time = float(np.interp(way, ahead, self.push.t)) if ahead[-1] >= way else inf
+        if time > half:
+            best = f"takes {time:.3g} s" if time < inf else f"has not come so far in {self.push.t[-1]:.3g} s"
+            shortest = f", so that the move takes {2 * time:.3g} s at least" if time < inf else ""
+            return f"its first half takes {half:.3g} s, {message} {best}{shortest}; lower its acceleration and speed"
+        return ""
 
     def _moves_steadily(self, speed: float) -> bool:
         hook, axis = self.loop.plant.rest_hook, self.loop.plant.axis
@@ -177,28 +182,12 @@ class _Abilities:
         low, high, _ = self.limits
         return low <= rest.inputs.get(self.loop.command.name, 0.0) <= high
 
-    def _force_obstacle(self, move: Move, acceleration: float, half: float) -> str:
-        """Where full command from rest does not come so far, or not accelerate so much."""
-        way, reached = abs(move.distance) / 2, float(self.push["acceleration"].max())
-        full = f"{self.limits[1 if self.side > 0 else 0]:.3g} {self.loop.command.unit}"
-        message = f"full command ({full}) from rest"
-        if acceleration > reached:
-            wanted, most = (self._write(v, "/s^2") for v in (acceleration, ALLOWED_SHARE * reached))
-            return f"it accelerates with {wanted}, {message} with {most}; lower its acceleration"
-        ahead = np.maximum.accumulate(self.push["way"])
-        time = float(np.interp(way, ahead, self.push.t)) if ahead[-1] >= way else inf
-        if time > half:
-            best = f"takes {time:.3g} s" if time < inf else f"has not come so far in {self.push.t[-1]:.3g} s"
-            least = f", so that the move takes {2 * time:.3g} s at least" if time < inf else ""
-            return f"its first half takes {half:.3g} s, {message} {best}{least}; lower its acceleration and speed"
-        return ""
-
     def _write(self, value: float, per: str) -> str:
         return write_value(value, f"{self.loop.feedback.unit}{per}", 3)
 
 
 def _abilities(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> _Abilities | None:
-    """What the plant of a case can; None where the loop is not on an axis's position, or nothing limits the command."""
+    """Abilities of a case's plant; None where the loop is not on an axis's position, or nothing limits the command."""
     own, axis, move = case.case_parameters(parameters), loop.plant.axis, case.reference
     limits = command_range(loop, own)
     if axis is None or loop.feedback.name != axis.position or not np.isfinite(limits[:2]).all():
@@ -213,32 +202,37 @@ def _abilities(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> 
     return _Abilities(loop, own, limits, move.initial, side, push)
 
 
-def _push_half_way(loop: ClosedLoop, axis: Axis, own: ParameterSet, x: Array, command: float, move: Move) -> Trajectory:
+def _push_half_way(
+    loop: ClosedLoop,
+    axis: Axis,
+    own: ParameterSet,
+    x: Array,
+    command: float,
+    move: Move,
+    *,
+    first: float = 0.1,  # share of the move over which the command is tried first
+    factor: float = 1.4,  # from one duration to the next
+    samples: int = 300,
+    tolerance: float = 1e-7,  # its figures are shown with three digits
+) -> Trajectory:
     """The plant from rest at a constant command, along the move, until it has come half way or hardly moves."""
-    duration, half = FIRST_PUSH * move.duration, abs(move.distance) / 2
+    duration, half, side = first * move.duration, abs(move.distance) / 2, copysign(1.0, move.distance)
+    inputs = {q.name: np.full(2, command if q.name == loop.command.name else 0.0) for q in loop.plant.inputs}
     while True:
-        run = _push(loop, own, x, command, duration)
-        side, position = copysign(1.0, move.distance), run[axis.position]
+        held, t = Trajectory(np.array([0.0, duration]), inputs), np.linspace(0.0, duration, samples + 1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PhysicsWarning)  # it may well meet an end stop, later than it matters
+            try:
+                run = simulate(loop.plant, held, own, initial=x, t_out=t, rtol=tolerance, atol=tolerance)
+            except ConvergenceError as error:
+                if not isinstance(error.solution, Trajectory) or len(error.solution) <= 2:
+                    raise
+                run = error.solution  # up to where the model ends, beyond an end stop for instance
+        position = run[axis.position]
         way, speed = side * (position - position[0]), side * run[axis.speed]
         if way.max() >= half or duration >= LONGEST_PUSH or run.t[-1] < duration:
             return Trajectory(run.t, {"way": way, "speed": speed, "acceleration": np.gradient(speed, run.t)})
-        duration *= PUSH_FACTOR
-
-
-def _push(loop: ClosedLoop, own: ParameterSet, x: Array, command: float, duration: float) -> Trajectory:
-    """The plant's run at a constant command; shorter where the model ends, beyond an end stop for instance."""
-    inputs = {q.name: np.full(2, command if q.name == loop.command.name else 0.0) for q in loop.plant.inputs}
-    ends, t = np.array([0.0, duration]), np.linspace(0.0, duration, PUSH_SAMPLES + 1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PhysicsWarning)  # it may well meet an end stop, later than it matters
-        try:
-            return simulate(
-                loop.plant, Trajectory(ends, inputs), own, initial=x, t_out=t, rtol=PUSH_TOLERANCE, atol=PUSH_TOLERANCE
-            )
-        except ConvergenceError as error:
-            if isinstance(error.solution, Trajectory) and len(error.solution) > 2:
-                return error.solution
-            raise
+        duration *= factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +263,7 @@ class ExcitationRun:
 
     @property
     def duration(self) -> float:
-        """Of the run [s]."""
+        """Duration of the run [s]."""
         return self.moves.horizon
 
     @property
@@ -336,8 +330,15 @@ def excitation_run(
     moves = _sequence(ends, fast, p.value("pid.Kp") * fast.speed / abs(command))
     for move in {(abs(m.distance), m.speed): m for m in moves.chain}.values():
         check_move(loop, replace(move, at=0.0), p)
-    response, (rear, front) = _simulate(loop, p, moves, sample_time), _end_stops(plant, p)
-    position, (low, high) = response[loop.feedback.name], ends
+    # in fixed steps: what is read from the response has three digits
+    given, discrete = moves.trajectory(sample_time), loop.discrete()
+    x0, u = loop.initial(p, reference=moves.origin)[None], given["reference"][None, :, None]
+    h, substeps = np.full((1, len(given)), sample_time), ceil(sample_time / LONGEST_STEP)
+    run = Rollout(discrete.pieces).run(x0, u, loop.parameter_vector(p), given.t[None], h, substeps=substeps)
+    sound = bool(np.isfinite(run.y).all())
+    require(sound, "the run cannot be simulated: the drive in the file meets its end stops or cannot be controlled so")
+    response = Trajectory(given.t, dict(zip(names(discrete.outputs), run.y[0].T, strict=True)))
+    position, (low, high), (rear, front) = response[loop.feedback.name], ends, _end_stops(plant, p)
     beyond = max(low - float(position.min()), float(position.max()) - high)
     message = f"the plain controller overshoots the run by {write_value(beyond, 'm', 3)}"
     fits = beyond < GUESS_SHARE * min(low - rear, front - high)
@@ -375,12 +376,17 @@ def _fast_move(loop: ClosedLoop, p: ParameterSet, ends: tuple[float, float], spe
     return replace(shape, speed=_round(min(own, speed)), acceleration=_round(acceleration))
 
 
-def _plain_gain(loop: ClosedLoop, p: ParameterSet, ends: tuple[float, float], speed: float) -> float:
-    """The largest proportional gain that keeps the sensitivity at both ends and in the middle, sliding both ways."""
+def _plain_gain(
+    loop: ClosedLoop, p: ParameterSet, ends: tuple[float, float], speed: float, first: float = 100.0, tries: int = 80
+) -> float:
+    """The largest proportional gain that keeps the sensitivity at both ends and in the middle, sliding both ways.
+
+    The first one that is tried moves the command by so many times its range over the span.
+    """
     places = [(x, side * v) for x in (*ends, sum(ends) / 2) for side in (1, -1) for v in (speed, MEDIUM * speed)]
     points = [_sliding(loop, p, x, v) for x, v in places]
-    gain = FIRST_GAIN * p.value("pid.upper") / (ends[1] - ends[0])
-    for _ in range(MOST_TRIES):
+    gain = first * p.value("pid.upper") / (ends[1] - ends[0])
+    for _ in range(tries):
         tried = p.with_values({"pid.Kp": gain})
         found = (margins(open_loop(loop, tried, x, u)) for x, u in points)
         if all(m.stable and m.max_sensitivity <= GUESSED_SENSITIVITY for m in found):
@@ -425,18 +431,6 @@ def _sequence(ends: tuple[float, float], fast: Move, gain: float) -> MoveSequenc
 def _place(x: float) -> float:
     """A position [m] as a file shows it whole."""
     return round(x, 5)
-
-
-def _simulate(loop: ClosedLoop, p: ParameterSet, moves: MoveSequence, sample_time: float) -> Trajectory:
-    """The loop along the moves in fixed steps: what is read from it has three digits."""
-    given = moves.trajectory(sample_time)
-    x0, u = loop.initial(p, reference=moves.origin)[None], given["reference"][None, :, None]
-    h, discrete = np.full((1, len(given)), sample_time), loop.discrete()
-    substeps = ceil(sample_time / LONGEST_STEP)
-    run = Rollout(discrete.pieces).run(x0, u, loop.parameter_vector(p), given.t[None], h, substeps=substeps)
-    sound = bool(np.isfinite(run.y).all())
-    require(sound, "the run cannot be simulated: the drive in the file meets its end stops or cannot be controlled so")
-    return Trajectory(given.t, dict(zip(names(discrete.outputs), run.y[0].T, strict=True)))
 
 
 def _end_stops(plant: System, p: ParameterSet) -> tuple[float, float]:

@@ -60,7 +60,7 @@ def monte_carlo(
         `IdentificationResult.covariance`, and `.estimates`: with these the draws are as wide as the confidence
         intervals (Student's t), and a parameter that has a range in place of an interval is drawn from anywhere in it.
     spreads : mapping, optional
-        As for `samples`; a parameter in it is drawn by it, whatever the fit says.
+        As for `samples`; a parameter in it is drawn by it, whatever the fit estimates.
     seed : int or tuple
         Plants of `samples` or `draws` are independent of these for the same seed, too.
     sampling : Sampling
@@ -112,7 +112,7 @@ def select_estimates(
 
 
 def degrees_of_freedom(estimates: "pd.DataFrame | None") -> dict[str, float]:
-    """The degrees of freedom of each estimate's variance, where a fit tells them."""
+    """The degrees of freedom of each estimate's variance, where a fit has them."""
     if estimates is None or "dof" not in estimates:
         return {}
     return {str(n): float(v) for n, v in estimates["dof"].items() if math.isfinite(v) and v > 0}
@@ -215,7 +215,7 @@ class ExpectedPlants(Shown):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What varies and by how much, a sentence a source."""
+        """Sentences on what varies and by how much, one a source."""
         stated = [a for a in self.axes if not a.is_gain and not set(a.names) & set(self.from_fit)]
         gains = [a for a in self.axes if a.is_gain]
         fitted = [a.label for a in self.axes if set(a.names) & set(self.from_fit)]
@@ -228,7 +228,7 @@ class ExpectedPlants(Shown):
         return tuple(f"{lead}: {', '.join(labels)}" for lead, labels in parts if labels)
 
     def summary(self) -> Report:
-        """How many plants, and what they differ by."""
+        """The number of plants, and their differences."""
         count = len(self.scenarios)
         lead = Line(f"{count} plant{'s' if count != 1 else ''} that the model may stand for", Tone.HEADING)
         return Report((lead, *(Line(sentence, indent=2) for sentence in self.sentences)))
@@ -287,11 +287,16 @@ def expected_plants(
     parts = zip(*((list(part.values()) or [{}] * count) for part in (varied, drawn)), strict=True)
     wide = draw_in_ranges(parameters, ranges, count, seed)
     plants = {f"plant {k + 1}": {**a, **b, **wide[k], **own[k % len(own)]} for k, (a, b) in enumerate(parts)}
-    axes = [_tolerance_axis(names, share) for names, share in shares.items()]
+    axes = list[CorrelatedParameters]()
+    for names, share in shares.items():
+        low, high = ({n: Factor(1 + side * share) for n in names} for side in (-1, 1))
+        axes.append(CorrelatedParameters(tuple(names), share, low, high, names[0].startswith(GAIN_PREFIXES)))
     if estimated is not None:
         deviations = dict(zip(map(str, estimated.index), np.sqrt(np.diag(estimated)).tolist(), strict=True))
         axes += [_estimate_axis(parameters, n, s, dof.get(n, math.inf)) for n, s in deviations.items()]
-    axes += [_range_axis(parameters, n, *ends) for n, ends in ranges.items()]
+    for n, (least, most) in ranges.items():
+        value = abs(parameters.value(n))
+        axes.append(CorrelatedParameters((n,), (most - least) / 2 / value if value else 0.0, {n: least}, {n: most}))
     return ExpectedPlants(plants if axes or known else {}, tuple(axes), from_fit, tuple(sorted(known)))
 
 
@@ -304,16 +309,6 @@ def _usual_tolerances(parameters: ParameterSet, others: Collection[str]) -> dict
         own = tuple(n for n in names if n in parameters and n not in others and parameters.value(n) != 0)
         found |= {own: share} if own else {}
     return found
-
-
-def _tolerance_axis(names: AxisNames, share: float) -> CorrelatedParameters:
-    low, high = ({n: Factor(1 + side * share) for n in names} for side in (-1, 1))
-    return CorrelatedParameters(tuple(names), share, low, high, names[0].startswith(GAIN_PREFIXES))
-
-
-def _range_axis(parameters: ParameterSet, name: str, low: float, high: float) -> CorrelatedParameters:
-    value = abs(parameters.value(name))
-    return CorrelatedParameters((name,), (high - low) / 2 / value if value else 0.0, {name: low}, {name: high})
 
 
 def _estimate_axis(parameters: ParameterSet, name: str, deviation: float, dof: float) -> CorrelatedParameters:

@@ -41,6 +41,7 @@ from pneuopt.evaluation.metric import (
 )
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
 from pneuopt.quantities.errors import require
+from pneuopt.quantities.units import ANR_DENSITY
 
 PUSH = "load.force"  # the disturbance against which a loop is stiff
 AIR_CHANNEL, POWER_CHANNEL = "air", "power"  # of a meter: mass flow from the supply [kg/s], power from the source [W]
@@ -101,7 +102,7 @@ def air_rows(record: StepRecord) -> ValuesAndSlopes:
     1.6878
     """
     mass, slopes = record.integrate_meter(AIR_CHANNEL)
-    factor = 1e3 / 1.185  # [l/kg]: air of ISO 8778 (ANR: 100 kPa, 20 degC, 65 % humidity) has 1.185 kg/m^3
+    factor = 1e3 / ANR_DENSITY  # [l/kg]
     return factor * mass, factor * slopes
 
 
@@ -113,7 +114,7 @@ def travel_rows(record: StepRecord) -> ValuesAndSlopes:
 
 @final
 class OvershootDistance(AtMost):
-    """How far the response passes the reference's end [measured unit]; under a disturbance alone, either side.
+    """Distance of the response beyond the reference's end [measured unit]; under a disturbance alone, either side.
 
     Parameters
     ----------
@@ -247,7 +248,7 @@ class RiseTime(AtMost):
 
 @final
 class Overshoot(AtMost):
-    """How far the response passes the reference, as a fraction of the step."""
+    """Distance of the response beyond the reference, as a fraction of the step."""
 
     metric = Metric(
         "Overshoot",

@@ -25,9 +25,7 @@ from pneuopt.evaluation.tolerances import (
     MIN_READINGS_A_SAMPLE,
     POINTS_PER_READING,
     READINGS_A_HORIZON,
-    RESPONSE_SAMPLES,
     SAMPLES_A_DITHER_PERIOD,
-    TRAVEL_SAMPLES,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_names, require
@@ -81,7 +79,7 @@ def sample_spacing(
     if loop.pid.sample_time is not None:
         return loop.pid.sample_time
     rate = highest_dither_frequency(loop, parameters)
-    longest = min(reference.horizon / RESPONSE_SAMPLES, 1 / (samples_a_period * rate) if rate else np.inf)
+    longest = min(reference.horizon / READINGS_A_HORIZON, 1 / (samples_a_period * rate) if rate else np.inf)
     whole = reference.at if reference.at > 0 else reference.horizon
     return float(whole / math.ceil(whole / longest - 1e-9))
 
@@ -195,18 +193,27 @@ def check_steps(
     longest = references[needed.index(max(needed))]
     on_plants = f" on {plants} plants" if plants > 1 else ""
     many = f" (one of {len(references)} references)" if len(references) > 1 else ""
-    key, digit = _finest_key(loop, longest, parameters), 10.0 ** math.floor(math.log10(sum(needed)))
+    h, rate = loop.pid.sample_time, _analogue_frequency(loop, parameters)
+    if rate and (h is None or SAMPLES_A_DITHER_PERIOD * rate * h > POINTS_PER_READING):
+        key = f"dither.frequency is {write_value(rate, 'Hz', 7)}"
+    elif h is not None:
+        key = f"pid.sample_time is {write_value(h, 's', 4)}"
+    else:
+        key = f"the step is at {write_value(longest.at, 's', 4)}"
+    seconds, digit = max(needed) * SECONDS_A_STEP, 10.0 ** math.floor(math.log10(sum(needed)))
+    shown = f"{seconds / 3600:.2g} hours" if seconds > 7200 else f"{seconds / 60:.2g} minutes"
+    time = shown if seconds <= 72 * 3600 else f"{seconds / 86400:.2g} days"
     budget = math.ceil(sum(needed) / digit) * digit  # rounded up to one digit
     raise InputError(
-        f"reference {longest.label}{many}{on_plants} takes {max(needed):.2g} steps, about "
-        f"{_duration(max(needed) * SECONDS_A_STEP)}: {key} over a horizon of {write_value(longest.horizon, 's', 7)}; "
+        f"reference {longest.label}{many}{on_plants} takes {max(needed):.2g} steps, about {time}: {key} over a horizon "
+        f"of {write_value(longest.horizon, 's', 7)}; "
         f"change that, shorten the horizon, or raise the budget of {max_steps:.2g} steps: "
         f"max_steps={budget:.0e}, in a tuning's file steps under [budget]",
     )
 
 
 def simulation_steps(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> float:
-    """How many steps the independent simulation of a response takes, at least."""
+    """Least number of steps that the independent simulation of a response takes."""
     spacing = sample_spacing(loop, reference, parameters)
     points = POINTS_PER_READING * readings_a_sample(loop, reference) * reference.horizon / spacing
     return max(points, SAMPLES_A_DITHER_PERIOD * _analogue_frequency(loop, parameters) * reference.horizon)
@@ -216,23 +223,6 @@ def _analogue_frequency(loop: ClosedLoop, parameters: ParameterSet) -> float:
     """Frequency of a dither that the integration itself resolves [Hz]; 0 for one that is sampled, and without one."""
     sampled = loop.dither is not None and loop.pid.sample_time is not None and not loop.dither.analogue
     return 0.0 if sampled else highest_dither_frequency(loop, parameters)
-
-
-def _finest_key(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> str:
-    """What sets the steps of a response, with its value: the dither, the sample time, or the step's instant."""
-    h, rate = loop.pid.sample_time, _analogue_frequency(loop, parameters)
-    if rate and (h is None or SAMPLES_A_DITHER_PERIOD * rate * h > POINTS_PER_READING):
-        return f"dither.frequency is {write_value(rate, 'Hz', 7)}"
-    if h is not None:
-        return f"pid.sample_time is {write_value(h, 's', 4)}"
-    return f"the step is at {write_value(reference.at, 's', 4)}"
-
-
-def _duration(seconds: float) -> str:
-    """Minutes, or hours, in words."""
-    if not math.isfinite(seconds) or seconds > 72 * 3600:
-        return f"{seconds / 86400:.2g} days"
-    return f"{seconds / 3600:.2g} hours" if seconds > 7200 else f"{seconds / 60:.2g} minutes"
 
 
 def check_travel(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -> None:
@@ -249,7 +239,11 @@ def check_travel(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -
             far = float((stop.side * (_values(reference)[1] - begin)).max())
             remedy = "take a smaller step" if isinstance(reference, Step) else "take a shorter way"
         elif isinstance(reference, Step):
-            far, remedy = _step_of_speed(reference, stop.side, room)
+            lead, rest = stop.side * reference.initial * reference.at, reference.horizon - reference.at
+            far = max(lead, lead + stop.side * reference.final * rest)
+            fits = (room - lead) / (stop.side * reference.final) if reference.final else inf
+            early = f"end it by horizon = {reference.at + fits:.3g} s"
+            remedy = f"{early}, or start elsewhere, start={{'position': ...}}" if fits > 0 else "start elsewhere"
         else:
             far = float((stop.side * cumulative_trapezoid(*_values(reference)[::-1])).max())
             remedy = "take less speed, or start elsewhere"
@@ -262,16 +256,7 @@ def check_travel(loop: ClosedLoop, case: TuningCase, parameters: ParameterSet) -
         )
 
 
-def _values(reference: Reference) -> tuple[Array, Array]:
-    """Instants over the horizon, and the reference there."""
-    t = np.linspace(0.0, reference.horizon, TRAVEL_SAMPLES)
+def _values(reference: Reference, count: int = 2001) -> tuple[Array, Array]:
+    """Instants over the horizon at which a reference's way is read, and the reference there."""
+    t = np.linspace(0.0, reference.horizon, count)
     return t, reference.values(t)
-
-
-def _step_of_speed(reference: Step, side: int, room: float) -> tuple[float, str]:
-    """How far a step of the speed leads to a side [m], and what to change where that is too far."""
-    lead, rest = side * reference.initial * reference.at, reference.horizon - reference.at
-    far = max(lead, lead + side * reference.final * rest)
-    fits = (room - lead) / (side * reference.final) if reference.final else inf
-    early = f"end it by horizon = {reference.at + fits:.3g} s"
-    return far, f"{early}, or start elsewhere, start={{'position': ...}}" if fits > 0 else "start elsewhere"

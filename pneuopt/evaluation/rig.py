@@ -284,7 +284,13 @@ def record(
     >>> run.experiment.trajectory["position"].round(9).tolist(), [event.t for event in run.events]
     ([0.0, 0.0, 0.023, 0.066], [0.1])
     """
-    log_inputs = _resample_inputs(rig, inputs)
+    rows, t, slack = input_rows(rig.model.inputs, inputs), inputs.t, 1e-9
+    if rig.loop is not None:  # the log's instants are the controller's samples
+        h = rig.loop.pid.sample_time or 0.0
+        slack = max(1e-6 * h, 4 * float(np.spacing(np.abs(t).max())))
+        t = t[0] + h * np.arange(int((t[-1] - t[0] + slack) / h) + 1)
+    rows = rows[np.searchsorted(inputs.t, t + slack, side="right") - 1]
+    log_inputs = Trajectory(t, dict(zip(names(rig.model.inputs), rows.T, strict=True)))
     x, p = initial_state(rig.model, parameters, initial), parameter_vector(rig.plant.parameters, parameters)
     source = (
         _SampledController(rig, rig.loop, parameters, log_inputs, x)
@@ -353,7 +359,15 @@ class _SampledController:
 
     def act(self, k: int, readings: Mapping[str, float]) -> float:
         """Return the command at sample k, and advance the controller by one sample."""
-        self._feedback_values.append(self._feedback(readings))
+        wanted, source = self._loop.pid_signal.name, self._rig.feedback
+        if source == wanted:
+            self._feedback_values.append(readings[wanted])
+        else:  # a speed, which is differentiated from an encoder's position
+            counts = Sensor(resolution=self._rig.encoder.resolution)
+            before, self._position = self._position, counts.reading(readings[str(source)], 0.0)
+            h, last = self._loop.pid.sample_time or 0.0, (self._feedback_values or [self._first_reading])[-1]
+            raw = last if before is None else (self._position - before) / h
+            self._feedback_values.append(last + h / (h + self._rig.encoder.filter) * (raw - last))
         counted = {self._rig.encoder.position: self._position} if self._position is not None else {}
         shown = {**readings, **counted}
         t, seen = self._inputs.t[k], [self._feedback_values[-1], *(shown[n] for n in self._others)]
@@ -372,19 +386,6 @@ class _SampledController:
             self._loop.command.name: self._commands,
             "feedback": self._feedback_values,
         }
-
-    def _feedback(self, readings: Mapping[str, float]) -> float:
-        """Measured signal as the controller gets it: a sensor's reading, or a speed differentiated from an encoder."""
-        wanted, source = self._loop.pid_signal.name, self._rig.feedback
-        if source == wanted:
-            return readings[wanted]
-        counts = Sensor(resolution=self._rig.encoder.resolution)
-        before, self._position = self._position, counts.reading(readings[str(source)], 0.0)
-        if before is None:
-            return self._first_reading
-        h = self._loop.pid.sample_time or 0.0
-        raw = (self._position - before) / h
-        return self._feedback_values[-1] + h / (h + self._rig.encoder.filter) * (raw - self._feedback_values[-1])
 
 
 def _run_samples(
@@ -418,14 +419,3 @@ def _run_samples(
 def _plant_outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str, float]:
     """Outputs of the plant by name."""
     return dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel().tolist(), strict=True))
-
-
-def _resample_inputs(rig: Rig, inputs: Trajectory) -> Trajectory:
-    """Inputs of the model at the instants of the log."""
-    rows, t, slack = input_rows(rig.model.inputs, inputs), inputs.t, 1e-9
-    if rig.loop is not None:
-        h = rig.loop.pid.sample_time or 0.0
-        slack = max(1e-6 * h, 4 * float(np.spacing(np.abs(t).max())))
-        t = t[0] + h * np.arange(int((t[-1] - t[0] + slack) / h) + 1)
-    rows = rows[np.searchsorted(inputs.t, t + slack, side="right") - 1]
-    return Trajectory(t, dict(zip(names(rig.model.inputs), rows.T, strict=True)))

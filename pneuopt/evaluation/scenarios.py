@@ -40,7 +40,7 @@ Seed = int | tuple[int | str, ...]
 
 
 class Sampling(Enum):
-    """How points are chosen in the unit cube; a newcomer adds a word here and a row of `_POINTS`."""
+    """Choice of points in the unit cube; a newcomer adds a word here and a row of `_POINTS`."""
 
     RANDOM = "random"
     """Independent of each other: Monte Carlo, whose scatter tells its own error."""
@@ -93,19 +93,6 @@ def unit_points(sampling: Sampling, count: int, axes: Sequence[str], seed: Seed,
     return _POINTS[sampling](count, axes, further(seed, kind, sampling.value))
 
 
-def _random_points(count: int, axes: Sequence[str], seed: Seed) -> Array:
-    return np.column_stack([generator(seed, axis).random(count) for axis in axes])
-
-
-def _latin_points(count: int, axes: Sequence[str], seed: Seed) -> Array:
-    """A permutation of the parts of each axis, and a point anywhere in each."""
-
-    def column(rng: np.random.Generator) -> Array:
-        return np.asarray((rng.permutation(count) + rng.random(count)) / count)
-
-    return np.column_stack([column(generator(seed, axis)) for axis in axes])
-
-
 def _sobol_points(count: int, axes: Sequence[str], seed: Seed) -> Array:
     """The first points of a scrambled sequence, which is balanced at powers of two, in an order of their own.
 
@@ -119,14 +106,17 @@ def _sobol_points(count: int, axes: Sequence[str], seed: Seed) -> Array:
 
 
 _POINTS: Mapping[Sampling, Callable[[int, Sequence[str], Seed], Array]] = {
-    Sampling.RANDOM: _random_points,
-    Sampling.LATIN_HYPERCUBE: _latin_points,
+    Sampling.RANDOM: lambda count, axes, seed: np.column_stack([generator(seed, axis).random(count) for axis in axes]),
+    Sampling.LATIN_HYPERCUBE: lambda count, axes, seed: np.column_stack(
+        # a permutation of the parts of each axis, and a point anywhere in each
+        [(rng.permutation(count) + rng.random(count)) / count for rng in (generator(seed, axis) for axis in axes)]
+    ),
     Sampling.SOBOL: _sobol_points,
 }
 
 
 class Distribution(Protocol):
-    """How a parameter varies from plant to plant."""
+    """Distribution of a parameter from plant to plant."""
 
     def __init__(self, spread: float | tuple[float, float]) -> None: ...
 
@@ -535,11 +525,17 @@ def draws(
     rng = generator(seed, "draws", *names)
     freedom = np.array([dof.get(n, math.inf) for n in names])
 
-    def draw() -> Array:
-        z = mean + _by_student_t(factor @ rng.standard_normal(len(names)), np.linalg.norm(factor, axis=1), freedom)
-        return np.asarray(np.where(log, np.exp(np.where(log, z, 0.0)), z))
+    def draw_within_bounds() -> dict[str, float]:
+        for _ in range(MAX_DRAWS_PER_SAMPLE):
+            z = mean + _by_student_t(factor @ rng.standard_normal(len(names)), np.linalg.norm(factor, axis=1), freedom)
+            drawn = np.where(log, np.exp(np.where(log, z, 0.0)), z)
+            values = dict(zip(names, drawn.tolist(), strict=True))
+            if all(parameters[n].lower <= v <= parameters[n].upper for n, v in values.items()):
+                return values
+        message = f"of {MAX_DRAWS_PER_SAMPLE} draws none lies within the bounds of {', '.join(names)}"
+        raise InputError(f"{message}; widen them, or give corners")
 
-    return {f"draw {k}": _draw_within_bounds(parameters, names, draw) for k in range(1, count + 1)}
+    return {f"draw {k}": draw_within_bounds() for k in range(1, count + 1)}
 
 
 def _by_student_t(normal: Array, deviations: Array, dof: Array) -> Array:
@@ -583,12 +579,3 @@ def _spread_ends(parameters: ParameterSet, name: str, spread: Spread | Distribut
     inside = p.lower <= low and high <= p.upper
     require(inside, f"{name}: {low:g} to {high:g} {p.unit} leaves its bounds, {p.lower:g} to {p.upper:g} {p.unit}")
     return low, high
-
-
-def _draw_within_bounds(parameters: ParameterSet, names: list[str], draw: Callable[[], Array]) -> dict[str, float]:
-    for _ in range(MAX_DRAWS_PER_SAMPLE):
-        values = dict(zip(names, draw().tolist(), strict=True))
-        if all(parameters[n].lower <= v <= parameters[n].upper for n, v in values.items()):
-            return values
-    message = f"of {MAX_DRAWS_PER_SAMPLE} draws none lies within the bounds of {', '.join(names)}"
-    raise InputError(f"{message}; widen them, or give corners")

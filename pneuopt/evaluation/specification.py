@@ -146,33 +146,28 @@ def specify_limits(
     """Check limits that may stand without an objective, as a file that only describes a loop has them."""
     asked = [q for q in subject_to if isinstance(q, NoHunting)]
     rest = NoHunting(max(q.duration for q in asked), min(q.repeatability for q in asked)) if asked else None
-    found = _specify_requirements([q for q in subject_to if not isinstance(q, NoHunting)], weights)
-    return replace(found, rest=rest)
-
-
-def _specify_requirements(subject_to: Sequence[Requirement], weights: Mapping[Requirement, float]) -> Specification:
-    """What a search reads of it: all that has a metric."""
-    for q in (*weights, *subject_to):
-        known = ", ".join(k.__name__ for k in REQUIREMENT_KINDS)
+    limited = [q for q in subject_to if not isinstance(q, NoHunting)]
+    known = ", ".join(k.__name__ for k in REQUIREMENT_KINDS)
+    for q in (*weights, *limited):
         require(isinstance(q, Requirement), f"{q!r} is no requirement; write {known}, as in Overshoot(max=0.05)")
     for q, weight in weights.items():
         require(0 < weight < inf, f"the weight of {metric_name(q)} must be positive, got {weight:g}")
-    for q in subject_to:
+    for q in limited:
         message = f"{metric_name(q)} in subject_to has no limit; write {metric_name(q)}({q.metric.sense.value}=...)"
         require(upper_limit(q) < inf, message)
     terms = [metric_name(q) for q in weights]
     require(len(set(terms)) == len(terms), f"minimise names a kind of requirement twice: {', '.join(terms)}")
-    bands = {q.band for q in (*weights, *subject_to) if isinstance(q, SettlingTime)}
+    bands = {q.band for q in (*weights, *limited) if isinstance(q, SettlingTime)}
     require(len(bands) <= 1, f"settling bands differ: {sorted(bands, key=str)}; one band holds for the whole tuning")
-    tubes = {q.bounds for q in (*weights, *subject_to) if isinstance(q, StepEnvelope)}
+    tubes = {q.bounds for q in (*weights, *limited) if isinstance(q, StepEnvelope)}
     require(len(tubes) <= 1, "two StepEnvelopes differ; join them to one")
     for tube in tubes:
-        _check_envelope(tube, (*weights, *subject_to), next(iter(bands), 0.02))
+        _check_envelope(tube, (*weights, *limited), next(iter(bands), 0.02))
     limits: dict[str, Requirement] = {}
-    for q in (*weights, *subject_to):
+    for q in (*weights, *limited):
         if upper_limit(q) < (upper_limit(limits[metric_name(q)]) if metric_name(q) in limits else inf):
             limits[metric_name(q)] = q
-    return Specification(weights, tuple(limits.values()), next(iter(bands), 0.02))
+    return Specification(weights, tuple(limits.values()), next(iter(bands), 0.02), rest)
 
 
 def _check_envelope(tube: EnvelopeBounds, requirements: Sequence[Requirement], band: Band) -> None:

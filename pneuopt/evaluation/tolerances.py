@@ -3,16 +3,15 @@
 # Simulations and readings
 
 SIMULATION_TOLERANCE = 1e-8  # relative, of continuations and rest checks; the absolute one is a hundredth of it
-RESPONSE_SAMPLES = 1000  # of a response of a loop without sample time: fewer blur a settling time
-READINGS_A_HORIZON = 1000  # of a sampled loop: with fewer, a signal leaves the band between two readings unseen
+READINGS_A_HORIZON = 1000  # at least: with fewer, a signal leaves the band between two readings unseen
 MIN_READINGS_A_SAMPLE, MAX_READINGS_A_SAMPLE = 2, 16  # of the controller, whatever the horizon
-SAMPLES_A_DITHER_PERIOD = 20  # of a continuous dither: with 6 a drive that settles in 63 ms seems to take 47 ms
+# of a continuous dither, with 6 a drive that settles in 63 ms seems to take 47 ms; likewise of any dither's ripple,
+# whose peaks fewer would cut
+SAMPLES_A_DITHER_PERIOD = 20
 POINTS_PER_READING = 4  # of the record for each reading of a search: with 1 both would miss the same
-TRAVEL_SAMPLES = 2001  # instants over a horizon at which a reference's way is read
 MIN_SETTLED_PERIODS = 2  # of a dither that a response stays in its band to count as settled where its ripple does not
 LINE_TOLERANCE = 1e-4  # largest distance of a signal between two readings from the line that joins them [step]
 INTEGRAL_TOLERANCE = 1e-3  # relative error of the integrals over the error that readings may cause
-PARTS_AT_A_TIME = 8  # into which a distance between readings is divided at a time
 MAX_REFINEMENTS = 4  # times that readings are added: each brings them eight times as close and costs a simulation
 SPREAD = 3.0  # factor on the time after a step within which other gains' responses change equally fast
 MAX_INSTANTS = 60_000  # readings of a response: fewer leave a fast response in a long horizon unresolved
@@ -23,14 +22,15 @@ SAMPLE_SHARE = 0.999  # of a sample time after which an instant is one sample la
 FINAL_PERIODS = 5  # of a dither at a record's end, over which its final value is averaged
 TAIL_SHARE = 0.05  # of a record that is its end, where ripple is read and a settling comes too late to count
 RIPPLE_ALLOWANCE = 2.0  # amplitudes of the ripple by which the signal moves towards its mean: 1 leaves a growing ripple
-MIN_WAVE_PHASES = 20  # instants of a dither period at which its wave is read: fewer cut its peaks
 EDGE_ROUNDING = 1e-9  # share of a band's half width by which rounding may put what lies on its edge outside
 MIN_STAY_RATIO = 2.0  # of the last stay in the band to the longest before, from which a late response has settled
 
 # Limit cycles
 
 TRANSIENT_SHARE = 0.4  # of a record, left out unless a start is given: less takes a ringing for a cycle
-MIN_CYCLES = 3  # fewer do not show whether they repeat; so many of the last ones show a hunting loop's largest error
+# fewer, of a cycle or of hunting's standstills, do not show whether they repeat or decay; so many of the last cycles
+# show a hunting loop's largest error
+MIN_CYCLES = 3
 MIN_AUTOCORRELATION = 0.5  # one period later, relative to the variance: less finds cycles in noise alone
 MAX_PERIOD_SPREAD = 0.35  # standard deviation of the periods over their mean: filtered noise has more
 WINDOWS_PER_PERIOD = 8  # moving averages per period that remove noise before crossings are sought
@@ -49,9 +49,6 @@ POLE_ROUNDING = 1e-13  # share of a matrix's size by which rounding moves its we
 MOST_POLE_ROUNDING = 1e-7  # share of the fastest pole beyond which rounding moves no double pole at zero
 NOISE_ANGLE = 0.3  # of the slowest noise that counts, over a horizon [rad]: slower noise is a drift
 FLAT = 1e-3  # relative change of a response over a grid's two lowest frequencies, below which it is that at rest
-SPREAD_FREQUENCIES = 48  # of a batch's sensitivity, beside those about the poles: fewer miss a broad maximum
-PEAK_REFINEMENTS, PEAK_GRID_POINTS = 4, 9  # finer grids about a batch's two highest peaks, and the points of each
-LOOPS_AT_A_TIME = 128  # more do not fit the processor's cache
 
 # The certificate
 
@@ -70,7 +67,6 @@ LATEST_SETTLING = 4.0  # horizons within which a response must be in its band fo
 
 # Rest by events
 
-MIN_STANDSTILLS = 3  # whose errors are compared: of fewer nobody can say whether hunting decays
 MIN_KEPT_ERROR = 0.9  # ratio of the error at a standstill to the one before, from which hunting does not decay
 MIN_PUSH = 1e-6  # share of the command's largest size by which it changes over the second half: rounding is less
 STILL_SHARE = 1e-4  # of the step: a motion over the second half below which a body that never sticks dies away
@@ -84,11 +80,7 @@ MAX_RIPPLE_SHARE = 0.5  # of the step, from peak to peak: from there on a dither
 
 # Whether a move can be made
 
-FIRST_PUSH, PUSH_FACTOR = 0.1, 1.4  # share of a move over which full command is tried first, and the factor to the next
-PUSH_SAMPLES = 300  # instants at which full command is read: fewer blur its times and its peak
 LONGEST_PUSH = 60.0  # [s], of what hardly moves: a shorter one refuses creeping drives
-PUSH_TOLERANCE = 1e-7  # of the simulation: its figures are shown with three digits
-MOVE_BISECTIONS = 20  # of a speed or a share of the limits: fewer make the figures coarse
 MOST_FACTOR = 64.0  # on a move's speeds that is tried for the shortest move: more would end beyond any drive
 ALLOWED_SHARE = 0.98  # of what full command can that is advised: nearer 1 the samples of a run refuse it
 
@@ -100,7 +92,7 @@ GUESS_SHARE = 0.5  # of the fastest move, and of the way to the stops: the drive
 LEAST_FAST_SPEED = 0.05  # [m/s], several Stribeck speeds: with less, viscous friction is taken for Coulomb's
 MEDIUM = 0.4  # speed of the medium moves over that of the fast ones
 GUESSED_SENSITIVITY = 2.0  # of the plain controller on the plant as guessed: a gain half as large again is stable
-FIRST_GAIN, GAIN_STEP, MOST_TRIES = 100.0, 0.85, 80  # share of the command per span, and the factor from try to try
+GAIN_STEP = 0.85  # factor from a proportional gain that is tried to the next: a smaller one gives away gain
 REST_BEFORE = 0.5  # [s] before the first move: pressures at rest are read from it
 SETTLED_SHARE, LEAST_DWELL = 0.005, 0.3  # of the span, to which a dwell lets the following error decay; at least [s]
 LONGEST_STEP = 2e-5  # [s] of the simulation as guessed: longer ones are unstable where friction turns over .1 mm/s

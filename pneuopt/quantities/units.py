@@ -22,6 +22,9 @@ from pneuopt.quantities.errors import UnitError, require
 ATMOSPHERE = 101325.0
 """Standard atmosphere [Pa] (ISO 2533), which gauge pressures count from unless `count_gauge_from` says otherwise."""
 
+ANR_DENSITY = 1.185
+"""Density of air at ANR [kg/m^3] (ISO 8778: 100 kPa, 20 degC, 65 % humidity), which converts a mass into l(ANR)."""
+
 MAX_UNIT_LENGTH = 80
 """Length of a unit's text [character]: a longer one takes seconds; a shorter bound refuses gains in base units."""
 MAX_UNIT_POWER = 144

@@ -35,7 +35,7 @@ from pneuopt.quantities.status import Progress, ProgressReporter
 from pneuopt.studies.executors import INTERRUPTED_CASE, Outcome, Processes
 from pneuopt.studies.journal import CaseMarks, Journal
 from pneuopt.studies.sweep import sweep
-from pneuopt.studies.tolerances import CHUNK_A_CORE, MAX_PROBED, RATE_MARGIN, SAME_START, USUAL_TOLERANCE
+from pneuopt.studies.tolerances import CHUNK_A_CORE, MAX_PROBED, RATE_MARGIN, SAME_START
 from pneuopt.tuning.space import (
     LoopLanes,
     ReferenceGrid,
@@ -59,7 +59,7 @@ CERTIFIED = "certified "  # before a plant's name where a journal keeps its cert
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BatchEvaluation(Shown):
-    """What `evaluate_batch` found; prints its `summary()`.
+    """Findings of `evaluate_batch`; prints its `summary()`.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class BatchEvaluation(Shown):
     checks: "pd.DataFrame"
 
     def summary(self) -> Report:
-        """How many plants there are, the spread of each metric, and the largest differences from the certificate."""
+        """The number of plants, the spread of each metric, and the largest differences from the certificate."""
         failed, differ = int((self.table["error"] != "").sum()), self.checks[~self.checks["agrees"]]
         cases, certified = len(self.table), self.checks["case"].nunique()
         agreement = f"{differ['case'].nunique()} differ" if len(differ) else "all agree"
@@ -109,7 +109,7 @@ def evaluate_batch(
     metrics: Sequence[str] = BATCH_METRICS,
     band: Band = 0.02,
     recertify: float = 0.01,
-    tolerance: float = USUAL_TOLERANCE,
+    tolerance: float = 0.01,
     seed: int = 0,
     chunk: int | None = None,
     executor: Executor | Processes | None = None,
@@ -135,7 +135,8 @@ def evaluate_batch(
     recertify : float
         Share of the plants that are drawn at random and certified, beside the worst by each metric; 0: only those.
     tolerance : float
-        Share of a metric, or of its median over the plants if that is larger, by which the lanes may differ.
+        Share of a metric, or of its median over the plants if that is larger, by which the lanes may differ: a search
+        claims no figure that differs by more than 1 %.
     seed : int
         Of the random share.
     chunk : int, optional
@@ -204,7 +205,7 @@ def evaluate_batch(
 
 
 class _Memory:
-    """What a journal knows of the plants, and which are still to be run."""
+    """Record of the plants that a journal holds, and of those still to be run."""
 
     def __init__(
         self,
@@ -215,14 +216,22 @@ class _Memory:
     ) -> None:
         self._journal, self._marks, self._columns = journal, CaseMarks(parameters), columns
         self._cases, self.kept = list(cases.items()), 0
-        self.missing = np.array([k for k in range(len(cases)) if not self._recall(k)], dtype=np.intp)
+        missing = list[int]()
+        for k, (name, values) in enumerate(self._cases):
+            outcome = journal.find(name, self._marks.of(values)) if journal is not None else None
+            if outcome is None or not columns.keys() <= outcome.results.keys():
+                missing.append(k)
+                continue
+            for n, column in columns.items():
+                column[k] = outcome.results[n]
+        self.missing = np.array(missing, dtype=np.intp)
         if journal is not None:
             known = np.setdiff1d(np.arange(len(cases)), self.missing)
             journal.append_rows(self._row(k, "") for k in known.tolist())
 
     @property
     def done(self) -> int:
-        """How many plants have been run, now or before."""
+        """Number of plants that have been run, now or before."""
         return len(self._cases) - len(self.missing) + self.kept
 
     def keep(self, rows: Indices, errors: Sequence[str]) -> None:
@@ -240,16 +249,6 @@ class _Memory:
         """A plant's row for those who watch."""
         name, values = self._cases[k]
         return {"case": name, **values, **{n: float(column[k]) for n, column in self._columns.items()}, "error": error}
-
-    def _recall(self, k: int) -> bool:
-        """Fill a row of the columns, if the journal has all of it."""
-        name, values = self._cases[k]
-        outcome = self._journal.find(name, self._marks.of(values)) if self._journal is not None else None
-        if outcome is None or not self._columns.keys() <= outcome.results.keys():
-            return False
-        for n, column in self._columns.items():
-            column[k] = outcome.results[n]
-        return True
 
 
 def check_lanes(loop: ClosedLoop, metrics: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -56,7 +56,7 @@ _RIGHT = tuple(check for check in CHECKS if check not in NEEDED)  # a simulated 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Bootstrap(Shown):
-    """What fits of simulated logs make of known values.
+    """Estimates that fits of simulated logs give for known values.
 
     Attributes
     ----------
@@ -75,7 +75,18 @@ class Bootstrap(Shown):
     @property
     def doubts(self) -> Mapping[str, str]:
         """By estimate, why its value or its interval is not to be trusted; what is not here may be."""
-        return {str(n): why for n, row in self.table.iterrows() if (why := _reason_for_doubt(row))}
+        from scipy.stats import binom
+
+        found = dict[str, str]()
+        for name, row in self.table.iterrows():
+            reasons = []
+            if abs(row["bias"]) > max(SIGNIFICANT * row["bias_error"], row["stderr"]):
+                share = f"{100 * abs(row['bias'] / row['value']):.2g} % " if row["value"] else ""
+                reasons.append(f"it comes out {share}too {'high' if row['bias'] * row['value'] > 0 else 'low'}")
+            if binom.cdf(row["covered"], row["intervals"], 0.95) < MIN_CHANCE:
+                reasons.append(f"{row['covered']:.0f} of {row['intervals']:.0f} intervals hold its value")
+            found |= {str(name): ", and ".join(reasons)} if reasons else {}
+        return found
 
     def summary(self) -> Report:
         """Which estimates to doubt, and why; then a row an estimate."""
@@ -168,19 +179,6 @@ def bootstrap(
     cases = {f"{_DRAW} {k}": {_DRAW: float(k)} for k in range(1, count + 1)}
     draws = sweep(refit, start, cases, executor=executor, progress=progress)
     return Bootstrap(_tabulate(fit, draws), draws)
-
-
-def _reason_for_doubt(row: "pd.Series[Any]") -> str:
-    """Why an estimate is not to be trusted; empty where it may be."""
-    from scipy.stats import binom
-
-    reasons = []
-    if abs(row["bias"]) > max(SIGNIFICANT * row["bias_error"], row["stderr"]):
-        share = f"{100 * abs(row['bias'] / row['value']):.2g} % " if row["value"] else ""
-        reasons.append(f"it comes out {share}too {'high' if row['bias'] * row['value'] > 0 else 'low'}")
-    if binom.cdf(row["covered"], row["intervals"], 0.95) < MIN_CHANCE:
-        reasons.append(f"{row['covered']:.0f} of {row['intervals']:.0f} intervals hold its value")
-    return ", and ".join(reasons)
 
 
 def _rig_of(rig: HasSystem | Rig | Runnable, log: Experiment, fit: IdentificationResult, outputs: Sequence[str]) -> Rig:

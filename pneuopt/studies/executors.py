@@ -36,11 +36,8 @@ from typing import TYPE_CHECKING, Any
 from pneuopt.quantities.errors import InputError, PneuoptError, require
 from pneuopt.quantities.parameters import ParameterSet, check_number
 from pneuopt.studies.tolerances import (
-    CHUNK_SECONDS,
-    CHUNKS_A_WORKER,
     CONNECT_SECONDS,
     LIMIT_SHARE,
-    MAX_CHUNK,
     MAX_PROCESSES,
     TRIES,
     UNKNOWN_WORKERS,
@@ -48,7 +45,6 @@ from pneuopt.studies.tolerances import (
 
 if TYPE_CHECKING:
     import loky
-    import pandas as pd
 
 
 CaseFunction = Callable[[ParameterSet], Any]
@@ -59,7 +55,7 @@ INTERRUPTED_CASE = "interrupted"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one case gave."""
+    """Results of one case, or why it has none."""
 
     results: Mapping[str, Any] = field(default_factory=dict)  # by name, bool, int, float or str
     seconds: float = nan  # time in the function [s]
@@ -109,7 +105,12 @@ def _plain_results(result: Any) -> dict[str, Any]:
     import pandas as pd
 
     if isinstance(result, pd.DataFrame):
-        return _plain_results(_flatten_frame(result))
+        if len(result) == 1:
+            result = {column: result[column].iloc[0] for column in result}  # each of its own type
+        elif len(result.columns) == 1:
+            result = result.iloc[:, 0]
+        else:
+            result = {f"{row}[{column}]": value for column in result for row, value in result[column].items()}
     plain: dict[str, Any] = {}
     for name, entry in (result if isinstance(result, Mapping | pd.Series) else {"value": result}).items():
         value = entry.item() if getattr(entry, "shape", None) == () else entry
@@ -117,14 +118,6 @@ def _plain_results(result: Any) -> dict[str, Any]:
             raise InputError(f"{name} is {type(value).__name__}; return numbers or text, by name")
         plain[str(name)] = value
     return plain
-
-
-def _flatten_frame(frame: "pd.DataFrame") -> Mapping[str, Any]:
-    if len(frame) == 1:
-        return {str(column): frame[column].iloc[0] for column in frame}
-    if len(frame.columns) == 1:
-        return {str(row): value for row, value in frame.iloc[:, 0].items()}
-    return {f"{row}[{column}]": value for column in frame for row, value in frame[column].items()}
 
 
 def limit_memory(megabytes: float) -> None:
@@ -274,13 +267,25 @@ class Chunk:
 
 
 class CaseQueue:
-    """Hands cases out in chunks of about half a second, or of `most_seconds` [s] where a limit of time is lower."""
+    """Hands cases out in chunks of about half a second, or of `most_seconds` [s] where a limit of time is lower.
+
+    Longer chunks lose more with a process, shorter ones cost more to send; more cases in one hold up the table, and
+    fill the memory where each is large.
+    """
 
     def __init__(
-        self, cases: Iterable[tuple[str, CaseValues]], count: int, workers: int, most_seconds: float = math.inf
+        self,
+        cases: Iterable[tuple[str, CaseValues]],
+        count: int,
+        workers: int,
+        *,
+        most_seconds: float = inf,
+        usual_seconds: float = 0.5,
+        most_cases: int = 1000,
     ) -> None:
         self._fresh, self._again, self._suspect = iter(cases), deque[Chunk](), deque[Chunk]()
-        self._left, self._workers, self._seconds = count, workers, min(CHUNK_SECONDS, most_seconds)
+        self._left, self._workers, self._most_cases = count, workers, most_cases
+        self._seconds = min(usual_seconds, most_seconds)
         self._done, self._spent = 0, 0.0
 
     def __bool__(self) -> bool:
@@ -293,7 +298,7 @@ class CaseQueue:
         size = 1
         if self._done:
             by_time = self._seconds * self._done / max(self._spent, 1e-9)
-            size = max(1, math.ceil(min(by_time, MAX_CHUNK, self._left / (2 * self._workers))))
+            size = max(1, math.ceil(min(by_time, self._most_cases, self._left / (2 * self._workers))))
         cases = dict(next(self._fresh) for _ in range(min(size, self._left)))
         self._left -= len(cases)
         if cases:
@@ -307,7 +312,7 @@ class CaseQueue:
         self._spent += sum(o.seconds for o in outcomes if o.seconds > 0)
 
     def give_back(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
-        """Take back a chunk whose process died: its cases are tried one by one; one that dies twice is said."""
+        """Take back a chunk whose process died: its cases are tried one by one; one that dies twice gets the reason."""
         if len(chunk.cases) > 1:
             self._again.extend(Chunk({name: values}) for name, values in chunk.cases.items())
         elif chunk.tries + 1 < TRIES:
@@ -317,7 +322,7 @@ class CaseQueue:
                 yield name, Outcome(error=reason)
 
     def separate(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
-        """Take back a chunk that took too long: a case alone is said, several are tried one by one."""
+        """Take back a chunk that took too long: a case alone gets the reason, several are tried one by one."""
         yield from self.give_back(Chunk(chunk.cases, TRIES), reason)
 
 
@@ -340,7 +345,7 @@ def run_in_processes(
 ) -> Outcomes:
     """Evaluate cases in spawned processes and yield each outcome as it comes; the function travels by pickle."""
     wanted = min(count, chosen.count or os.cpu_count() or 1, MAX_PROCESSES)
-    queue = CaseQueue(cases, count, wanted, LIMIT_SHARE * chosen.seconds)
+    queue = CaseQueue(cases, count, wanted, most_seconds=LIMIT_SHARE * chosen.seconds)
     crew = _Crew(pickle_function(fn, parameters, chosen), chosen)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="A worker was restarted")  # its chunk is given to its successor
@@ -363,7 +368,7 @@ def run_in_processes(
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """What a process computes; without a chunk it loads the function. `deadline` is of `time.monotonic` [s]."""
+    """Work of a process; without a chunk it loads the function. `deadline` is of `time.monotonic` [s]."""
 
     process: "loky.ProcessPoolExecutor"
     chunk: Chunk | None
@@ -385,8 +390,13 @@ class _Crew:
         arguments = (self._packed,)
         process = loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_begin, initargs=arguments)
         self._processes.append(process)
-        with _one_thread_each():
+        added = {n: "1" for n in _THREAD_VARIABLES if n not in os.environ}  # what the user has said goes first
+        os.environ.update(added)  # it starts with one thread for linear algebra
+        try:
             self.busy[process.submit(_load_task)] = _Run(process, None, inf)
+        finally:
+            for n in added:
+                del os.environ[n]
 
     def give(self, process: "loky.ProcessPoolExecutor", chunk: Chunk) -> None:
         """Let a process compute a chunk."""
@@ -423,7 +433,7 @@ class _Crew:
 def _receive(
     crew: _Crew, queue: CaseQueue, run: _Run, future: "Future[list[Outcome]]"
 ) -> Iterator[tuple[str, Outcome]]:
-    """What a process gave; it, or another if it died, goes on with the next chunk."""
+    """Outcomes of a process; it, or another if it died, goes on with the next chunk."""
     try:
         outcomes = future.result()
     except BrokenProcessPool as error:
@@ -445,32 +455,19 @@ def _receive(
         yield from zip(run.chunk.cases, outcomes, strict=False)  # fewer outcomes where the last is an interruption
 
 
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes that are started within have one thread for linear algebra; what the user has said of it goes first."""
-    added = {n: "1" for n in _THREAD_VARIABLES if n not in os.environ}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for n in added:
-            del os.environ[n]
-
-
 def _begin(packed: bytes) -> None:
     """In a spawned process: keep the function; ignore Ctrl-C, which reaches all processes; end when the first has."""
     global _packed  # noqa: PLW0603 - the state of a worker process, which serves one study
     _packed = packed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
+
+    def end_with(sentinel: int) -> None:  # the first process may be killed without a word to the others
+        wait_for_connections([sentinel])
+        os._exit(1)
+
     if parent is not None:
-        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-
-
-def _end_with(sentinel: int) -> None:
-    """Wait for the end of the first process, which may be killed without a word to the others."""
-    wait_for_connections([sentinel])
-    os._exit(1)
+        threading.Thread(target=end_with, args=(parent.sentinel,), daemon=True).start()
 
 
 def _load_task() -> list[Outcome]:
@@ -520,8 +517,12 @@ def run_in_executor(
     parameters: ParameterSet,
     cases: Iterable[tuple[str, CaseValues]],
     count: int,
+    chunks_a_worker: int = 3,
 ) -> Outcomes:
-    """Evaluate cases in an executor and yield each outcome as it comes."""
+    """Evaluate cases in an executor and yield each outcome as it comes.
+
+    With fewer chunks that wait for each worker it is idle while a result travels; more fill the memory.
+    """
     workers = int(getattr(executor, "_max_workers", None) or UNKNOWN_WORKERS)
     queue, running = CaseQueue(cases, count, workers), dict[Future[list[Outcome]], Chunk]()
     try:
@@ -532,14 +533,21 @@ def run_in_executor(
         task = functools.partial(evaluate_cases, fn, parameters)
     try:
         while queue or running:
-            while len(running) < CHUNKS_A_WORKER * workers and (chunk := queue.take(alone=not running)):
+            while len(running) < chunks_a_worker * workers and (chunk := queue.take(alone=not running)):
                 try:
                     running[executor.submit(task, list(chunk.cases.values()))] = chunk
                 except BrokenExecutor as error:  # broken for good, it costs its cases
                     yield from ((name, Outcome(error=describe_error(error))) for name in chunk.cases)
             done = wait(running, return_when=FIRST_COMPLETED).done
             for future in [future for future in running if future in done]:  # in the order of the cases
-                yield from _receive_chunk(future, running.pop(future), queue)
+                chunk = running.pop(future)
+                try:
+                    outcomes = future.result()
+                except Exception as error:  # the executor's own: a dead worker, a broken pool, a cancelled future
+                    yield from queue.give_back(chunk, describe_error(error))
+                    continue
+                queue.measure(outcomes)
+                yield from zip(chunk.cases, outcomes, strict=False)  # fewer where the last is an interruption
     finally:
         for future in running:
             future.cancel()
@@ -560,14 +568,3 @@ class _Task:
 def _unpack(packed: bytes) -> tuple[CaseFunction, ParameterSet]:
     fn, parameters = pickle.loads(packed)
     return fn, parameters
-
-
-def _receive_chunk(future: "Future[list[Outcome]]", chunk: Chunk, queue: CaseQueue) -> Iterator[tuple[str, Outcome]]:
-    """What a chunk gave; one whose worker died is tried again."""
-    try:
-        outcomes = future.result()
-    except Exception as error:  # the executor's own: a dead worker, a broken pool, a cancelled future
-        yield from queue.give_back(chunk, describe_error(error))
-        return
-    queue.measure(outcomes)
-    yield from zip(chunk.cases, outcomes, strict=False)  # fewer outcomes where the last is an interruption

@@ -239,12 +239,15 @@ class Journal:
             lines = self.path.read_bytes().splitlines() if self.path.exists() else []
             head = _parse(lines[0]) if lines else None
             before = head.get("study") if isinstance(head, dict) else None
-            if resume:
-                self._check_study(before, study)
+            if resume and not isinstance(before, dict):
+                raise InputError(f"{self.path}: there is nothing to resume; leave out --resume, resume=True in Python")
+            known = before if isinstance(before, dict) else {}
+            changed = [n for n in {**known, **study} if known.get(n) != study.get(n)]
+            if resume and changed:
+                message = f"{self.path}: is of another study, {', '.join(changed)} changed since; put that back"
+                raise InputError(f"{message}, or begin anew without --resume, resume=True in Python")
             entries = [entry for entry in map(_parse, lines[1:] if before == study else ()) if isinstance(entry, dict)]
-            whole = [
-                e for e in entries if {"case", "of", "results"} <= e.keys()
-            ]  # of a case there twice, the last counts
+            whole = [e for e in entries if {"case", "of", "results"} <= e.keys()]  # a case's last entry counts
             self._marks = {e["case"]: e["of"] for e in whole}
             self.known: Mapping[str, Outcome] = {
                 e["case"]: Outcome(e["results"], float(e.get("seconds", 0.0))) for e in whole
@@ -256,7 +259,7 @@ class Journal:
             raise InputError(f"{self.path}: cannot be written ({error.strerror}); check the folder") from None
 
     def find(self, name: str, mark: str) -> Outcome | None:
-        """What an earlier run computed for a case with the same values, by their mark; None where there is nothing."""
+        """Outcome of a case with the same values in an earlier run, by their mark; None where there is none."""
         return self.known[name] if self._marks.get(name) == mark else None
 
     def add(self, name: str, mark: str, outcome: Outcome) -> None:
@@ -300,17 +303,6 @@ class Journal:
             os.fsync(self._file.fileno())
             self._synced = time.monotonic()
 
-    def _check_study(self, before: object, study: Mapping[str, str]) -> None:
-        """Raise `InputError` unless the file is of this study."""
-        if not isinstance(before, dict):
-            raise InputError(f"{self.path}: there is nothing to resume; leave out --resume, resume=True in Python")
-        changed = [n for n in {**before, **study} if before.get(n) != study.get(n)]
-        if changed:
-            raise InputError(
-                f"{self.path}: is of another study, {', '.join(changed)} changed since; put that back, or begin anew "
-                "without --resume, resume=True in Python"
-            )
-
 
 class CaseMarks:
     """Hashes of cases: two have the same mark if all their parameters, common ones included, agree."""
@@ -331,7 +323,7 @@ def _describe_failure(path: Path, error: OSError) -> str:
 
 
 def _parse(line: bytes) -> object:
-    """What a line says; None where it was cut."""
+    """Content of a line; None where it was cut."""
     try:
         return json.loads(line)
     except ValueError:

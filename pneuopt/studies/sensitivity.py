@@ -41,7 +41,7 @@ from pneuopt.studies.batch import PlantBatch, check_lanes
 from pneuopt.studies.executors import INTERRUPTED_CASE, CaseFunction, Processes
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.sweep import grid, sweep
-from pneuopt.studies.tolerances import BREAK_RATIO, MAX_LOST, RESAMPLES, SIDE, SPREAD_POINTS, START_SIDE
+from pneuopt.studies.tolerances import BREAK_RATIO, MAX_LOST, SIDE, START_SIDE
 from pneuopt.tuning.space import LoopLanes, ReferenceGrid, read_metrics
 
 if TYPE_CHECKING:
@@ -155,18 +155,13 @@ def sensitivity(
         progress=progress,
         journal=journal,
     )
-    return _tabulate(cases, _chosen(cases, parameters, figures), axes, count)
-
-
-def _chosen(cases: "pd.DataFrame", parameters: ParameterSet, figures: Sequence[str] | None) -> list[str]:
-    """The columns of results to tell about."""
     results = [str(n) for n in cases.columns if n not in (*parameters, "case", "seconds", "error")]
     numbers = [n for n in results if cases[n].dtype.kind in "fiub"]
     why = next((str(e) for e in cases["error"] if e), "it returns no number")
     require(len(numbers) > 0, f"no case of the study gave a figure: {why}")
     wanted = as_tuple("figures", figures or (), str, 'names of figures, as ["SettlingTime"]')
     check_names("figure", wanted, numbers, "sensitivity")
-    return list(wanted) or numbers
+    return _tabulate(cases, wanted or numbers, axes, count)
 
 
 def _tabulate(cases: "pd.DataFrame", figures: Sequence[str], axes: Sequence[str], count: int) -> Sensitivity:
@@ -194,8 +189,8 @@ def _tabulate(cases: "pd.DataFrame", figures: Sequence[str], axes: Sequence[str]
     return Sensitivity(table, WideFrame.from_dict(about, orient="index"), cases)
 
 
-def _indices(blocks: Array, axes: int) -> Iterator[dict[str, float]]:
-    """First and total index of each axis, with their intervals; NaN where there are no points."""
+def _indices(blocks: Array, axes: int, resamples: int = 400) -> Iterator[dict[str, float]]:
+    """First and total index of each axis, with their intervals, which jump with fewer resamples; NaN without points."""
     if not blocks.size:
         yield from (dict.fromkeys(_COLUMNS, nan) for _ in range(axes))
         return
@@ -209,7 +204,7 @@ def _indices(blocks: Array, axes: int) -> Iterator[dict[str, float]]:
     drawn: Any = bootstrap(
         [np.arange(blocks.shape[1])],
         lambda points: _estimate(blocks[:, points]),
-        n_resamples=RESAMPLES,
+        n_resamples=resamples,
         vectorized=False,
         method="percentile",
         rng=np.random.default_rng(0),
@@ -236,7 +231,7 @@ GRID_PARAMETERS = ("dither.frequency",)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LocalSensitivity(Shown):
-    """How the figures of a design change with the tolerances.
+    """Change of a design's figures with the tolerances.
 
     Attributes
     ----------
@@ -335,7 +330,12 @@ def local_sensitivity(
     batch = PlantBatch(full_loop, steps, parameters, {"design": {}}, chosen, band)
     rows, about = dict[tuple[str, str], dict[str, float]](), dict[str, dict[str, float]]()
     for spacing, substeps in zip(batch.grids, batch.substeps, strict=True):
-        for metric, (value, changes) in _measure(full_loop, parameters, batch, spacing, substeps, axes).items():
+        y, along = _run_with_sensitivities(full_loop, batch, spacing, substeps, axes)
+        moved = np.concatenate([y[None], y + SIDE * along, y - SIDE * along])
+        period, m = full_loop.dither_period(full_loop.complete(parameters)), len(along)
+        read = read_metrics(spacing, moved, (batch.band,), period, batch.metrics, (), batch.lanes.channels)
+        for metric, values in read.items():
+            value, changes = float(values[0]), (values[1 : 1 + m] - values[1 + m :]) / (2 * SIDE)
             figure, squares = batch.column(metric, spacing), changes**2
             about[figure] = {"value": value, "std": float(np.sqrt(squares.sum()))}
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -346,12 +346,17 @@ def local_sensitivity(
     return LocalSensitivity(WideFrame(list(rows.values()), index=index), WideFrame.from_dict(about, orient="index"))
 
 
-def _axis_steps(loop: ClosedLoop, parameters: ParameterSet, spreads: SampleSpreads) -> dict[str, dict[str, float]]:
-    """By axis the standard deviation of each of its parameters [SI], of one sign where they rise together."""
+def _axis_steps(
+    loop: ClosedLoop, parameters: ParameterSet, spreads: SampleSpreads, quantiles: int = 64
+) -> dict[str, dict[str, float]]:
+    """By axis the standard deviation of each of its parameters [SI], of one sign where they rise together.
+
+    It is that of so many quantiles of the axis: fewer cut a normal's tails, 64 of them by 2 %.
+    """
     axes, steps = axis_labels(parameters, spreads), dict[str, dict[str, float]]()
-    shares = (np.arange(SPREAD_POINTS) + 0.5) / SPREAD_POINTS
+    shares = (np.arange(quantiles) + 0.5) / quantiles
     for k, axis in enumerate(axes):
-        points = np.full((SPREAD_POINTS, len(axes)), 0.5)
+        points = np.full((quantiles, len(axes)), 0.5)
         points[:, k] = shares
         rows = values_at(parameters, spreads, points)
         columns = {n: np.array([row[n] for row in rows]) for n in rows[0]}
@@ -360,23 +365,6 @@ def _axis_steps(loop: ClosedLoop, parameters: ParameterSet, spreads: SampleSprea
         fixed = [n for n in steps[axis] if n in GRID_PARAMETERS]
         require(not fixed, f"{', '.join(fixed)}: the samples of a response hang on it; sweep `evaluate` for it")
     return steps
-
-
-def _measure(
-    loop: ClosedLoop,
-    parameters: ParameterSet,
-    batch: PlantBatch,
-    grid: ReferenceGrid,
-    substeps: int,
-    axes: Mapping[str, Mapping[str, float]],
-) -> dict[str, tuple[float, Array]]:
-    """By metric its value and its change for one standard deviation of each axis."""
-    y, along = _run_with_sensitivities(loop, batch, grid, substeps, axes)
-    moved = np.concatenate([y[None], y + SIDE * along, y - SIDE * along])
-    period = loop.dither_period(loop.complete(parameters))
-    figures = read_metrics(grid, moved, (batch.band,), period, batch.metrics, (), batch.lanes.channels)
-    m = len(along)
-    return {n: (float(v[0]), (v[1 : 1 + m] - v[1 + m :]) / (2 * SIDE)) for n, v in figures.items()}
 
 
 def _run_with_sensitivities(
@@ -394,20 +382,15 @@ def _run_with_sensitivities(
     run, sound = lanes.run(grid, x0, batch.nominal, substeps)
     require(bool(sound[0]), "the response runs away; no figure of it has a slope", ConvergenceError)
     assert run.dy is not None
-    along = [
-        run.dy[0] @ np.concatenate([_start_change(batch, grid.reference, s), [s.get(n, 0.0) for n in names]])
-        for s in axes.values()
-    ]
+    along = list[Array]()
+    for steps in axes.values():
+        before, after = (
+            batch.start({n: batch.nominal_value(n) + side * START_SIDE * s for n, s in steps.items()}, grid.reference)
+            for side in (-1, 1)
+        )
+        start_change = lanes.with_integral((after - before)[None] / (2 * START_SIDE))[0]
+        along.append(run.dy[0] @ np.concatenate([start_change, [steps.get(n, 0.0) for n in names]]))
     return run.y[0], np.array(along)
-
-
-def _start_change(batch: PlantBatch, reference: Reference, steps: Mapping[str, float]) -> Array:
-    """How the state before the step changes with an axis."""
-    ends = [
-        batch.start({n: batch.nominal_value(n) + side * START_SIDE * s for n, s in steps.items()}, reference)
-        for side in (1, -1)
-    ]
-    return np.asarray(batch.lanes.with_integral((ends[0] - ends[1])[None] / (2 * START_SIDE))[0])
 
 
 Places = Mapping[str, Mapping[float, int]]

@@ -43,7 +43,7 @@ from pneuopt.studies.executors import (
     run_in_processes,
 )
 from pneuopt.studies.journal import CaseMarks, Journal
-from pneuopt.studies.tolerances import MAX_TABLE_BYTES, RATE_AFTER
+from pneuopt.studies.tolerances import MAX_TABLE_BYTES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -81,7 +81,17 @@ def grid(parameters: ParameterSet, axes: Mapping[str, Iterable[float]]) -> dict[
     """
     require(len(axes) > 0, "a grid needs an axis: a parameter and its values")
     check_names("parameter", axes, parameters, "axis")
-    columns = [_label_axis(parameters, name, list(map(float, values))) for name, values in axes.items()]
+    columns = list[list[tuple[str, float]]]()
+    for name, given in axes.items():
+        values = list(map(float, given))
+        require(len(values) > 0, f"axis {name}: no values")
+        require(len(set(values)) == len(values), f"axis {name}: a value is there twice; leave one out")
+        for value in values:
+            check_case(parameters, {name: value}, "axis")
+        # labels have six digits, or 17 where two labels would be equal
+        short, full = ([write_value(v, parameters[name].unit, digits) for v in values] for digits in (6, 17))
+        labels = short if len(set(short)) == len(values) else full
+        columns.append([(f"{name} = {label}", value) for label, value in zip(labels, values, strict=True)])
     return {
         ", ".join(label for label, _ in point): dict(zip(axes, (value for _, value in point), strict=True))
         for point in itertools.product(*columns)
@@ -121,7 +131,14 @@ def read_cases(parameters: ParameterSet, table: "pd.DataFrame | str | Path") -> 
     import pandas as pd
 
     where = "table" if isinstance(table, pd.DataFrame) else str(table)
-    frame = table if isinstance(table, pd.DataFrame) else _read_csv(Path(table))
+    if isinstance(table, pd.DataFrame):
+        frame = table
+    else:
+        try:
+            frame = pd.read_csv(BytesIO(read_source(Path(table), MAX_TABLE_BYTES, "take fewer cases")))
+        except ValueError as error:  # pandas' own errors among them
+            reason = " ".join(str(error).split())[:MAX_REASON]
+            raise InputError(f"{table}: is no table of cases in CSV ({reason})") from None
     heads = {column: re.fullmatch(r"(.*?)(?: \[(.*)\])?", str(column)) for column in frame if column != _NAMES}
     columns = {column: (head[1].strip(), head[2]) for column, head in heads.items() if head}
     names = [name for name, _ in columns.values()]
@@ -130,35 +147,18 @@ def read_cases(parameters: ParameterSet, table: "pd.DataFrame | str | Path") -> 
     require(len(set(names)) == len(names), f"{where}: a parameter has two columns; leave one out")
     labels = [f"row {k}" for k in range(1, len(frame) + 1)] if _NAMES not in frame else list(map(str, frame[_NAMES]))
     require(len(set(labels)) == len(labels), f"{where}: two cases have the same name")
-    values = {
-        name: _read_column(frame[column], parameters[name].unit if unit is None else unit, parameters[name].unit, where)
-        for column, (name, unit) in columns.items()
-    }
+    values = dict[str, list[float]]()
+    for column, (name, written) in columns.items():
+        numbers = pd.to_numeric(frame[column], errors="coerce").to_numpy(dtype=float)
+        bad = [k for k, v in enumerate(numbers.tolist(), 1) if not math.isfinite(v)]
+        require(not bad, f"{where}: {column}: row {bad[0] if bad else 0} is no number; every case needs its own")
+        unit = parameters[name].unit
+        factor, offset = si_conversion(unit if written is None else written, unit, where=f"{where}: {column}")
+        values[name] = (factor * numbers + offset).tolist()
     cases = {label: {n: values[n][k] for n in names} for k, label in enumerate(labels)}
     for label, case in cases.items():
         check_case(parameters, case, f"{where}: {label}")
     return cases
-
-
-def _read_csv(path: Path) -> "pd.DataFrame":
-    import pandas as pd
-
-    raw = read_source(path, MAX_TABLE_BYTES, "take fewer cases")
-    try:
-        return pd.read_csv(BytesIO(raw))
-    except ValueError as error:  # pandas' own errors among them
-        raise InputError(f"{path}: is no table of cases in CSV ({' '.join(str(error).split())[:MAX_REASON]})") from None
-
-
-def _read_column(column: "pd.Series[Any]", written: str, unit: str, where: str) -> list[float]:
-    """A column's numbers in its parameter's unit."""
-    import pandas as pd
-
-    numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
-    bad = [k for k, v in enumerate(numbers.tolist(), 1) if not math.isfinite(v)]
-    require(not bad, f"{where}: {column.name}: row {bad[0] if bad else 0} is no number; every case needs its own")
-    factor, offset = si_conversion(written, unit, where=f"{where}: {column.name}")
-    return [float(v) for v in factor * numbers + offset]
 
 
 def check_case(parameters: ParameterSet, case: CaseValues, name: str) -> None:
@@ -175,17 +175,6 @@ def check_case(parameters: ParameterSet, case: CaseValues, name: str) -> None:
         parameters.with_values(case)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-
-
-def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:
-    """The values with their labels, of six digits, or of 17 where two labels would be equal."""
-    require(len(values) > 0, f"axis {name}: no values")
-    require(len(set(values)) == len(values), f"axis {name}: a value is there twice; leave one out")
-    for value in values:
-        check_case(parameters, {name: value}, "axis")
-    short, full = ([write_value(v, parameters[name].unit, digits) for v in values] for digits in (6, 17))
-    labels = short if len(set(short)) == len(values) else full
-    return [(f"{name} = {label}", value) for label, value in zip(labels, values, strict=True)]
 
 
 class CaseRows:
@@ -329,10 +318,10 @@ def sweep(
 
 
 class _Meter:
-    """How far a study is, how fast it goes and how long it will take."""
+    """Progress of a study, with its rate and the time left once rates no longer jump."""
 
-    def __init__(self, rows: CaseRows) -> None:
-        self._rows = rows
+    def __init__(self, rows: CaseRows, rate_after: float = 5.0) -> None:
+        self._rows, self._rate_after = rows, rate_after  # from the first case on [s]
         self._first: tuple[int, float] | None = None  # cases that were done as the first came, and when [s]
 
     def text(self) -> str:
@@ -340,7 +329,7 @@ class _Meter:
         rows, now = self._rows, time.monotonic()
         done_before, begun = self._first = self._first or (rows.done, now)
         text = f"{rows.done} of {rows.count} cases" + (f", {rows.failed} failed" if rows.failed else "")
-        if now - begun < RATE_AFTER:
+        if now - begun < self._rate_after:
             return text
         rate = (rows.done - done_before) / (now - begun)
         left = round((rows.count - rows.done) / rate)

@@ -5,9 +5,6 @@
 # plants that a core runs before they are read: fewer fill no lanes; the responses of more leave its cache, for fresh
 # pages, and 16 take two fifths longer
 CHUNK_A_CORE = 8
-# share of a metric, or of its median over the plants, by which lanes and certificate may differ: a search claims no
-# figure that differs by more
-USUAL_TOLERANCE = 0.01
 # plants, beside those with an extreme value, whose fastest mode is sought: fewer may miss a stiff one, on which RK4 is
 # then unstable; each more costs an eigenvalue problem a plant and state
 MAX_PROBED = 64
@@ -27,14 +24,9 @@ SIGNIFICANT = 3.0  # deviations [1] of a mean from the value from which it is a 
 
 # Executors
 
-CHUNK_SECONDS = (
-    0.5  # time of a chunk of cases [s]: longer ones lose more with a process, shorter ones cost more to send
-)
-MAX_CHUNK = 1000  # cases in a chunk [1]: more hold up the table, and fill the memory where each is large
 TRIES = 2  # runs of a case whose process dies [1]: a second one tells a case that kills from a machine that went away
 MAX_PROCESSES = 60  # at once: Windows cannot wait for more than 63, and each takes memory for CasADi and the model
 LIMIT_SHARE = 0.25  # of a case's time limit that a chunk shall take [1]: one that takes all of it is cut up
-CHUNKS_A_WORKER = 3  # that wait for each worker [1]: fewer leave it idle while a result travels, more fill the memory
 # workers [1] of an executor that does not say how many it has, or of a cluster that may grow: more make chunks so small
 # that each costs more to send than to compute, fewer leave workers idle
 UNKNOWN_WORKERS = 64
@@ -57,8 +49,6 @@ BREAK_RATIO = 3.0
 # Sensitivity
 
 MAX_LOST = 0.1  # share of points [1] without a figure, beyond which its indices would tell of other plants
-RESAMPLES = 400  # bootstrap samples of an index: fewer make its ends jump, more only take time
-SPREAD_POINTS = 64  # quantiles of an axis that give its standard deviation [1]: fewer cut a normal's tails, 2 % here
 # part of a standard deviation by which a response is moved along its sensitivity [1]: with a larger one a figure that
 # bends is off, with a smaller one its digits are lost in the difference; and the same for the state before the step,
 # which is found by iteration, to fewer digits
@@ -67,4 +57,3 @@ SIDE, START_SIDE = 1e-4, 1e-3
 # Sweep
 
 MAX_TABLE_BYTES = 2**28  # of cases, 256 MiB: more fill the memory; less refuses a million cases of ten parameters
-RATE_AFTER = 5.0  # time after the first case until a rate is shown [s]: earlier ones jump

@@ -18,8 +18,8 @@ from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Sens
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.cylinder import areas, volumes
-from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
+from pneuopt.quantities.units import ANR_DENSITY
 
 MOST_LEARNED = 200.0  # [N] beyond the nominal friction: a collision would teach more
 LEAST_FALL = (
@@ -111,7 +111,7 @@ class ExactLinearisation:
 
         def flow(upstream: Any, downstream: Any) -> Any:
             fall = (downstream / upstream - known["valve.critical_ratio"]) / (1 - known["valve.critical_ratio"])
-            choked = known["valve.conductance"] * REFERENCE_DENSITY * upstream
+            choked = known["valve.conductance"] * ANR_DENSITY * upstream
             return choked * ca.sqrt(ca.fmax(1 - ca.fmax(fall, 0) ** 2, LEAST_FALL))
 
         heat = n * known["gas.constant"] * known["ambient.temperature"]

@@ -37,11 +37,12 @@ from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY, Smoothing
+from pneuopt.models.pneumatic.gas import Smoothing
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import ANR_DENSITY
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import loop_pieces, search_space
 
@@ -122,7 +123,7 @@ def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave(sid
     pressure = run[f"pressure_{side}"]
     gained = (pressure[-1] - pressure[0]) * volume / (287.0 * p.value("ambient.temperature"))
     assert x == pytest.approx(0.25, abs=1e-4)
-    assert litres == pytest.approx(1e3 * gained / REFERENCE_DENSITY, rel=2e-3)
+    assert litres == pytest.approx(1e3 * gained / ANR_DENSITY, rel=2e-3)
     np.testing.assert_allclose(spool[0], run["valve.spool"], atol=1e-12)
 
 
@@ -213,7 +214,7 @@ def test_a_closed_valve_draws_nothing_and_travel_counts_to_and_fro() -> None:
     assert found["AirUse"] == 0.0
     assert found["ValveTravel"] == pytest.approx(4 * 0.1 * 5, rel=1e-4)
     later = metered(t, np.ones((1, 1001)), np.zeros((1, 1001)), 0.5)["AirUse"]
-    assert later == pytest.approx(0.5e3 / REFERENCE_DENSITY)
+    assert later == pytest.approx(0.5e3 / ANR_DENSITY)
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.6])

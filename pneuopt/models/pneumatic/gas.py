@@ -14,10 +14,10 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.units import ANR_DENSITY
 
 GAS_CONSTANT = 287.05  # specific gas constant of dry air [J/(kg K)]
 ISENTROPIC_EXPONENT = 1.4  # ratio of specific heats of air [-]
-REFERENCE_DENSITY = 1.185  # density of air at ANR, ISO 8778: 100 kPa, 20 degC, 65 % humidity [kg/m^3]
 REFERENCE_TEMPERATURE = 293.15  # temperature at ANR [K]
 REFERENCE_PRESSURE = 1e5  # pressure at ANR [Pa]
 _TEMPERATURE_EXPONENT = (ISENTROPIC_EXPONENT - 1) / ISENTROPIC_EXPONENT
@@ -130,7 +130,7 @@ def conductance_of_area(area: float) -> float:
     """
     k = ISENTROPIC_EXPONENT
     choked = sqrt(k / (GAS_CONSTANT * REFERENCE_TEMPERATURE)) * (2 / (k + 1)) ** ((k + 1) / (2 * (k - 1)))
-    return float(area * choked / REFERENCE_DENSITY)
+    return float(area * choked / ANR_DENSITY)
 
 
 def conductance_of_nominal_flow(flow: float, b: float = 0.3) -> float:

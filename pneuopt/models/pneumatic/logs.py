@@ -35,7 +35,6 @@ from pneuopt.dynamics.system import Symbols, System, define, discretise, names, 
 from pneuopt.logs.tolerances import MAX_REGRESSION_ROWS
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.pneumatic.cylinder import volumes
-from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
 from pneuopt.models.starts import (
     RegressionRows,
     choose_filter_time,
@@ -68,7 +67,7 @@ from pneuopt.models.tolerances import (
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import ATMOSPHERE
+from pneuopt.quantities.units import ANR_DENSITY, ATMOSPHERE
 
 PRESSURE_NAMES = ("pressure_a", "pressure_b")
 
@@ -251,7 +250,7 @@ class PneumaticLog:
         fastest = float(np.quantile(np.abs(self.known_states["speed"]), 0.99))
         gas = self.parameters.value("gas.constant") * self.parameters.value("ambient.temperature")
         area = math.pi / 4 * self.parameters.value("cylinder.bore") ** 2
-        return max(area * fastest * 0.5 / (REFERENCE_DENSITY * gas), 1e-10)
+        return max(area * fastest * 0.5 / (ANR_DENSITY * gas), 1e-10)
 
     def _simulate_air(self, valves: Sequence[ValveValues]) -> list[dict[str, Array]]:
         return self._simulator_for(tuple(self.known_states)).simulate_states(

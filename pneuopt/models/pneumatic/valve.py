@@ -9,8 +9,9 @@ import casadi as ca
 
 from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.system import Symbols
-from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY, REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
+from pneuopt.models.pneumatic.gas import REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.units import ANR_DENSITY
 
 
 class Spool(Enum):
@@ -116,7 +117,7 @@ class ProportionalValve:
             fall = upstream.pressure - downstream.pressure
             share = (1 + fall / ca.sqrt(fall**2 + self.smoothing.pressure**2)) / 2
             temperature = downstream.temperature + (upstream.temperature - downstream.temperature) * share
-            scale = p["conductance"] * REFERENCE_DENSITY * opening(x, p) * ca.sqrt(REFERENCE_TEMPERATURE / temperature)
+            scale = p["conductance"] * ANR_DENSITY * opening(x, p) * ca.sqrt(REFERENCE_TEMPERATURE / temperature)
             return scale * self.law.flow(upstream.pressure, downstream.pressure, p, self.smoothing)
 
         return Flows(

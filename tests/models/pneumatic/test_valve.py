@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY, IsentropicNozzle
+from pneuopt.models.pneumatic.gas import IsentropicNozzle
 from pneuopt.models.pneumatic.valve import Port, ProportionalValve, Spool, opening
+from pneuopt.quantities.units import ANR_DENSITY
 
 VALVE = ProportionalValve()
 NUMBERS = {n: q.value for n, q in VALVE.parameters.items()}
@@ -31,7 +32,7 @@ def test_which_way_positive_voltage_drives() -> None:
     assert forwards[0] > 0
     assert forwards[3] > 0
     assert max(forwards[1:3]) < 1e-9
-    assert forwards[0] == pytest.approx(0.5 * 2e-8 * REFERENCE_DENSITY * 7e5, rel=0.02)
+    assert forwards[0] == pytest.approx(0.5 * 2e-8 * ANR_DENSITY * 7e5, rel=0.02)
 
 
 @given(position, st.floats(1.5e5, 6.5e5), st.floats(1.5e5, 6.5e5))
