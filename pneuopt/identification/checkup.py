@@ -43,7 +43,7 @@ from pneuopt.logs.doctor import LogFinding, Severity, evidence, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise
 from pneuopt.quantities.errors import ModelError, PhysicsWarning
-from pneuopt.quantities.parameters import ParameterSet, check_parameters
+from pneuopt.quantities.parameters import Intersample, ParameterSet, check_parameters
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, text_columns
 from pneuopt.quantities.results import Shown
 from pneuopt.quantities.units import ATMOSPHERE, write_value
@@ -217,9 +217,17 @@ def check(
         parameters = find_centre(model, logs, parameters)
     found = [_model_finding(str(w.message), logs) for w in said]
     found += [f for log in logs for f in examine(log, axis_from_model(model.plant, log, parameters))]
-    found += [f for log in logs for f in _exchange_findings(model, log, parameters, found)]
+    for log in logs:
+        several = len({f.channel for f in found if f.fault and f.log == log.name}) > 1
+        if several and (pair := find_exchange(model, log, parameters)):
+            message = f"with the columns of {pair[0]} and {pair[1]} exchanged nothing is wrong: say so in [columns]"
+            found.append(LogFinding(pair[0], message, False, EXCHANGE_CHECK, log.name, evidence(log, *pair)))
     found += [_model_finding(sentence, logs) for sentence in find_log_warnings(model, logs, parameters)]
-    found += [*_log_findings(model, given, logs), *_free(logs, parameters)]
+    found += _log_findings(model, given, logs)
+    try:
+        check_free(logs, parameters)
+    except ModelError as error:
+        found.append(LogFinding("", str(error), True, FREE_CHECK))
     ranked = sorted(
         (_locate(_rank(f, found, logs), logs) for f in found), key=lambda f: list(Severity).index(f.severity)
     )
@@ -233,8 +241,19 @@ def list_assumptions(
     system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
 ) -> tuple[Assumption, ...]:
     """The noise, the behaviour between samples and the fixed parameters that nobody has stated."""
-    logs = (*_noise_levels(system, given, checked), *_behaviour(system, given), *_gauge_zero(system, given))
-    return (*logs, *_defaults(system.parameters, parameters))
+    found = [*_noise_levels(system, given, checked)]
+    behaviour = {
+        n: kind for log in given for n, kind in input_behaviour(system, log).items() if n not in log.intersample
+    }
+    for channel, kind in behaviour.items():
+        how = "as a command runs" if kind is Intersample.HELD else "as a measured channel runs"
+        name, key = f"{channel} between samples", f"[intersample] {channel}"
+        found.append(Assumption(name, kind.value, "", key, SIDECAR, f"{how} between samples"))
+    columns = [column for log in given if log.source for column in log.source.columns.values()]
+    if AMBIENT_PRESSURE not in system.parameters and any("(g)" in column.unit for column in columns):
+        zero = "zero of gauge pressures", ATMOSPHERE, "Pa(a)", "bar(a)", "the log's units", "the standard's"
+        found.append(Assumption(*zero))
+    return (*found, *_defaults(system.parameters, parameters))
 
 
 def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> Iterator[Assumption]:
@@ -249,26 +268,6 @@ def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequen
                 yield Assumption(
                     f"noise of {channel}", found[channel], units[channel], f"[noise] {channel}", SIDECAR, how
                 )
-
-
-def _behaviour(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
-    said: dict[str, str] = {}
-    for log in given:
-        for channel, kind in input_behaviour(system, log).items():
-            if channel not in log.intersample:
-                said[channel] = kind.value
-    for channel, word in said.items():
-        why = "as a command runs between samples" if word == "held" else "as a measured channel runs between samples"
-        yield Assumption(f"{channel} between samples", word, "", f"[intersample] {channel}", SIDECAR, why)
-
-
-def _gauge_zero(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
-    """The zero of gauge pressures in logs of a drive that has no ambient pressure."""
-    if AMBIENT_PRESSURE in system.parameters:
-        return
-    columns = [column for log in given if log.source for column in log.source.columns.values()]
-    if any("(g)" in column.unit for column in columns):
-        yield Assumption("zero of gauge pressures", ATMOSPHERE, "Pa(a)", "bar(a)", "the log's units", "the standard's")
 
 
 def _defaults(defaults: ParameterSet, given: ParameterSet) -> Iterator[Assumption]:
@@ -302,17 +301,6 @@ def _model_finding(sentence: str, logs: Sequence[Experiment]) -> LogFinding:
     return LogFinding(channels[0] if channels else "", message, False, MODEL_CHECK, log.name, shown)
 
 
-def _exchange_findings(
-    model: Fittable, log: Experiment, parameters: ParameterSet, found: Sequence[LogFinding]
-) -> Iterator[LogFinding]:
-    """That two columns are exchanged, where a log has faults in two channels, and none once they are."""
-    several = len({f.channel for f in found if f.fault and f.log == log.name}) > 1
-    pair = find_exchange(model, log, parameters) if several else None
-    if pair is not None:
-        message = f"with the columns of {pair[0]} and {pair[1]} exchanged nothing is wrong: say so in [columns]"
-        yield LogFinding(pair[0], message, False, EXCHANGE_CHECK, log.name, evidence(log, *pair))
-
-
 def _log_findings(model: Fittable, given: Sequence[Experiment], logs: Sequence[Experiment]) -> Iterator[LogFinding]:
     """What was mended in each log, or doubted of its noise, and which measured samples are missing."""
     for log, checked in zip(given, logs, strict=True):
@@ -325,14 +313,6 @@ def _log_findings(model: Fittable, given: Sequence[Experiment], logs: Sequence[E
                 rows = (log.source.first_row + int(at[0]), log.source.first_row + int(at[-1])) if log.source else None
                 message = f"{count}; a fit goes without"
                 yield LogFinding(channel, message, False, LOG_CHECK, checked.name, rows=rows)
-
-
-def _free(logs: Sequence[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:
-    """The fault that nothing is to be identified."""
-    try:
-        check_free(logs, parameters)
-    except ModelError as error:
-        yield LogFinding("", str(error), True, FREE_CHECK)
 
 
 def _rank(finding: LogFinding, found: Sequence[LogFinding], logs: Sequence[Experiment]) -> LogFinding:
@@ -419,7 +399,11 @@ def _log_lines(log: Experiment) -> Iterator[Line]:
     rate = f"every {write_value(step, 's', 4)} ({write_value(1 / step, 'Hz', 5)})"
     yield _line(f"{log.name or 'log'}: {rows}, {t[0]:.6g} s to {t[-1]:.6g} s, {rate}", 2)
     for channel in log.trajectory:
-        yield _line(f"{channel}: {_range(log, channel)}{_origin(log, channel)}", 4)
+        column, unit = log.trajectory[channel], log.unit(channel)
+        low, high = (write_value(float(f(column)), unit, 3) for f in (np.nanmin, np.nanmax))
+        missing = int(np.isnan(column).sum())
+        lost = f", {missing} sample{'s' * (missing > 1)} missing" if missing else ""
+        yield _line(f"{channel}: {low} to {high}{lost}{_origin(log, channel)}", 4)
     if source and "time" in source.columns:
         yield _line(f"time: column {source.columns['time'].name!r}", 4)
     if source and source.sidecar:
@@ -429,13 +413,6 @@ def _log_lines(log: Experiment) -> Iterator[Line]:
     for name, value in log.conditions.items():
         yield _line(f"{name} = {value:g} in this log", 4)
     yield from (_line(remark, 4) for remark in log.remarks)
-
-
-def _range(log: Experiment, channel: str) -> str:
-    column, unit = log.trajectory[channel], log.unit(channel)
-    low, high = (write_value(float(f(column)), unit, 3) for f in (np.nanmin, np.nanmax))
-    missing = int(np.isnan(column).sum())
-    return f"{low} to {high}" + (f", {missing} sample{'s' * (missing > 1)} missing" if missing else "")
 
 
 def _origin(log: Experiment, channel: str) -> str:

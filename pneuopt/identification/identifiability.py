@@ -12,6 +12,7 @@ A newcomer adds a rule: ``rule(mended, finding, ambient) -> MendedLog | None`` a
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -246,14 +247,11 @@ def _make_verdict(
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=list(IdentifiableRow.__annotations__))
-    groups = (tuple(names[i] for i in np.flatnonzero(row)) for row in weak)
-    harmful = tuple(group for group in groups if _is_harmful(table.loc[list(group)]))
+    groups = [[names[i] for i in np.flatnonzero(row)] for row in weak]
+    worst = [table.loc[group, ["inflation", "relative"]].max() for group in groups]
+    exceeds = [w["inflation"] > MAX_INFLATION and w["relative"] > HARMLESS_DEVIATION for w in worst]
+    harmful = tuple(tuple(group) for group, is_harmful in zip(groups, exceeds, strict=True) if is_harmful)
     return Verdict(table, harmful, reasons, identification_hints=hints)
-
-
-def _is_harmful(members: "pd.DataFrame") -> bool:
-    """Whether a weak combination leaves one of its parameters noticeably uncertain."""
-    return bool(members["inflation"].max() > MAX_INFLATION and members["relative"].max() > HARMLESS_DEVIATION)
 
 
 def _comparison_size(name: str, p: Parameter, problem: EstimationProblem) -> float:
@@ -543,7 +541,12 @@ class _Body:
 
 def find_exchange(model: Fittable, log: Experiment, parameters: ParameterSet) -> tuple[str, str] | None:
     """Two channels with which exchanged the log doctor finds no fault; None where there is no such pair, or several."""
-    pairs = [pair for pair in combinations(log.trajectory, 2) if _is_right(model, exchange(log, *pair), parameters)]
+    pairs = []
+    for pair in combinations(log.trajectory, 2):
+        with suppress(InputError):
+            (full,) = check_logs(model, exchange(log, *pair), parameters)
+            found = examine(full, axis_from_model(model.plant, full, parameters))
+            pairs += [] if any(f.fault for f in found) else [pair]
     return pairs[0] if len(pairs) == 1 else None
 
 
@@ -556,14 +559,6 @@ def exchange(log: Experiment, a: str, b: str) -> Experiment:
             values[name] = columns[name].factor * raw + columns[name].offset
     noise = {n: sigma for n, sigma in log.noise.items() if n not in (a, b)}
     return replace(log, trajectory=log.trajectory.with_columns(values), noise=noise, holes=())
-
-
-def _is_right(model: Fittable, log: Experiment, parameters: ParameterSet) -> bool:
-    try:
-        (full,) = check_logs(model, log, parameters)
-    except InputError:
-        return False
-    return not any(f.fault for f in examine(full, axis_from_model(model.plant, full, parameters)))
 
 
 Rule = Callable[[MendedLog, LogFinding, float], MendedLog | None]

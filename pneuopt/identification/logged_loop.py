@@ -146,7 +146,10 @@ class LoggedLoop:
         out: list[Start] = []
         for was_at_rest in (True, False):
             replayed = {n: self._replay_controller(log, n, was_at_rest=was_at_rest) for n, log in logs.items()}
-            plant = {n: self._plant_log(log, replayed[n]) for n, log in logs.items()}
+            plant = {}
+            for n, log in logs.items():
+                measured = log.measured.with_columns({self.loop.command.name: replayed[n]["control"]})
+                plant[n] = Log(measured, log.parameters.select(self.loop.plant.parameters))
             controller = {n: {s: run[s] for s in run if s != "control"} for n, run in replayed.items()}
             label = "from rest" if was_at_rest else "from an empty integral"
             for start in self.loop.plant.starts(plant)[: None if was_at_rest else 1]:
@@ -233,11 +236,6 @@ class LoggedLoop:
         x0 |= {"sensor.reading": measured}
         rested = x0["pid.integral"] + x0["pid.transfer"]  # noise keeps the error of a rest from being zero
         return x0 | {"pid.integral": rested if was_at_rest else 0.0, "pid.transfer": 0.0}
-
-    def _plant_log(self, log: Log, replayed: Trajectory) -> Log:
-        plant = self.loop.plant
-        measured = log.measured.with_columns({self.loop.command.name: replayed["control"]})
-        return Log(measured, log.parameters.select(plant.parameters))
 
 
 def _add_acting_input(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSystem:

@@ -53,7 +53,7 @@ from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.filters import FitScores, fit_scores
-from pneuopt.shooting.least_squares import Fit, Optimum, solve_least_squares
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
 from pneuopt.shooting.segments import Segments, segment
 from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
@@ -278,7 +278,14 @@ def disagreement_p(clusters: Clusters, variance: float) -> float:
     square with the mean and the variance that it has by chance (Satterthwaite 1946).
     """
     scale, own = _whiten(clusters)
-    scores = _simulate_scores(own) if clusters.by_chance is None else clusters.by_chance @ scale.T
+    if clusters.by_chance is None:
+        # scores z_g at the true parameters have the covariance H_g, a cluster's share; fitted, z_g - H_g sum(z)
+        values, vectors = np.linalg.eigh(own)
+        normal = np.random.default_rng(0).standard_normal((SIMULATIONS, *own.shape[:2]))
+        true = np.einsum("gij,gj,ngj->ngi", vectors, np.sqrt(np.maximum(values, 0.0)), normal)
+        scores = true - np.einsum("gij,nj->ngi", own, true.sum(axis=1))
+    else:
+        scores = clusters.by_chance @ scale.T
     assumed = ASSUMED_SHARE / clusters.count * np.eye(len(scale))
     every = np.concatenate([(clusters.scores @ scale.T)[None], scores])
     seen, *chance = np.einsum("ngi,gij,ngj->n", every, np.linalg.inv(own + assumed), every, optimize=True)
@@ -289,17 +296,6 @@ def disagreement_p(clusters: Clusters, variance: float) -> float:
 def t_quantile(dof: Array | float, level: float = LEVEL) -> Array:
     """Half width of an interval in standard deviations, by Student's t."""
     return np.asarray(t.ppf(0.5 + level / 2, dof))
-
-
-def _simulate_scores(own: Array) -> Array:
-    """Whitened scores of fits to independent residuals, shape (SIMULATIONS, K, k), by each cluster's share H_g.
-
-    The scores z_g at the true parameters have the covariance H_g; at the estimates they are z_g - H_g sum(z).
-    """
-    values, vectors = np.linalg.eigh(own)
-    normal = np.random.default_rng(0).standard_normal((SIMULATIONS, *own.shape[:2]))
-    true = np.einsum("gij,gj,ngj->ngi", vectors, np.sqrt(np.maximum(values, 0.0)), normal)
-    return np.asarray(true - np.einsum("gij,nj->ngi", own, true.sum(axis=1)))
 
 
 def _whiten(clusters: Clusters) -> tuple[Array, Array]:
@@ -383,17 +379,13 @@ def _missed_share(problem: EstimationProblem, experiment: Experiment, run: Traje
     measured = experiment.trajectory[channel]
     if math.isinf(problem.window):
         return agreement(measured, run[channel])["nrmse"]
-    bends = np.concatenate([_bend(measured[a:b]) for a, b in window_runs(experiment, problem.window)])
-    size = float(np.nansum(bends**2))
+    size, at = 0.0, np.arange(len(measured))
+    for begin, end in window_runs(experiment, problem.window):
+        known = begin + np.flatnonzero(np.isfinite(measured[begin:end]))
+        if known.size >= 3:  # a start state explains a straight line
+            line = np.polyval(np.polyfit(at[known] - begin, measured[known], 1), at[known] - begin)
+            size += float(np.sum((measured[known] - line) ** 2))
     return math.sqrt(float(np.nansum((measured - run[channel]) ** 2)) / size) if size > 0 else math.nan
-
-
-def _bend(values: Array) -> Array:
-    """What a straight line leaves of some samples; NaN where one is missing."""
-    known, at = np.isfinite(values), np.arange(len(values), dtype=float)
-    if known.sum() < 3:
-        return values * math.nan
-    return np.asarray(values - np.polyval(np.polyfit(at[known], values[known], 1), at))
 
 
 def _hotelling_p(rows: Array) -> float:
@@ -415,24 +407,20 @@ def _signals_behind_residuals(scores: FitScores, known: Sequence[str]) -> list[S
     segments = scores.optimum.equations.segments
     blocks, (sums, derivatives) = _split_in_time(segments, MOTION_BLOCKS), scores.residual_sums()
     measured = np.flatnonzero(segments.counts)
-    means = {n: v for n, v in _segment_means(scores.optimum).items() if n in known}
-    found = []
-    for name, values in means.items():
-        ps = [motion_p(values, sums[:, i], derivatives[:, i], scores, blocks) for i in measured]
-        found.append(Signal(name, values, min(ps)))
-    level = MOTION_LEVEL / max(1, len(found) * len(measured))
-    return sorted((s for s in found if s.p < level), key=lambda s: s.p)
-
-
-def _segment_means(optimum: Optimum) -> dict[str, Array]:
-    """The mean of each state and input over each segment, of those that vary."""
-    segments, x = optimum.equations.segments, optimum.run.x
+    x = scores.optimum.run.x
     assert x is not None
     real = np.arange(segments.t.shape[1]) < segments.lengths[:, None]
     signals = np.concatenate([x, segments.inputs], axis=2)
     means = np.sum(signals * real[..., None], axis=1) / segments.lengths[:, None]
     columns = zip(names((*segments.system.states, *segments.system.inputs)), means.T, strict=True)
-    return {n: v for n, v in columns if np.ptp(v) > MIN_SIGNAL_SPREAD * np.abs(v).max(initial=0.0)}
+    found = []
+    for name, values in columns:
+        if name not in known or not np.ptp(values) > MIN_SIGNAL_SPREAD * np.abs(values).max(initial=0.0):
+            continue  # it does not vary
+        ps = [motion_p(values, sums[:, i], derivatives[:, i], scores, blocks) for i in measured]
+        found.append(Signal(name, values, min(ps)))
+    level = MOTION_LEVEL / max(1, len(found) * len(measured))
+    return sorted((s for s in found if s.p < level), key=lambda s: s.p)
 
 
 def _classes(values: Array, *, of_size: bool = False) -> Indices:
@@ -498,27 +486,18 @@ def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth
     if found.optimum is None:
         return
     for name in names:
-        moved = _step_with(found.optimum, free.index(name), [free.index(n) for n in names])
-        if moved is not None:
-            fall, step = moved
-            change = (scales * step)[free.index(name)] / found.parameters.value(name)
-            yield RejectedWidth(name, fall, (scales * step)[own] / max(1.0, -change))
+        arrow, keep = found.optimum.equations.arrow, found.optimum.keep.copy()
+        reduced, place = arrow.eliminate(0.0), free.index(name)
+        keep[[free.index(n) for n in names]] = False
+        without = reduced and reduced.step(keep)
+        keep[place] = found.optimum.keep[place]
+        step = reduced and reduced.step(keep)
+        if step and without:
+            fall, moves = arrow.descent_rate(step) - arrow.descent_rate(without), scales * step.parameters
+            yield RejectedWidth(name, fall, moves[own] / max(1.0, -moves[place] / found.parameters.value(name)))
 
 
 def fixed_widths(problem: EstimationProblem) -> list[str]:
     """The widths of the model that are not free; a free one is an estimate itself."""
     names = dict.fromkeys(n for w in problem.system.plant.identification_hints.widths for n in (w.name, *w.follows))
     return [n for n in names if n in problem.parameters and not problem.parameters[n].free]
-
-
-def _step_with(optimum: Optimum, width: int, widths: list[int]) -> tuple[float, Array] | None:
-    """The fall of twice the cost by a width, and the Gauss-Newton step of all parameters with it; None without one."""
-    arrow, keep = optimum.equations.arrow, optimum.keep.copy()
-    reduced = arrow.eliminate(0.0)
-    keep[widths] = False
-    without = reduced and reduced.step(keep)
-    keep[width] = optimum.keep[width]
-    step = reduced and reduced.step(keep)
-    if not step or not without:
-        return None
-    return arrow.descent_rate(step) - arrow.descent_rate(without), step.parameters

@@ -117,11 +117,17 @@ class EstimationProblem:
     def transcription(self, candidate: Start) -> Transcription:
         """The problem as multiple shooting, started from a candidate."""
         phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
-        residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
+        residuals = []
+        for i, e in enumerate(self.experiments):
+            outputs = outputs_in_log(self.system, e)
+            noise = np.array([e.noise[o] for o in outputs])
+            if e.name in self.weights:
+                noise = noise[:, None] / np.sqrt(self.weights[e.name].T)
+            residuals.append(Residuals(i, outputs, e.trajectory.matrix(outputs), noise))
         parameters = self.unknowns().with_values(candidate.parameters)
         held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.fixed.items()}
         parameters = parameters | ParameterSet(held)
-        return Transcription(self._discrete, parameters, phases, residuals)
+        return Transcription(self._discrete, parameters, phases, tuple(residuals))
 
     @cached_property
     def _discrete(self) -> DiscreteSystem:
@@ -149,7 +155,12 @@ class EstimationProblem:
         breaks = [end for begin, end in experiment.holes if begin > 0 and end < len(t)]
         if not math.isinf(self.window):
             breaks = sorted({*breaks, *(begin for begin, _ in window_runs(experiment, self.window) if begin > 0)})
-        nodes = regular_nodes(len(t), self._samples_a_segment(h), breaks)
+        if self.system.states:
+            samples = self.method.segment_time / float(np.median(h))
+            a_segment = len(h) if math.isinf(samples) else max(2, round(samples))
+        else:  # a static map has no gaps, and is cut only for batches and blocks of time
+            a_segment = min(max(1, len(h) // STATIC_SEGMENTS), 100)
+        nodes = regular_nodes(len(t), a_segment, breaks)
         guess = states.matrix(names(self.system.states))
         for begin, end in experiment.holes:
             h[max(begin - 1, 0) : end] = 0.0  # the state stands still where its inputs are unknown
@@ -157,20 +168,6 @@ class EstimationProblem:
         driven = append_slopes(t, driven, self._linear, self._rising(experiment))
         start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
         return Phase(experiment.name, t, h, driven, nodes, start, guess=guess, breaks=np.array(breaks, dtype=np.intp))
-
-    def _samples_a_segment(self, h: Array) -> int:
-        """Samples between two nodes; a static map has no gaps, and is cut only for batches and blocks of time."""
-        if not self.system.states:
-            return min(max(1, len(h) // STATIC_SEGMENTS), 100)
-        samples = self.method.segment_time / float(np.median(h))
-        return len(h) if math.isinf(samples) else max(2, round(samples))
-
-    def _residuals(self, index: int, experiment: Experiment) -> Residuals:
-        outputs = outputs_in_log(self.system, experiment)
-        noise = np.array([experiment.noise[o] for o in outputs])
-        if experiment.name in self.weights:
-            noise = noise[:, None] / np.sqrt(self.weights[experiment.name].T)
-        return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
 
 
 def as_estimation_model(model: HasSystem | ClosedLoop | Fittable) -> Fittable:

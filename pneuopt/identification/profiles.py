@@ -256,7 +256,12 @@ def _bracket(refits: _Refits, side: int, target: float) -> None:
     """Refit on one side until the deviance exceeds the level, then closely around that point; or to the bound."""
     p = refits.parameter
     bound = refits.to_search(p.lower if side < 0 else p.upper)
-    inside, step = refits.points[0], (first := _first_step(refits, target))
+    inside, first = refits.points[0], 1.05 * target * refits.spread  # a little beyond the end of the linear interval
+    if p.log:
+        first = min(first, MAX_LOG_STEP) if math.isfinite(first) else MAX_LOG_STEP
+    elif not 0 < first < math.inf:
+        first = 0.1 * max(abs(p.value), 1e-6)
+    step = first
     probes = [point for point in refits.points if side * point.z > side * inside.z]  # of the curvature
     for _ in range(MAX_REFITS_A_SIDE):
         z = side * min(side * inside.z + step, side * bound)
@@ -293,14 +298,6 @@ def _interval_end(refits: _Refits, side: int, target: float) -> float:
 def _is_at_level(refits: _Refits, point: _ProfilePoint, target: float) -> bool:
     """Whether a refit lies so near the level that no other one is needed."""
     return abs(refits.deviance_root(point) - target) < END_TOLERANCE * target
-
-
-def _first_step(refits: _Refits, target: float) -> float:
-    """The first step from the estimate, as searched: a little beyond the end of the linear interval."""
-    p, linear = refits.parameter, 1.05 * target * refits.spread
-    if p.log:
-        return min(linear, MAX_LOG_STEP) if math.isfinite(linear) else MAX_LOG_STEP
-    return linear if math.isfinite(linear) and linear > 0 else 0.1 * max(abs(p.value), 1e-6)
 
 
 def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePoint, target: float) -> None:

@@ -6,7 +6,7 @@ Below: their tables and words, the motion that a set of logs shows, what it lack
 
 import math
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -16,7 +16,6 @@ import numpy as np
 from pneuopt.dynamics.hooks import IdentificationHints, Lack, LoggedMotion
 from pneuopt.identification.tolerances import MOVING_SPEED_SHARE
 from pneuopt.logs.experiment import Experiment
-from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Column, Line, Report, Table, format_number, number_columns, text_columns
 from pneuopt.quantities.results import Result, Shown
@@ -314,7 +313,16 @@ class IdentificationResult(Result):
 
 def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> Report:
     """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen."""
-    rows = [_estimate_row(str(n), row) for n, row in estimates.to_dict(orient="index").items()]
+    rows = []
+    for name, row in estimates.to_dict(orient="index").items():
+        value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
+        if math.isnan(row["ci_low"]) and math.isfinite(row["range_low"]):
+            low, high = float(row["range_low"]), float(row["range_high"])
+            spread = (high - low) / 4  # the digits then show a fiftieth of the range, which is no confidence interval
+            interval = f"range{TIED}{_join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))}"
+        value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
+        mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
+        rows.append((str(name), value, interval, str(row["unit"]), str(mark)))
     rows += [(w.name, format_number(w.value, 3), "-", w.unit, "chosen") for w in widths]
     columns = *text_columns("parameter"), *number_columns("value", f"95{TIED}% interval"), *text_columns("unit", "mark")
     table = (Table(columns, tuple(rows)),) if rows else ()
@@ -354,17 +362,6 @@ def _agreement_in_short(fit: "pd.DataFrame") -> Table:
         *(Column("in log", is_text=True), Column("RMSE: median"), Column("unit", is_text=True)),
     )
     return Table(columns, tuple(rows))
-
-
-def _estimate_row(name: str, row: Mapping[Hashable, Any]) -> tuple[str, str, str, str, str]:
-    value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
-    if math.isnan(row["ci_low"]) and math.isfinite(row["range_low"]):
-        low, high = float(row["range_low"]), float(row["range_high"])
-        spread = (high - low) / 4  # the digits then show a fiftieth of the range, which is no confidence interval
-        interval = f"range{TIED}{_join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))}"
-    value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
-    mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
-    return name, value, interval, str(row["unit"]), str(mark)
 
 
 def _format_interval(value: float, spread: float, low: float, high: float) -> tuple[str, str]:
@@ -486,14 +483,3 @@ def _write_values(words: str, values: ParameterSet) -> str:
 
 def _base_name(name: str) -> str:
     return name.partition("[")[0]
-
-
-def _acceleration(t: Array, v: Array) -> Array:
-    every = max(1, len(t) // 200)
-    return np.asarray(np.diff(v[::every]) / np.diff(t[::every]))
-
-
-def _count_reversals(v: Array, level: float) -> int:
-    """Changes of direction, from beyond a level to beyond it on the other side."""
-    side = np.sign(v[np.abs(v) > level])
-    return int(np.count_nonzero(np.diff(side)))

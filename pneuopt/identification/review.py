@@ -71,15 +71,7 @@ def review_fit(
     """
     start = problem.start_from(result)
     if not result.status.converged:
-        verdict = _verdict_at(problem, start, result)
-        status = (
-            result.status
-            if result.status.code is Code.INTERRUPTED
-            else _locate_failure(problem, start, result.status, verdict)
-        )
-        estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict)
-        unknown = result.covariance * math.nan
-        return replace(result, estimates=estimates, covariance=unknown, status=status, verdict=verdict), ()
+        return _review_failure(problem, start, result), ()
     result = replace(result, estimates=_blank_intervals(result.estimates, unidentifiable))
     profiles, waiting = _profiles(problem, result)
     result = _widen_dragged(result, profiles)
@@ -95,8 +87,12 @@ def review_fit(
         unchanged = [n for n, v in problem.fixed.items() if v == given.value(n)]
         verdict = add_unidentifiable(verdict, unidentifiable, local, unchanged)
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
-    covariance = _widen_covariance(result.covariance, estimates["stderr"])
-    status = _name_part(problem, _name_interruption(result.status, waiting), verdict)
+    covariance, status = _widen_covariance(result.covariance, estimates["stderr"]), result.status
+    if waiting:
+        words = f"the estimates are found, the interval of {waiting[0]} is not"
+        detail = f"the intervals of {join_names(waiting)} are of the linear model, which is doubtful here"
+        status = Status(Code.INTERRUPTED, (words, detail, *status.sentences[1:], "run again for the intervals"))
+    status = _name_part(problem, status, verdict)
     result = replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
     return result, tuple(profiles.values())
 
@@ -120,15 +116,6 @@ def _verdict_at(problem: EstimationProblem, start: Start, result: Identification
     return verdict_from_sensitivities(
         problem, start, max(1.0, result.stats["chi_square_ratio"] * result.stats["variance_inflation"])
     )
-
-
-def _name_interruption(status: Status, waiting: Sequence[str]) -> Status:
-    """The status of a fit, interrupted where intervals still waited for their profiles."""
-    if not waiting:
-        return status
-    verdict = f"the estimates are found, the interval of {waiting[0]} is not"
-    detail = f"the intervals of {join_names(waiting)} are of the linear model, which is doubtful here"
-    return Status(Code.INTERRUPTED, (verdict, detail, *status.sentences[1:], "run again for the intervals"))
 
 
 def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple[dict[str, Profile], list[str]]:
@@ -211,14 +198,16 @@ def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
     return out.assign(value=out["value"].where(known), mark=out["mark"].where(known, Mark.UNIDENTIFIABLE))
 
 
-def _locate_failure(problem: EstimationProblem, start: Start, status: Status, verdict: Verdict) -> Status:
-    """The status of a failure with its worst place and the remedies."""
-    status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
-    if verdict.unidentifiable:
-        status = status.with_remedies(
-            _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
-        )
-    return status.with_remedies(*advise_widths(problem))
+def _review_failure(problem: EstimationProblem, start: Start, result: IdentificationResult) -> IdentificationResult:
+    """The result without intervals; its status names the worst place and the remedies, unless it was interrupted."""
+    verdict, status = _verdict_at(problem, start, result), result.status
+    estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict)
+    if status.code is not Code.INTERRUPTED:
+        status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
+        advice = _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
+        status = status.with_remedies(*(advice if verdict.unidentifiable else ()), *advise_widths(problem))
+    unknown = result.covariance * math.nan
+    return replace(result, estimates=estimates, covariance=unknown, status=status, verdict=verdict)
 
 
 def _name_part(problem: EstimationProblem, status: Status, verdict: Verdict) -> Status:
@@ -345,16 +334,11 @@ def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     alike = sorted(
         (t for t in trials if t.squares <= level), key=lambda trial: (trial.name.startswith(NATURE), trial.squares)
     )
-    return replace(alike[0], alike=tuple(t.name for t in alike[1:]), lag=_dead_time(problem, alike[0]))
-
-
-def _dead_time(problem: EstimationProblem, value: WrongValue) -> float:
-    """The dead time that delays slow commands as a lower bandwidth of the final control element does [s]; or 0."""
-    axis = problem.system.plant.axis
-    element = axis.final_element if axis is not None else None
-    if element is None or value.name != element.bandwidth:
-        return 0.0
-    return max(0.0, (1 / value.found - 1 / value.given) / (2 * math.pi))
+    best, axis, lag = alike[0], problem.system.plant.axis, 0.0
+    if axis is not None and axis.final_element is not None and best.name == axis.final_element.bandwidth:
+        # a dead time delays slow commands as a lower bandwidth does
+        lag = max(0.0, (1 / best.found - 1 / best.given) / (2 * math.pi))
+    return replace(best, alike=tuple(t.name for t in alike[1:]), lag=lag)
 
 
 def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:

@@ -71,7 +71,6 @@ from pneuopt.identification.tolerances import (
     SHORT_ITERATIONS,
     WINDOW_FACTOR,
 )
-from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code, Status
@@ -294,17 +293,16 @@ def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> t
             return problem, replace(fit, status=part.status)
         if part.status.code is Code.DIVERGED:
             return problem, fit
-    return (problem, fit) if _rests_on_held(held, part) else (held, part)
-
-
-def _rests_on_held(problem: EstimationProblem, fit: Fit) -> bool:
-    """Whether the logs tell nothing of any other parameter where those held may be ten times as large."""
-    if fit.covariance is None or fit.prior_covariance is None:
-        return False
-    names = fit.parameters.free_names
-    values, free = np.array([fit.parameters.value(n) for n in names]), [n not in problem.fixed for n in names]
-    covariance = fit.covariance + fit.prior_covariance
-    return bool(prior_dominated(covariance, fit.prior_covariance, values, problem.fixed.values())[free].all())
+    if part.covariance is None or part.prior_covariance is None:
+        return held, part
+    # where those held may be ten times as large, the logs may tell nothing of any other
+    values = np.array([part.parameters.value(n) for n in part.parameters.free_names])
+    covariance, free = (
+        part.covariance + part.prior_covariance,
+        [n not in held.fixed for n in part.parameters.free_names],
+    )
+    leans = prior_dominated(covariance, part.prior_covariance, values, held.fixed.values())
+    return (problem, fit) if leans[free].all() else (held, part)
 
 
 def explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
@@ -422,24 +420,16 @@ def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candid
     tried before; with one that is not clearly above another that bounds it, one that has led to the same.
     """
     for found in _tries(problem):
-        held, fit, label = _settle(*found) if tried else found
+        held, fit, label = found
+        if tried and fit.status.code is Code.NOT_CONVERGED and is_at_noise(held, fit):
+            held, fit = fit_without_unsettled(*found)
         is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.fixed or bool(tried))
-        is_sure = is_in_order(held, fit) or any(_is_confirmed(fit, other) for _, other, _ in tried)
+        pairs = (sorted((fit, other), key=lambda each: each.stats["cost"]) for _, other, _ in tried)
+        is_sure = is_in_order(held, fit) or any(are_alike(better, worse) for better, worse in pairs)
         tried.append((held, fit, label))
         if (is_answer and is_sure) or fit.status.code is Code.INTERRUPTED:
             return held, fit, label
     return None
-
-
-def _is_confirmed(fit: Fit, other: Fit) -> bool:
-    """Whether both ended at one optimum, whichever of them is the better."""
-    return are_alike(*sorted((fit, other), key=lambda each: each.stats["cost"]))
-
-
-def _settle(problem: EstimationProblem, fit: Fit, label: str) -> Candidate:
-    """The fit; where it is at the noise but for a parameter that did not settle, that of the others."""
-    is_unsettled = fit.status.code is Code.NOT_CONVERGED and is_at_noise(problem, fit)
-    return (*(fit_without_unsettled(problem, fit, label) if is_unsettled else (problem, fit)), label)
 
 
 def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
@@ -497,15 +487,23 @@ def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> 
 
 
 def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
-    """The problem with an excerpt in place of each long log."""
+    """The problem with its liveliest part in place of each long log."""
     if math.isfinite(problem.window) or not problem.has_gaps or len(problem.candidates()) < 2:
         return None
     if not problem.system.states or any(e.holes for e in problem.experiments) or problem.weights:
         return None
-    parts = tuple(_cut(problem, e) for e in problem.experiments)
+    parts = []
+    for e in problem.experiments:
+        run, step, part = e.trajectory, float(np.median(np.diff(e.trajectory.t))), e
+        count = math.ceil(EXCERPT_SEGMENTS * max(problem.method.segment_time, step) / step)
+        if len(run) >= MIN_LENGTH_RATIO * count:
+            columns = [run.fill_gaps(name) for name in outputs_in_log(problem.system, e)]
+            begin = liveliest_part(np.column_stack(columns), count)
+            part = replace(e, trajectory=run.rows(begin, begin + count), source=None)
+        parts.append(part)
     whole, kept = (sum(len(e.trajectory) for e in each) for each in (problem.experiments, parts))
     is_huge = sum(e.trajectory.duration for e in problem.experiments) > MAX_SEGMENTS * problem.method.segment_time
-    return replace(problem, experiments=parts) if whole >= MIN_LENGTH_RATIO * kept and not is_huge else None
+    return replace(problem, experiments=tuple(parts)) if whole >= MIN_LENGTH_RATIO * kept and not is_huge else None
 
 
 def filter_states(problem: EstimationProblem, start: Start, gathered: float = GATHERED_DEVIATION) -> Start:
@@ -543,26 +541,20 @@ def liveliest_part(columns: Array, count: int) -> int:
     return int(first[np.argmax(np.log(variances).sum(axis=1))])
 
 
-def _cut(problem: EstimationProblem, experiment: Experiment) -> Experiment:
-    """The liveliest part of a log; the log itself where it is short."""
-    run = experiment.trajectory
-    step = float(np.median(np.diff(run.t)))
-    count = math.ceil(EXCERPT_SEGMENTS * max(problem.method.segment_time, step) / step)
-    if len(run) < MIN_LENGTH_RATIO * count:
-        return experiment
-    columns = [run.fill_gaps(name) for name in outputs_in_log(problem.system, experiment)]
-    begin = liveliest_part(np.column_stack(columns), count)
-    return replace(experiment, trajectory=run.rows(begin, begin + count), source=None)
-
-
 # a parameter over the one that bounds it [1]: finer and wider ones cost time, others miss the valley
 RATIOS = np.geomspace(1.1, 2.4, 8)
 
 
 def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit | None:
     """The fit with tight gaps from where the prediction errors of a filter lead; None where no guess predicts."""
-    bounded, guesses = _bounded_parameters(problem), [c for c in problem.candidates() if c.trial_parameters]
-    if not bounded or len(guesses) < 2 or not _is_plain(problem):
+    free = set(problem.parameters.free_names) - set(problem.fixed)
+    order = problem.system.plant.identification_hints.at_least
+    bounded = {n: m for n, m in order.items() if n in free and m in free}
+    guesses = [c for c in problem.candidates() if c.trial_parameters]
+    # a filter follows whole logs from segment to segment
+    is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
+    is_plain = is_whole and bool(problem.system.states) and not problem.weights
+    if not bounded or len(guesses) < 2 or not is_plain:
         return None
     segments = segment(problem.transcription(guesses[0]))
     scaling = ParameterScaling(segments.transcription)
@@ -585,19 +577,6 @@ def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit |
     start = filter_states(tight, start, last[-1].gap)
     method = replace(tight.method, max_misfit=max_misfit)
     return solve_least_squares(tight.transcription(start), method)
-
-
-def _is_plain(problem: EstimationProblem) -> bool:
-    """Whether a filter can follow the logs from segment to segment."""
-    is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
-    return is_whole and bool(problem.system.states) and not problem.weights
-
-
-def _bounded_parameters(problem: EstimationProblem) -> dict[str, str]:
-    """The free parameters that another one bounds, and that one."""
-    free = set(problem.parameters.free_names) - set(problem.fixed)
-    order = problem.system.plant.identification_hints.at_least
-    return {n: m for n, m in order.items() if n in free and m in free}
 
 
 def _hypotheses(guesses: Sequence[Start], bounded: dict[str, str]) -> Iterator[tuple[tuple[int, int], Start]]:
@@ -685,7 +664,9 @@ def enforce_ordering(problem: EstimationProblem, fit: Fit, label: str) -> tuple[
         return problem, fit
     start = problem.start_from(fit, label)
     start = replace(start, parameters={**start.parameters, **values})
-    ordered = replace(problem, fixed={**problem.fixed, **_without_effect(problem, start), **values})
+    begun = given.with_values(start.parameters)
+    unseen = {n: begun.value(n) for n in verdict_from_sensitivities(problem, start).unidentifiable}
+    ordered = replace(problem, fixed={**problem.fixed, **unseen, **values})
     if len(ordered.fixed) >= len(found.free_names):
         return problem, fit
     held, other = fit_fixing_unidentifiable(ordered, start)
@@ -698,26 +679,17 @@ def mark_order(problem: EstimationProblem, result: IdentificationResult) -> Iden
     """Mark estimates that the logs put below another one beyond chance, though no plant has them there."""
     estimates, status = result.estimates.copy(), result.status
     for low, high in problem.system.plant.identification_hints.at_least.items():
-        if low in estimates.index and _is_below(result, low, high):
-            estimates.loc[[n for n in (low, high) if n in estimates.index], "mark"] = Mark.BIAS_POSSIBLE
+        if low not in estimates.index:
+            continue
+        names = [n for n in (low, high) if n in estimates.index]
+        signs = np.array([1.0 if n == high else -1.0 for n in names])
+        variance = float(signs @ result.covariance.loc[names, names].to_numpy() @ signs)
+        below = result.parameters.value(high) - float(result.estimates["value"][low])
+        if variance >= 0 and below > CLEAR_DEVIATIONS * math.sqrt(variance):
+            estimates.loc[names, "mark"] = Mark.BIAS_POSSIBLE
             words = f"{low} is below {high}, which no drive has: model error, both may be biased"
             status = status.with_details(words)
     return replace(result, estimates=estimates, status=status)
-
-
-def _is_below(result: IdentificationResult, low: str, high: str) -> bool:
-    """Whether an estimate is below another parameter, free or fixed, beyond chance."""
-    names = [n for n in (low, high) if n in result.estimates.index]
-    signs = [1.0 if n == high else -1.0 for n in names]
-    values = {low: float(result.estimates["value"][low]), high: result.parameters.value(high)}
-    variance = float(signs @ result.covariance.loc[names, names].to_numpy() @ signs)
-    return variance >= 0 and values[high] - values[low] > CLEAR_DEVIATIONS * math.sqrt(variance)
-
-
-def _without_effect(problem: EstimationProblem, start: Start) -> dict[str, float]:
-    """The parameters that the logs do not identify at a start, with its values."""
-    values = problem.unknowns().with_values(start.parameters)
-    return {n: values.value(n) for n in verdict_from_sensitivities(problem, start).unidentifiable}
 
 
 Windowed = tuple[EstimationProblem, Fit, ChosenWindow]
