@@ -339,7 +339,7 @@ def _predict_log(
     problem = EstimationProblem(system, (experiment,), fixed, method)
     windows = replace(problem, window=math.inf if window is None else window)
     check_window(windows)
-    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), method)
+    fit = solve_least_squares(problem.transcription(problem.candidates[0]), method)
     if window is not None:  # from that fit: over a whole log in one segment, stiction would trap the start
         windows = replace(windows, method=replace(method, segment_time=window))
         fit = solve_least_squares(windows.transcription(windows.start_from(fit)), windows.method)

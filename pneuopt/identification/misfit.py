@@ -48,10 +48,8 @@ from pneuopt.identification.tolerances import (
     SLOW_RATIO,
     TIME_BLOCKS,
 )
-from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.status import Code, Status
-from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.filters import FitScores, fit_scores
 from pneuopt.shooting.least_squares import Fit, solve_least_squares
 from pneuopt.shooting.segments import Segments, segment
@@ -60,7 +58,7 @@ from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """What the residuals of a fit tell about its intervals."""
+    """The diagnosis of a fit's residuals, for its intervals."""
 
     covariance: Array | None  # of all free parameters; NaN for those that the fit has not determined
     dof: Array  # degrees of freedom of each variance, for Student's t
@@ -96,7 +94,7 @@ class Misfit:
         return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
 
     def assess(self, status: Status) -> Status:
-        """The status of a fit with what its residuals tell."""
+        """The status of a fit with the diagnosis of its residuals."""
         status = status.with_details(*self.sentences)
         if not (self.is_excessive and status.converged):
             return status
@@ -106,12 +104,12 @@ class Misfit:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What a user should know, and what would help."""
+        """Sentences for the user: the misfit, and the logs that would help."""
         found = []
         if self.signals:
             found.append(f"residuals depend on {join_names(self.signals)}: model error, estimates may be biased")
         if self.restarts:
-            found.append("over whole logs the model misses more than their noise: estimates from windows may be biased")
+            found.append("over whole logs the misfit exceeds the noise: estimates from windows may be biased")
         if self.rejected_widths:
             widths = f"{join_names(self.rejected_widths)} that the logs reject"
             found.append(f"the model has a value of {widths}: the estimates that it moves may be biased")
@@ -252,10 +250,18 @@ def robust_covariance(
     enough = np.minimum(np.max([s.dof for s in within], axis=0), MIN_TIME_DOF)
     spreads = [(s._replace(dof=np.maximum(s.dof, LEAST_TIME_DOF)), s.dof >= enough) for s in within]
     spreads += [(s, s.dof >= MIN_LOG_DOF) for s in between]
-    covariance, degrees = _widest(white, dof, spreads)
+    # for each parameter the widest interval among those that count for it
+    variances, degrees, together = np.diag(white).copy(), np.full(len(white), dof), white.copy()
+    for spread, counts in spreads:
+        own, own_dof = np.diag(spread.covariance), np.where(counts, spread.dof, dof)
+        wider = counts & (t_quantile(own_dof) * np.sqrt(own) > t_quantile(degrees) * np.sqrt(variances))
+        variances, degrees = np.where(wider, own, variances), np.where(wider, own_dof, degrees)
+        together += spread.covariance
+    stretch = np.sqrt(variances / np.diag(together))
     lone = between[0].dof < MIN_LOG_DOF if between else none
     fine, coarse = (np.diag(spread.covariance) for spread in (within[0], within[max(len(times) - 1, 0)]))
     slow = len(times) > 1 and bool(np.median(coarse / fine) > SLOW_RATIO)
+    covariance = together * np.outer(stretch, stretch)
     return RobustCovariance(covariance, degrees, widened=True, is_slow=slow, lone=lone)
 
 
@@ -328,21 +334,6 @@ def _degrees_of_freedom(directions: Array, own: Array) -> float:
     return float(np.trace(M)) ** 2 / squares if squares > 0 else 0.0
 
 
-def _widest(white: Array, dof: float, spreads: Sequence[tuple[Spread, Mask]]) -> tuple[Array, Array]:
-    """For each parameter the variance with the widest interval, and its degrees of freedom.
-
-    The mask tells for which parameters a spread counts.
-    """
-    variance, freedom, together = np.diag(white).copy(), np.full(len(white), dof), white.copy()
-    for spread, counts in spreads:
-        own, own_dof = np.diag(spread.covariance), np.where(counts, spread.dof, dof)
-        wider = counts & (t_quantile(own_dof) * np.sqrt(own) > t_quantile(freedom) * np.sqrt(variance))
-        variance, freedom = np.where(wider, own, variance), np.where(wider, own_dof, freedom)
-        together += spread.covariance
-    stretch = np.sqrt(variance / np.diag(together))
-    return together * np.outer(stretch, stretch), freedom
-
-
 class Signal(NamedTuple):
     """A simulated signal, its mean in each segment, and the probability that the residuals depend on it by chance."""
 
@@ -366,26 +357,28 @@ def motion_p(values: Array, residuals: Array, derivatives: Array, scores: FitSco
 
 
 def _is_excessive(problem: EstimationProblem, fit: Fit, variance: float) -> bool:
-    """Whether residuals exceed the noise so far, or the variation of a channel where its noise is estimated."""
+    """Whether residuals exceed the noise so far, or the variation of a channel where its noise is estimated.
+
+    Within windows the variation is what the start of each does not explain.
+    """
     if variance <= MAX_MISFIT**2:
         return False
-    pairs = zip(problem.experiments, fit.trajectories, strict=True)
-    shares = [_missed_share(problem, e, run, c) for e, run in pairs for c in outputs_in_log(problem.system, e)]
+    shares = []
+    for e, run in zip(problem.experiments, fit.trajectories, strict=True):
+        for channel in outputs_in_log(problem.system, e):
+            measured = e.trajectory[channel]
+            if math.isinf(problem.window):
+                shares.append(agreement(measured, run[channel])["nrmse"])
+                continue
+            size = 0.0
+            for begin, end in window_runs(e, problem.window):
+                at = np.flatnonzero(np.isfinite(measured[begin:end]))
+                values = measured[begin:end][at]
+                if at.size >= 3:  # a start state explains a straight line
+                    size += float(np.sum((values - np.polyval(np.polyfit(at, values, 1), at)) ** 2))
+            rest = float(np.nansum((measured - run[channel]) ** 2))
+            shares.append(math.sqrt(rest / size) if size > 0 else math.nan)
     return problem.noise_is_stated or float(np.nanmean(shares)) > MAX_NRMSE
-
-
-def _missed_share(problem: EstimationProblem, experiment: Experiment, run: Trajectory, channel: str) -> float:
-    """Residuals over the variation of a channel; within windows, over what the start of each does not explain."""
-    measured = experiment.trajectory[channel]
-    if math.isinf(problem.window):
-        return agreement(measured, run[channel])["nrmse"]
-    size, at = 0.0, np.arange(len(measured))
-    for begin, end in window_runs(experiment, problem.window):
-        known = begin + np.flatnonzero(np.isfinite(measured[begin:end]))
-        if known.size >= 3:  # a start state explains a straight line
-            line = np.polyval(np.polyfit(at[known] - begin, measured[known], 1), at[known] - begin)
-            size += float(np.sum((measured[known] - line) ** 2))
-    return math.sqrt(float(np.nansum((measured - run[channel]) ** 2)) / size) if size > 0 else math.nan
 
 
 def _hotelling_p(rows: Array) -> float:
@@ -470,7 +463,7 @@ def suspect_widths(misfit: Misfit, problem: EstimationProblem, fit: Fit, varianc
 
 
 def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth]:
-    """What each width of a model would change if a converged fit estimated it, too.
+    """The changes by each width of a model, if a converged fit estimated it, too.
 
     Nothing where gaps stand for noise of the states, whose costs have other weights.
     """

@@ -16,7 +16,6 @@ from pneuopt.identification.problem import EstimationProblem, as_estimation_mode
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.statistics import confidence_interval
 from pneuopt.identification.tolerances import (
-    DELTA_METHOD_STEP,
     END_TOLERANCE,
     MAX_LOG_PROBE,
     MAX_LOG_STEP,
@@ -387,17 +386,19 @@ def propagate_intervals(
     return values, np.array([confidence_interval(v, s, log=False, dof=d) for v, s, d in every])
 
 
-def _linearise(result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]) -> tuple[Array, Array]:
-    """The figures at the estimates, shape (n,), and their slopes by these, shape (n, k)."""
+def _linearise(
+    result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike], step: float = 1e-3
+) -> tuple[Array, Array]:
+    """The figures at the estimates, shape (n,), and their slopes (n, k) by these over a step [standard deviations]."""
     known = {n: p.value for n, p in result.parameters.items()}
     found = {str(n): float(v) for n, v in result.estimates["value"].items()}
     at = {**known, **{n: known[n.partition("[")[0]] if math.isnan(v) else v for n, v in found.items()}}
     variances = np.diag(result.covariance.to_numpy(dtype=float))
     slopes = []
     for name, variance in zip(map(str, result.covariance.index), variances, strict=True):
-        step = DELTA_METHOD_STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
-        up, down = (np.asarray(function({**at, name: at[name] + side * step}), dtype=float) for side in (1, -1))
-        slopes.append((up - down) / (2 * step))
+        change = step * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
+        up, down = (np.asarray(function({**at, name: at[name] + side * change}), dtype=float) for side in (1, -1))
+        slopes.append((up - down) / (2 * change))
     value = np.asarray(function(at), dtype=float)
     return value, np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
 

@@ -46,9 +46,7 @@ from pneuopt.identification.tolerances import (
     CLEAR_DEVIATIONS,
     DECIDING,
     EXCERPT_SEGMENTS,
-    FIRST_ITERATIONS,
     GAP_FACTOR,
-    GUESS_BOUND_WIDTH,
     GUESS_STAGES,
     HOPELESS_MISFIT,
     LEVELS,
@@ -63,13 +61,13 @@ from pneuopt.identification.tolerances import (
     MIN_LENGTH_RATIO,
     MIN_WINDOW_SAMPLES,
     MIN_WINDOWS,
-    NEXT_ITERATIONS,
     PART_SEGMENTS,
     REFIT_STAGES,
     SAME_COST_RATIO,
     SAME_MISFIT_RATIO,
     SHORT_ITERATIONS,
     WINDOW_FACTOR,
+    WINDOW_ITERATIONS,
 )
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import InputError, require
@@ -80,7 +78,6 @@ from pneuopt.shooting.filters import PredictionErrors, filter_nodes
 from pneuopt.shooting.least_squares import (
     BudgetSpentError,
     Fit,
-    LeastSquares,
     SearchEnd,
     close_gaps,
     solve_least_squares,
@@ -111,8 +108,11 @@ def fit_from_starts(
         for start in starts_by_cost(problem, confirms, left_after, lambda: _cost_after_guesses(problem, fits)):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
-            known = _joinable_costs(fits) if is_plain else ()
-            tried = replace(problem, method=_method_after(problem, fits)) if known else problem
+            # a search that joins the best one only confirms it: without noise of the states where that did not settle
+            is_joinable = is_plain and bool(fits) and is_optimum(fits[0][1]) and not fits[0][0].fixed
+            known = fits[0][1].stage_costs if is_joinable else ()
+            settles = is_joinable and problem.method.allows_state_noise and fits[0][1].status.converged
+            tried = replace(problem, method=replace(problem.method, allows_state_noise=settles)) if known else problem
             held, fit = fit_fixing_unidentifiable(tried, start, limit, known)
             held = replace(held, method=problem.method)
             if fit.end is SearchEnd.DUPLICATE:
@@ -178,7 +178,7 @@ def starts_by_cost(
     `confirms` tells whether the first optimum only needs confirmation, by the next start as it is; `left_after` after
     how many stages the first start was left, `left_cost` what it cost after as many as the others get.
     """
-    candidates = problem.candidates()
+    candidates = problem.candidates
     yield candidates[0]
     while len(candidates) > 1 and confirms():
         candidates = candidates[1:]
@@ -215,15 +215,18 @@ def _cost_after_guesses(problem: EstimationProblem, fits: Sequence[Candidate]) -
     return next((cost for stage, cost in fits[0][1].stage_costs if stage == gap), math.nan)
 
 
-def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
-    """What a start reaches in some stages with its guesses held, the start from there, and whether that is the noise.
+def _settle_start(
+    problem: EstimationProblem, candidate: Start, stages: int, width: float = 1e-9
+) -> tuple[tuple[float, float], Start, bool]:
+    """The cost of a start after some stages with its guesses held, the start from there, and whether that is the noise.
 
     A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones. With
-    noise of the states a wrong guess explains any log.
+    noise of the states a wrong guess explains any log. Bounds of some `width` [1] hold a guess, for equal
+    ones would compile other equations.
     """
     transcription = problem.transcription(candidate)
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
-    bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
+    bounds = {n: (v - width * abs(v), v + width * abs(v)) for n, v in guesses.items()}
     held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
     method = replace(problem.method, stages=problem.method.stages[:stages], allows_state_noise=False)
     fit = solve_least_squares(held, method)
@@ -276,7 +279,7 @@ def _hold_unidentifiable(
 
 
 def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
-    """Where a search did not settle in a parameter, the fit of the others with that one held where it came to."""
+    """The fit of the other parameters, where a search did not settle in one: that one is held where it came to."""
     held, part = problem, fit
     last = problem.method.stages[-REFIT_STAGES:]
     warm = replace(
@@ -329,17 +332,6 @@ def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
     """
     best = fits[0][1]
     return is_optimum(best) and (len(fits) == 1 or best.jumps is not None)
-
-
-def _joinable_costs(fits: Sequence[Candidate]) -> tuple[tuple[float, float], ...]:
-    """The costs at the end of the best search's stages, at which another one that joins it only confirms it."""
-    return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].fixed else ()
-
-
-def _method_after(problem: EstimationProblem, fits: Sequence[Candidate]) -> LeastSquares:
-    """The method of a start that is to confirm the best one: without noise of the states where that did not settle."""
-    settles = problem.method.allows_state_noise and fits[0][1].status.converged
-    return replace(problem.method, allows_state_noise=settles)
 
 
 def _are_enough(fits: Sequence[Candidate]) -> bool:
@@ -433,7 +425,7 @@ def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candid
 
 
 def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
-    """What is tried before a long search of long logs; nothing where they are short.
+    """The attempts before a long search of long logs; none where they are short.
 
     First a short search: most logs need no more, and one that is cut near the noise goes on. Then the fit from states
     that are filtered, and that from the parameters of a part of each log. The states of the whole logs are filtered by
@@ -442,7 +434,7 @@ def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
     parts = cut_excerpts(problem)
     if parts is None:
         return
-    rough, stages = problem.candidates()[0], problem.method.stages
+    rough, stages = problem.candidates[0], problem.method.stages
     few = stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)
     method = replace(problem.method, stages=few, max_misfit=HOPELESS_MISFIT, allows_state_noise=False)
     short = solve_least_squares(problem.transcription(rough), method)
@@ -488,7 +480,7 @@ def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> 
 
 def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
     """The problem with its liveliest part in place of each long log."""
-    if math.isfinite(problem.window) or not problem.has_gaps or len(problem.candidates()) < 2:
+    if math.isfinite(problem.window) or not problem.has_gaps or len(problem.candidates) < 2:
         return None
     if not problem.system.states or any(e.holes for e in problem.experiments) or problem.weights:
         return None
@@ -550,7 +542,7 @@ def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit |
     free = set(problem.parameters.free_names) - set(problem.fixed)
     order = problem.system.plant.identification_hints.at_least
     bounded = {n: m for n, m in order.items() if n in free and m in free}
-    guesses = [c for c in problem.candidates() if c.trial_parameters]
+    guesses = [c for c in problem.candidates if c.trial_parameters]
     # a filter follows whole logs from segment to segment
     is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
     is_plain = is_whole and bool(problem.system.states) and not problem.weights
@@ -713,15 +705,17 @@ def check_window(problem: EstimationProblem) -> None:
 
 def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
     """The fit in windows of the length with the narrowest intervals; None unless whole logs failed by their gaps."""
-    if not _has_failed_by_gaps(problem, fit):
+    absorbed = fit.stats["gap_share"] > MAX_GAP_SHARE and math.isfinite(fit.stats["cost"])
+    can_cut = not problem.is_whole and bool(problem.system.states) and problem.system.motion().sample_time is None
+    if not (fit.status.code is Code.NOT_CONVERGED and absorbed and can_cut):
         return None
     lengths = [problem.window] if math.isfinite(problem.window) else _lengths(problem)
-    trials, start, iterations = list[_Trial](), problem.start_from(fit), FIRST_ITERATIONS
+    trials, start, iterations = list[_WindowTrial](), problem.start_from(fit), 2 * WINDOW_ITERATIONS
     for length in reversed(lengths):
         trials.append(_try_length(problem, start, length, iterations))
         if trials[-1].fit.status.code is Code.INTERRUPTED:
             break
-        start, iterations = trials[-1].problem.start_from(trials[-1].fit), NEXT_ITERATIONS
+        start, iterations = trials[-1].problem.start_from(trials[-1].fit), WINDOW_ITERATIONS
     found = [trial for trial in trials if trial.is_answer]
     if not found:
         return None
@@ -747,7 +741,7 @@ def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
     return segments.trajectories(segments.run(nodes, q, substeps, states=True))
 
 
-class _Trial(NamedTuple):
+class _WindowTrial(NamedTuple):
     """The fit in windows of one length."""
 
     length: float
@@ -780,7 +774,7 @@ class _Trial(NamedTuple):
         known = float(np.mean(self.half_widths < sizes)) if sizes.size else 1.0
         return self.fit.status.converged and known > MIN_KNOWN_SHARE
 
-    def agrees(self, shorter: "_Trial") -> bool:
+    def agrees(self, shorter: "_WindowTrial") -> bool:
         """Whether its estimates agree with those of shorter windows, in which the model's errors add up less."""
         names = [n for n in self.fit.parameters.free_names if n in shorter.fit.parameters.free_names]
         apart = np.abs([self.fit.parameters.value(n) - shorter.fit.parameters.value(n) for n in names])
@@ -788,13 +782,6 @@ class _Trial(NamedTuple):
         own, other = self.half_widths, shorter.half_widths
         widths = [own[free.index(n)] + other[others.index(n)] for n in names]
         return bool(np.all(apart <= np.array(widths)))
-
-
-def _has_failed_by_gaps(problem: EstimationProblem, fit: Fit) -> bool:
-    """Whether gaps have taken the misfit of a search that ended by itself, of a plant that windows can cut."""
-    absorbed = fit.stats["gap_share"] > MAX_GAP_SHARE and math.isfinite(fit.stats["cost"])
-    can_cut = not problem.is_whole and bool(problem.system.states) and problem.system.motion().sample_time is None
-    return fit.status.code is Code.NOT_CONVERGED and absorbed and can_cut
 
 
 def _lengths(problem: EstimationProblem) -> list[float]:
@@ -808,12 +795,12 @@ def _lengths(problem: EstimationProblem) -> list[float]:
     return [shortest * WINDOW_FACTOR**k for k in range(count)]
 
 
-def _try_length(problem: EstimationProblem, start: Start, length: float, iterations: int) -> _Trial:
-    """The fit in windows of one length, a segment each, and what its residuals tell."""
+def _try_length(problem: EstimationProblem, start: Start, length: float, iterations: int) -> _WindowTrial:
+    """The fit in windows of one length, a segment each, with the diagnosis of its residuals."""
     # without gaps all stages are alike; steps are refined where the search has converged
     last = replace(problem.method.stages[-1], iterations=iterations, refine=1)
     cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=(last,)))
     held, found = fit_fixing_unidentifiable(cut, start)
     held = replace(held, method=replace(held.method, stages=problem.method.stages))
     freedom = degrees_of_freedom(held, found)
-    return _Trial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))
+    return _WindowTrial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))
