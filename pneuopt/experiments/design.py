@@ -27,7 +27,6 @@ from pneuopt.experiments.tolerances import (
     SINGULAR,
     STATE_RIDGE,
     UNINFORMED,
-    USEFUL_RATIO,
 )
 from pneuopt.identification.result import IdentificationResult, join_names
 from pneuopt.identification.statistics import confidence_interval
@@ -85,7 +84,7 @@ class ExperimentDesign(Result):
 
     @property
     def excitation(self) -> Trajectory:
-        """What to play; of several runs take ``runs``."""
+        """The signal to play; of several runs take ``runs``."""
         require(len(self.runs) == 1, f"{len(self.runs)} runs are planned: take design.runs[0], [1], ...")
         return self.runs[0].select([self.channel])
 
@@ -164,10 +163,19 @@ class ExperimentDesign(Result):
         return WideFrame.from_dict(rows, orient="index")
 
     def summary(self) -> Report:
-        """What the runs gain, the intervals before and after, the limits that they touch, and what to play."""
-        return Report((self._verdict(), *self._remarks(), self._intervals(), *self._steps()))
+        """The gain of the runs, the intervals before and after, the limits that they touch, and the signal to play."""
+        rows = []
+        for name, row in self.table.iterrows():
+            ends = [_join(row["before_low"], row["before_high"]), _join(row["after_low"], row["after_high"])]
+            mark = "asked" if row["target"] else "" if row["identifiable"] else "unidentifiable"
+            shrunk = format_number(row["narrower"], 3)
+            rows.append((str(name), format_number(row["value"], 4), *ends, shrunk, str(row["unit"]), mark))
+        heads = number_columns("value", "95 % now", "95 % after", "narrower")
+        intervals = Table((*text_columns("parameter"), *heads, *text_columns("unit", "")), tuple(rows))
+        return Report((self._verdict(), *self._remarks(), intervals, *self._steps()))
 
-    def _verdict(self) -> Line:
+    def _verdict(self, useful: float = 1.5) -> Line:
+        """The ratio by which the targets' intervals shrink; below a `useful` one runs are hardly worth their time."""
         wanted = self.table[self.table["target"]]
         lost = [str(n) for n in wanted.index if n in self.unidentifiable]
         length = write_value(float(self.runs[0].t[-1] + self.runs[0].t[1]), "s", 3)
@@ -184,7 +192,7 @@ class ExperimentDesign(Result):
             )
         least, most = float(ratios.min()), float(ratios.max())
         many = f"{least:.1f} to {most:.1f} times" if most > 1.05 * least else f"{least:.1f} times"
-        tone = Tone.GOOD if least >= USEFUL_RATIO else Tone.DOUBTFUL
+        tone = Tone.GOOD if least >= useful else Tone.DOUBTFUL
         return Line(f"{lead} makes the asked intervals {many} narrower", tone)
 
     def _remarks(self) -> list[Line]:
@@ -199,16 +207,6 @@ class ExperimentDesign(Result):
             what = join_names(list(self.active_limits))
             out.append(Line(f"limits that are reached: {what}; wider ones would allow more", indent=2))
         return out
-
-    def _intervals(self) -> Table:
-        rows = []
-        for name, row in self.table.iterrows():
-            ends = [_join(row["before_low"], row["before_high"]), _join(row["after_low"], row["after_high"])]
-            mark = "asked" if row["target"] else "" if row["identifiable"] else "unidentifiable"
-            shrunk = format_number(row["narrower"], 3)
-            rows.append((str(name), format_number(row["value"], 4), *ends, shrunk, str(row["unit"]), mark))
-        heads = number_columns("value", "95 % now", "95 % after", "narrower")
-        return Table((*text_columns("parameter"), *heads, *text_columns("unit", "")), tuple(rows))
 
     def _steps(self, shown: int = 8) -> list[Line]:
         start = write_value(self.stats["origin"], self.units[self.channel], 4)
@@ -269,7 +267,7 @@ def _join(low: float, high: float) -> str:
 
 
 class Criterion(Protocol):
-    """What a planned experiment is to make small."""
+    """The figure that a planned experiment is to make small."""
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -428,7 +426,7 @@ def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int 
 
 
 def _gap_information(ends: Array, weight: Array) -> Array:
-    """What each gap tells about its two nodes' states and the parameters, shape (..., 2 n + w, 2 n + w).
+    """The information of each gap about its two nodes' states and the parameters, shape (..., 2 n + w, 2 n + w).
 
     In nominal sizes: x_next = ends (x, p) + w, with w of variances 1 / `weight`, shape (n,).
     """

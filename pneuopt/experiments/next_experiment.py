@@ -11,7 +11,7 @@ only what keeps every limit at every sample, for every plant that is thought pos
 A short run is simulated in a fraction of the time: the search also begins with a quarter of the duration, whose
 information counts four times. Where that does better, it is refined, played twice in a row, and refined again.
 
-A `Block` is a stretch of a planned excitation, a wave about a level. A `PlannedRun` simulates many candidates at once
+A `WaveBlock` is a stretch of an excitation, a wave about a level. A `PlannedRun` simulates many candidates at once
 in SIMD lanes, with their limits and their information: that of the log that the run would leave, the plant's command
 and its measured outputs. So a loop only makes the run; it is the plant that is identified, along short segments whose
 sensitivities are chained, the start state eliminated, as `identify` does.
@@ -44,26 +44,19 @@ from pneuopt.evaluation.scenarios import further, generator
 from pneuopt.evaluation.specification import Objective, Specification, specify
 from pneuopt.experiments.design import Criterion, DOptimal, ExperimentDesign, linked_information, tabulate_design
 from pneuopt.experiments.tolerances import (
-    ALL_BLOCKS,
     ALL_BLOCKS_SPREAD,
-    AMPLITUDES,
-    BATCH_SAMPLES,
     BEGIN_SHARE,
     BLOCKS,
+    CHANGES,
     CHIRP_RATIO,
-    COPIED_BLOCK,
     CYCLES_A_SAMPLE,
-    FREQUENCIES,
-    FRESH_BLOCK,
     LEAST_AMPLITUDE,
-    LEVEL_SHARE,
     MAX_SAMPLES,
     MAX_WRONG,
     MIN_BLOCK_SAMPLES,
     MIN_GAIN,
     MIN_SUBSTEPS,
     MOST_REPEATS,
-    ONE_BLOCK,
     PART_SHARE,
     QUIET_CYCLES,
     QUIET_ROUNDS,
@@ -71,7 +64,6 @@ from pneuopt.experiments.tolerances import (
     SLACK,
     SPREADS,
     VAGUE,
-    VARIATIONS,
 )
 from pneuopt.identification.logged_loop import REFERENCE_CHANNELS
 from pneuopt.identification.result import IdentificationResult
@@ -104,7 +96,7 @@ class Wave(Enum):
 
 
 @dataclass(frozen=True)
-class Block:
+class WaveBlock:
     """A wave about a level.
 
     Attributes
@@ -144,34 +136,44 @@ class Block:
         return f"{self.wave.value} of {write_value(self.amplitude, unit, 3)}{pace}{level}"
 
 
-def join_blocks(blocks: Sequence[Block], t: Array) -> Array:
-    """The excitation of equally long blocks, counted from its start, shape (n,); levels are joined smoothly."""
+def join_blocks(blocks: Sequence[WaveBlock], t: Array, rise: float = 0.15) -> Array:
+    """The excitation of equally long blocks, counted from its start, shape (n,).
+
+    The level moves smoothly, without a knock, in the share `rise` of a block.
+    """
     out = np.empty(len(t))
     edges = np.linspace(0, len(t), len(blocks) + 1).round().astype(int)
     level = 0.0
     for block, (begin, end) in zip(blocks, itertools.pairwise(edges.tolist()), strict=True):
         own = t[begin:end] - t[begin]
-        way = np.clip(own / (LEVEL_SHARE * own[-1]), 0, 1) if own[-1] > 0 else np.ones_like(own)
+        way = np.clip(own / (rise * own[-1]), 0, 1) if own[-1] > 0 else np.ones_like(own)
         out[begin:end] = level + (block.level - level) * (1 - np.cos(np.pi * way)) / 2 + block.samples(own)
         level = block.level
     return out
 
 
-def library(amplitude: float, duration: float, sample_time: float) -> list[Block]:
-    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps."""
+def library(
+    amplitude: float, duration: float, sample_time: float, amplitudes: int = 10, frequencies: int = 8
+) -> list[WaveBlock]:
+    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps.
+
+    Of each kind so many amplitudes and frequencies; the refinement finds what lies between.
+    """
     fastest = max(CYCLES_A_SAMPLE / sample_time, 2 / duration)
-    sizes = amplitude * np.geomspace(LEAST_AMPLITUDE, 1.0, AMPLITUDES)
-    paces = np.geomspace(1 / duration, fastest, FREQUENCIES)
-    waves = [Block(w, a, f) for w, a, f in itertools.product(Wave, sizes.tolist(), paces.tolist())]
+    sizes = amplitude * np.geomspace(LEAST_AMPLITUDE, 1.0, amplitudes)
+    paces = np.geomspace(1 / duration, fastest, frequencies)
+    waves = [WaveBlock(w, a, f) for w, a, f in itertools.product(Wave, sizes.tolist(), paces.tolist())]
     return [b for b in waves if b.wave is not Wave.CHIRP or CHIRP_RATIO * b.frequency <= fastest]
 
 
-def vary(block: Block, rng: np.random.Generator, spread: float, amplitude: float, ends: tuple[float, float]) -> Block:
+def vary(
+    block: WaveBlock, rng: np.random.Generator, spread: float, amplitude: float, ends: tuple[float, float]
+) -> WaveBlock:
     """A block near another one, its numbers moved by about `spread` of themselves, its level by that of the range."""
     size, pace, shift = rng.standard_normal(3) * spread
     level = block.level + shift * amplitude * 0.3 if rng.random() < 0.5 else block.level
     wave = list(Wave)[rng.integers(len(Wave))] if rng.random() < 0.15 else block.wave
-    return Block(
+    return WaveBlock(
         wave,
         min(block.amplitude * math.exp(size), amplitude),
         float(np.clip(block.frequency * math.exp(pace), *ends)),
@@ -180,13 +182,13 @@ def vary(block: Block, rng: np.random.Generator, spread: float, amplitude: float
 
 
 def vary_run(
-    run: Sequence[Block],
+    run: Sequence[WaveBlock],
     rng: np.random.Generator,
     spread: float,
     reach: tuple[float, float],
     ends: tuple[float, float],
-    fresh: Sequence[Block],
-) -> list[Block]:
+    fresh: Sequence[WaveBlock],
+) -> list[WaveBlock]:
     """A run near another one: mostly with one block changed, else with all, with one exchanged, copied or moved.
 
     Small changes alone stay where the exchange of separate blocks began: what a block tells depends on its neighbours.
@@ -194,14 +196,15 @@ def vary_run(
     changed, amplitude = list(run), max(abs(v) for v in reach)
     k, j = (int(n) for n in rng.integers(len(run), size=2))
     kind, size = rng.random(), spread * rng.random()
-    if kind < ONE_BLOCK:
+    one, every, exchanged, copied = CHANGES
+    if kind < one:
         changed[k] = vary(run[k], rng, size, amplitude, ends)
-    elif kind < ALL_BLOCKS:
+    elif kind < every:
         changed = [vary(b, rng, ALL_BLOCKS_SPREAD * spread, amplitude, ends) for b in run]
-    elif kind < FRESH_BLOCK:
+    elif kind < exchanged:
         level = float(rng.uniform(*reach) * rng.random())
         changed[k] = replace(fresh[int(rng.integers(len(fresh)))], level=level)
-    elif kind < COPIED_BLOCK:
+    elif kind < copied:
         changed[k] = vary(run[j], rng, size, amplitude, ends)
     else:
         changed[k], changed[j] = run[j], run[k]
@@ -224,6 +227,7 @@ class PlannedRun:
     sample_time: float  # [s]
     start: Mapping[str, float]  # outputs at the rest from which each run begins
     origin: float = 0.0  # the excitation there [its unit]
+    batch: int = 400_000  # samples that are simulated at once: each takes 100 bytes a signal
 
     @cached_property
     def command(self) -> Quantity:
@@ -233,7 +237,7 @@ class PlannedRun:
 
     @cached_property
     def excited_quantity(self) -> Quantity:
-        """What is excited: the loop's reference as logs name it, or the plant's command."""
+        """The excited quantity: the loop's reference as logs name it, or the plant's command."""
         if self.loop is None:
             return self.command
         seen = self.loop.feedback
@@ -242,7 +246,7 @@ class PlannedRun:
 
     @property
     def channels(self) -> tuple[Quantity, ...]:
-        """What a run shows: the excitation, the command, the plant's outputs, then states that are no outputs."""
+        """The excitation, the command, the plant's outputs, then states that are no outputs."""
         shown = [self.excited_quantity, self.command, *self.plant.outputs, *self.plant.states]
         return tuple({q.name: q for q in reversed(shown)}[n] for n in dict.fromkeys(names(shown)))
 
@@ -272,7 +276,7 @@ class PlannedRun:
     def simulate(self, signals: Array, parameters: ParameterSet, substeps: int) -> Array:
         """Run excitations of shape (m, n), counted from the start; returns all `channels`, shape (m, n, n_channels)."""
         m, n = signals.shape
-        size, given = max(1, BATCH_SAMPLES // n), signals[:, :, None] + self.origin
+        size, given = max(1, self.batch // n), signals[:, :, None] + self.origin
         p, x0 = parameter_vector((self.loop or self.plant).parameters, parameters), self.rest(parameters)
         t, h = np.arange(n) * self.sample_time, np.full(n, self.sample_time)
         parts = []
@@ -287,7 +291,7 @@ class PlannedRun:
         return np.concatenate(parts)
 
     def violations(self, runs: Array, parameters: ParameterSet) -> Mapping[str, Array]:
-        """How far each run leaves each limit, as a share of its width, shape (m,); below zero: the room left."""
+        """The way of each run beyond each limit, as a share of its width, shape (m,); below zero: the room left."""
         out, position = {}, {q.name: i for i, q in enumerate(self.channels)}
         for name, (low, high) in self.all_limits(parameters).items():
             values = runs[:, :, position[name]]
@@ -308,9 +312,9 @@ class PlannedRun:
         return out
 
     def information(self, runs: Array, parameters: ParameterSet, substeps: int) -> Array:
-        """What `identify` will know of the free parameters from the log of each run, in their units; (m, k, k)."""
+        """The information of each run's log about the free parameters, as in `identify`, in their units; (m, k, k)."""
         m, n = runs.shape[:2]
-        size = max(1, BATCH_SAMPLES // n)
+        size = max(1, self.batch // n)
         parts = [self._information(runs[i : i + size], parameters, substeps) for i in range(0, m, size)]
         k = len(self.free)
         return np.concatenate(parts) if parts else np.zeros((0, k, k))
@@ -392,7 +396,7 @@ class Judge:
 
     @cached_property
     def sizes(self) -> Array:
-        """What each standard deviation is divided by: the value, or of an offset at zero its range or 1."""
+        """The size that each standard deviation is divided by: the value, or of an offset at zero its range or 1."""
         return np.array([value_size(self.parameters, n) for n in self.free])
 
     def covariance(self, information: Array) -> Array:
@@ -426,6 +430,7 @@ class DesignSearch:
     _parts: "dict[int, DesignSearch]" = field(default_factory=dict)
     tried: int = 0
     substeps: int = MIN_SUBSTEPS
+    variations: int = 12  # of a block at once, in SIMD lanes
 
     def design(self) -> ExperimentDesign:
         """Choose blocks, refine the runs, and predict what they tell."""
@@ -458,7 +463,7 @@ class DesignSearch:
             units,
         )
 
-    def _find_blocks(self) -> list[list[Block]]:
+    def _find_blocks(self) -> list[list[WaveBlock]]:
         """The blocks of all runs, found in the whole duration or in a part of it, whichever has begun better."""
         whole = self._begin()
         search, runs = self, whole
@@ -476,7 +481,7 @@ class DesignSearch:
             runs = whole
         return self._refine(min(runs, whole, key=self._figure), self.budget)
 
-    def _begin(self) -> list[list[Block]]:
+    def _begin(self) -> list[list[WaveBlock]]:
         """Blocks of the library, refined for a while."""
         return self._refine(self._fit_into_limits(self._choose_blocks()), self.budget.part(BEGIN_SHARE))
 
@@ -499,18 +504,18 @@ class DesignSearch:
 
     @cached_property
     def _reach(self) -> tuple[float, float]:
-        """How far the excitation may go down and up from the start."""
+        """The range of the excitation, down and up from the start."""
         low, high = self.run.excited_limits()
         origin = self.run.origin
         return low - origin, high - origin
 
     @cached_property
-    def _waves(self) -> list[Block]:
+    def _waves(self) -> list[WaveBlock]:
         """Blocks of every kind."""
         t = self._grid[: self.samples // self._blocks]
         return library(max(abs(v) for v in self._reach), float(t[-1]) or self.run.sample_time, self.run.sample_time)
 
-    def _choose_blocks(self) -> list[list[Block]]:
+    def _choose_blocks(self) -> list[list[WaveBlock]]:
         """The blocks of all runs by exchange: their information adds up."""
         t = self._grid[: self.samples // self._blocks]
         waves = self._waves
@@ -533,7 +538,7 @@ class DesignSearch:
         ordered = sorted(picked, key=lambda i: waves[i].amplitude)
         return [[waves[i] for i in ordered[r :: self.runs]] for r in range(self.runs)]
 
-    def _fit_into_limits(self, runs: list[list[Block]]) -> list[list[Block]]:
+    def _fit_into_limits(self, runs: list[list[WaveBlock]]) -> list[list[WaveBlock]]:
         """The blocks of each run in a row, all made smaller until the whole run keeps the limits."""
         message, fitted = "the blocks of a run, one behind the other, keep no limits; plan a shorter duration", []
         for blocks in runs:
@@ -544,12 +549,12 @@ class DesignSearch:
             fitted.append(rows[int(np.argmax(keeps))])
         return fitted
 
-    def _figure(self, runs: list[list[Block]]) -> float:
+    def _figure(self, runs: list[list[WaveBlock]]) -> float:
         """The criterion after these runs."""
         gains = self._evaluate(np.stack([self._signal(blocks) for blocks in runs]))[0]
         return float(self.judge.deviation(self.known + gains.sum(axis=1)))
 
-    def _refine(self, runs: list[list[Block]], budget: CpuBudget) -> list[list[Block]]:
+    def _refine(self, runs: list[list[WaveBlock]], budget: CpuBudget) -> list[list[WaveBlock]]:
         """Change the runs by chance, far and near in turn, and keep what is better within the limits."""
         every = self._evaluate(np.stack([self._signal(blocks) for blocks in runs]))[0]
         best = float(self.judge.deviation(self.known + every.sum(axis=1)))
@@ -561,7 +566,9 @@ class DesignSearch:
                 if budget.is_spent:
                     break
                 others = self.known + every.sum(axis=1) - every[:, r]
-                tried = [vary_run(runs[r], self.rng, spread, self._reach, ends, self._waves) for _ in range(VARIATIONS)]
+                tried = [
+                    vary_run(runs[r], self.rng, spread, self._reach, ends, self._waves) for _ in range(self.variations)
+                ]
                 gains, keeps = self._evaluate(np.stack([self._signal(row) for row in tried]))
                 figures = np.where(keeps, self.judge.deviation(others[:, None] + gains), np.inf)
                 winner = int(np.argmin(figures))
@@ -594,10 +601,10 @@ class DesignSearch:
             gains[i, rows[kept]] = self.run.information(found[kept], self.plants[i], self.substeps)
         return self.repeats * gains, keeps
 
-    def _signal(self, blocks: Sequence[Block]) -> Array:
+    def _signal(self, blocks: Sequence[WaveBlock]) -> Array:
         return np.clip(join_blocks(blocks, self._grid), *self._reach)
 
-    def _infeasible(self, waves: Sequence[Block], t: Array) -> InputError:
+    def _infeasible(self, waves: Sequence[WaveBlock], t: Array) -> InputError:
         """Which limit even the gentlest excitation breaks, and what it would need."""
         gentle = min(waves, key=lambda b: (b.amplitude, b.frequency))
         signal = np.clip(gentle.samples(t), *self._reach)[None]
@@ -615,7 +622,7 @@ class DesignSearch:
 
 
 def value_size(parameters: ParameterSet, name: str) -> float:
-    """What a standard deviation of a parameter is compared with [its unit]."""
+    """The size that a standard deviation of a parameter is compared with [its unit]."""
     p = parameters[name]
     width = p.upper - p.lower
     return abs(p.value) or (width if math.isfinite(width) and width > 0 else 1.0)
@@ -693,7 +700,12 @@ def next_experiment(
     budget, seen = CpuBudget(cpu_seconds), ProgressReporter(progress, "next_experiment")
     model = as_runnable(system)
     check_smooth(model)
-    run = _plan(model, parameters, duration, limits, fit, noise, sample_time, start, runs)
+    if noise is None and fit is not None:
+        # of each channel the larger of its noise and what its residuals show, the median over the logs
+        inflation = math.sqrt(max(1.0, float(fit.stats.get("variance_inflation", 1.0))))
+        channels = fit.fit.reset_index().groupby("channel")
+        noise = {str(n): float(own[["noise", "rmse"]].max(axis=1).median()) * inflation for n, own in channels}
+    run = _plan(model, parameters, duration, limits, noise or {}, sample_time, start, runs)
     whole = run.plant.parameters | (model.parameters | parameters)
     wanted = criterion or DOptimal()
     targets = tuple(n for n in whole.match_names(*(wanted.targets or run.free)) if n in run.free)
@@ -721,8 +733,7 @@ def _plan(
     parameters: ParameterSet,
     duration: float,
     limits: Limits,
-    fit: IdentificationResult | None,
-    noise: Mapping[str, float] | None,
+    noise: Mapping[str, float],
     sample_time: float | None,
     start: Mapping[str, float] | None,
     runs: int,
@@ -745,40 +756,24 @@ def _plan(
     free = tuple(n for n in parameters.free_names if n in plant.parameters)
     shared = tuple(n for n in free if not parameters[n].per_log)
     require(bool(shared), "no parameter of the plant is free; free what the next identification is to find")
-    levels = noise if noise is not None else _noise_of(fit)
-    check_names("output", levels, names(plant.outputs), "noise")
-    require(bool(levels), "noise: give the standard deviation of each output that will be logged, or a fit")
-    wrong = [n for n, sigma in levels.items() if not 0 < sigma < math.inf]
+    check_names("output", noise, names(plant.outputs), "noise")
+    require(bool(noise), "noise: give the standard deviation of each output that will be logged, or a fit")
+    wrong = [n for n, sigma in noise.items() if not 0 < sigma < math.inf]
     require(not wrong, f"noise: that of {', '.join(wrong)} must be positive")
     per_log = tuple(n for n in free if parameters[n].per_log)
-    run = PlannedRun(plant, loop, shared, per_log, dict(levels), dict(limits), step, {})
+    run = PlannedRun(plant, loop, shared, per_log, dict(noise), dict(limits), step, {})
     check_names("signal", limits, names(run.channels), "limits")
     empty = [n for n, (low, high) in limits.items() if not low < high]
     require(not empty, f"limits: {', '.join(empty)}: the least value must lie below the greatest")
     run.excited_limits()
-    run = replace(run, start=_complete_start(run, start or {}))
-    return replace(run, origin=run.rest_excitation(parameters))
-
-
-def _complete_start(run: PlannedRun, start: Mapping[str, float]) -> dict[str, float]:
-    """Where a run begins: the position in the middle of its limits, unless said."""
-    check_names("output", start, names(run.plant.outputs), "start")
-    found = dict(start)
+    begun = dict(start or {})
+    check_names("output", begun, names(plant.outputs), "start")
     for name in ("position", "angle"):
-        low, high = run.limits.get(name, (-math.inf, math.inf))
-        if name in names(run.plant.outputs) and name not in found and math.isfinite(high - low):
-            found[name] = (low + high) / 2
-    return found
-
-
-def _noise_of(fit: IdentificationResult | None) -> dict[str, float]:
-    """Of each channel of a fit the larger of its noise and what its residuals show, the median over the logs."""
-    if fit is None:
-        return {}
-    table = fit.fit.reset_index()
-    inflation = math.sqrt(max(1.0, float(fit.stats.get("variance_inflation", 1.0))))
-    levels = {str(n): own[["noise", "rmse"]].max(axis=1).median() for n, own in table.groupby("channel")}
-    return {n: float(v) * inflation for n, v in levels.items()}
+        low, high = limits.get(name, (-math.inf, math.inf))
+        if name in names(plant.outputs) and math.isfinite(high - low):
+            begun.setdefault(name, (low + high) / 2)  # the middle of its limits
+    run = replace(run, start=begun)
+    return replace(run, origin=run.rest_excitation(parameters))
 
 
 def _known_information(free: Sequence[str], covariance: "pd.DataFrame | None") -> Array:
@@ -900,16 +895,6 @@ def predict_loss(
     spec = objective if isinstance(objective, Specification) else specify(objective)
     unknown = [n for n in tracking.table.index if n not in loop.plant.parameters]
     require(not unknown, f"{', '.join(map(str, unknown))}: no parameter of the loop's plant; track what it has")
-    rows = {}
-    for date, is_ahead, values in _plants(tracking, ahead):
-        known = parameters.with_values({n: v for n, v in values.items() if np.isfinite(v)})
-        rows[date] = {"ahead": is_ahead, **_certify(loop, references, known, spec)}
-    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("date")
-    return DesignOutlook(table)
-
-
-def _plants(tracking: Tracking, ahead: int) -> "list[tuple[pd.Timestamp, bool, dict[str, float]]]":
-    """Date, whether it is ahead, and the values of the tracked parameters."""
     own = {str(n): tracking.history.loc[n].to_dict(orient="list") for n in tracking.table.index}
     dates = [pd.Timestamp(d) for d in tracking.history.loc[tracking.table.index[0]].index]
     plants = [(d, False, {n: float(column["value"][k]) for n, column in own.items()}) for k, d in enumerate(dates)]
@@ -919,7 +904,12 @@ def _plants(tracking: Tracking, ahead: int) -> "list[tuple[pd.Timestamp, bool, d
             first, last = float(column["line"][0]), float(column["line"][-1])
             moved[name] = last + (share * (last - first) if name in tracking.drifting else 0.0)
         plants.append((dates[-1] + share * (dates[-1] - dates[0]), True, moved))
-    return plants
+    rows = {}
+    for date, is_ahead, values in plants:
+        known = parameters.with_values({n: v for n, v in values.items() if np.isfinite(v)})
+        rows[date] = {"ahead": is_ahead, **_certify(loop, references, known, spec)}
+    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("date")
+    return DesignOutlook(table)
 
 
 def _certify(

@@ -3,7 +3,6 @@
 # Design
 
 REACHED_ROOM = 0.02  # [1] of a limit's width, within which it counts as active
-USEFUL_RATIO = 1.5  # [1] times that a target's interval shrinks, below which the run is hardly worth its time
 LARGEST = 6  # [1] power of the sum that stands for the largest: with a higher one a search sees the worst alone
 STATE_RIDGE = 1e-6  # [nominal sizes] information about a node's state that is always there, to keep it invertible
 SINGULAR = 1e-13  # [1] of the largest information about a start state, below which it is rounding
@@ -20,23 +19,19 @@ SLACK = 1e-3  # [1] of a limit, that counts as kept: a design that was tuned lie
 
 # Search
 
-LEVEL_SHARE = 0.15  # [1] of a block, in which the excitation moves smoothly to its level without a knock
 CHIRP_RATIO = 4.0  # [1] of a chirp's last to its first frequency
-AMPLITUDES, FREQUENCIES = 10, 8  # of the library; the refinement finds what lies between
 LEAST_AMPLITUDE = 3e-4  # [1] of the range, of the smallest wave: presliding motion needs it, smaller drowns in noise
-# [1] shares, each up to the next, of the kinds of change of a run; the rest moves blocks. The first kind refines, the
-# others lead out of where it ends
-ONE_BLOCK, ALL_BLOCKS, FRESH_BLOCK, COPIED_BLOCK = 0.6, 0.75, 0.9, 0.95
+# [1] shares of the kinds of change of a run, each up to the next: one block, all, an exchanged or copied one; else two
+# change places. The first kind refines, the others lead out of where it ends
+CHANGES = (0.6, 0.75, 0.9, 0.95)
 ALL_BLOCKS_SPREAD = 0.15  # [1] by which blocks that move together move less than one alone
 CYCLES_A_SAMPLE = 0.08  # [1] of the highest frequency: a faster wave has corners that the controller cannot play
-BATCH_SAMPLES = 400_000  # simulated at once: 100 bytes a sample and signal
 MIN_SUBSTEPS = 8  # integration steps a sample: fewer miss how a bristle lets go
 BLOCKS = 8  # of the shortest run
 MOST_REPEATS = 4  # times that the shortest run fits into the duration
 BEGIN_SHARE = 0.08  # [1] of the time, for each of the lengths a search begins with
 PART_SHARE = 0.6  # [1] of the time left, for a part of the run; the rest mends what its repetition spoils
 MIN_BLOCK_SAMPLES = 50  # of a block: shorter ones hold no slow motion
-VARIATIONS = 12  # of a block at once, in SIMD lanes
 SPREADS = (0.5, 0.2, 0.08)  # [1] of a change, in turn: the largest leave a poor optimum, the smallest find its bottom
 ROUNDS_A_SPREAD = 3  # changes of each of them, over the number of blocks
 QUIET_CYCLES, MIN_GAIN = 2, 0.01  # cycles over all spreads without such a gain [1], after which a search has ended

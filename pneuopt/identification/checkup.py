@@ -38,12 +38,11 @@ from pneuopt.identification.problem import (
     outputs_in_log,
 )
 from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, Verdict
-from pneuopt.identification.tolerances import MIN_PERCENT
 from pneuopt.logs.doctor import LogFinding, Severity, evidence, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise
 from pneuopt.quantities.errors import ModelError, PhysicsWarning
-from pneuopt.quantities.parameters import ParameterSet, check_parameters
+from pneuopt.quantities.parameters import Intersample, ParameterSet, check_parameters
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, text_columns
 from pneuopt.quantities.results import Shown
 from pneuopt.quantities.units import ATMOSPHERE, write_value
@@ -90,7 +89,7 @@ class Assumption:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Checkup(Shown):
-    """What `check` finds.
+    """The findings of `check`.
 
     Attributes
     ----------
@@ -129,7 +128,7 @@ class Checkup(Shown):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What matters for a fit: what the logs do not identify, and what is wrong with them, a sentence each."""
+        """Sentences on what the logs do not identify, and on what is wrong with them."""
         doubts = (f for f in self.findings if f.severity is Severity.DOUBT and f.check not in (MODEL_CHECK, LOG_CHECK))
         return (*(self.verdict.sentences if self.verdict else ()), *(f"{f.log}: {f.message}" for f in doubts))
 
@@ -150,7 +149,7 @@ class Checkup(Shown):
         return Line(f"nothing is wrong: {known}", Tone.GOOD)
 
     def to_dict(self) -> dict[str, Any]:
-        """What was found, for a file."""
+        """The findings as a record, for a file."""
         verdict = self.verdict
         rows = verdict.table.reset_index(names="name").to_dict(orient="records") if verdict else []
         return {
@@ -168,9 +167,14 @@ class Checkup(Shown):
 
     def summary(self) -> Report:
         """Whether a fit takes the logs; what was read, assumed and found; what is identifiable, and what would help."""
+        file, sections, assumed = "", [a.key.partition("]")[0] for a in self.assumptions], list[Line | Table]()
+        for a in sorted(self.assumptions, key=lambda a: sections.index(a.key.partition("]")[0])):
+            assumed += [_line(f"in {a.file}:", 2)] if a.file != file else []
+            assumed.append(_line(f"{a.key} = {a.text}: {a.reason}", 4))
+            file = a.file
         blocks: dict[str, list[Line | Table]] = {
             "read": [*itertools.chain.from_iterable(map(_log_lines, self.logs))],
-            "assumed, for it stands in no file; written so, it states the same": [*_assumption_lines(self.assumptions)],
+            "assumed, for it stands in no file; written so, it states the same": assumed,
             "found": [*map(finding_line, self.findings)],
             "identifiable, by sensitivities at the start values, if the model is right": [*_verdict_parts(self)],
             "what would help": [_line(f"{run}: for {', '.join(names)}", 2) for run, names in self.runs.items()],
@@ -217,15 +221,23 @@ def check(
         parameters = find_centre(model, logs, parameters)
     found = [_model_finding(str(w.message), logs) for w in said]
     found += [f for log in logs for f in examine(log, axis_from_model(model.plant, log, parameters))]
-    found += [f for log in logs for f in _exchange_findings(model, log, parameters, found)]
+    for log in logs:
+        several = len({f.channel for f in found if f.fault and f.log == log.name}) > 1
+        if several and (pair := find_exchange(model, log, parameters)):
+            message = f"with the columns of {pair[0]} and {pair[1]} exchanged nothing is wrong: say so in [columns]"
+            found.append(LogFinding(pair[0], message, False, EXCHANGE_CHECK, log.name, evidence(log, *pair)))
     found += [_model_finding(sentence, logs) for sentence in find_log_warnings(model, logs, parameters)]
-    found += [*_log_findings(model, given, logs), *_free(logs, parameters)]
+    found += _log_findings(model, given, logs)
+    try:
+        check_free(logs, parameters)
+    except ModelError as error:
+        found.append(LogFinding("", str(error), True, FREE_CHECK))
     ranked = sorted(
         (_locate(_rank(f, found, logs), logs) for f in found), key=lambda f: list(Severity).index(f.severity)
     )
     is_open = any(f.severity is Severity.FAULT for f in ranked)
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
-    verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates()[0])
+    verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates[0])
     return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
 
 
@@ -233,8 +245,28 @@ def list_assumptions(
     system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
 ) -> tuple[Assumption, ...]:
     """The noise, the behaviour between samples and the fixed parameters that nobody has stated."""
-    logs = (*_noise_levels(system, given, checked), *_behaviour(system, given), *_gauge_zero(system, given))
-    return (*logs, *_defaults(system.parameters, parameters))
+    found = [*_noise_levels(system, given, checked)]
+    behaviour = {
+        n: kind for log in given for n, kind in input_behaviour(system, log).items() if n not in log.intersample
+    }
+    for channel, kind in behaviour.items():
+        how = "as a command runs" if kind is Intersample.HELD else "as a measured channel runs"
+        name, key = f"{channel} between samples", f"[intersample] {channel}"
+        found.append(Assumption(name, kind.value, "", key, SIDECAR, f"{how} between samples"))
+    columns = [column for log in given if log.source for column in log.source.columns.values()]
+    if AMBIENT_PRESSURE not in system.parameters and any("(g)" in column.unit for column in columns):
+        zero = "zero of gauge pressures", ATMOSPHERE, "Pa(a)", "bar(a)", "the log's units", "the standard's"
+        found.append(Assumption(*zero))
+    for name, usual in system.parameters.items():
+        used = parameters.get(name, usual)
+        if used.free or used.stated or used != usual:
+            continue
+        section, _, key = name.partition(".")
+        reason = f"{used.meaning} ({used.source})" if used.source else used.meaning
+        if used.source == DEFAULT_WIDTH:
+            reason = f"{used.meaning}; identify chooses it by the logs"
+        found.append(Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason))
+    return tuple(found)
 
 
 def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> Iterator[Assumption]:
@@ -249,38 +281,6 @@ def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequen
                 yield Assumption(
                     f"noise of {channel}", found[channel], units[channel], f"[noise] {channel}", SIDECAR, how
                 )
-
-
-def _behaviour(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
-    said: dict[str, str] = {}
-    for log in given:
-        for channel, kind in input_behaviour(system, log).items():
-            if channel not in log.intersample:
-                said[channel] = kind.value
-    for channel, word in said.items():
-        why = "as a command runs between samples" if word == "held" else "as a measured channel runs between samples"
-        yield Assumption(f"{channel} between samples", word, "", f"[intersample] {channel}", SIDECAR, why)
-
-
-def _gauge_zero(system: Fittable, given: Sequence[Experiment]) -> Iterator[Assumption]:
-    """The zero of gauge pressures in logs of a drive that has no ambient pressure."""
-    if AMBIENT_PRESSURE in system.parameters:
-        return
-    columns = [column for log in given if log.source for column in log.source.columns.values()]
-    if any("(g)" in column.unit for column in columns):
-        yield Assumption("zero of gauge pressures", ATMOSPHERE, "Pa(a)", "bar(a)", "the log's units", "the standard's")
-
-
-def _defaults(defaults: ParameterSet, given: ParameterSet) -> Iterator[Assumption]:
-    for name, usual in defaults.items():
-        used = given.get(name, usual)
-        if used.free or used.stated or used != usual:
-            continue
-        section, _, key = name.partition(".")
-        reason = f"{used.meaning} ({used.source})" if used.source else used.meaning
-        if used.source == DEFAULT_WIDTH:
-            reason = f"{used.meaning}; identify chooses it by the logs"
-        yield Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason)
 
 
 MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
@@ -302,19 +302,8 @@ def _model_finding(sentence: str, logs: Sequence[Experiment]) -> LogFinding:
     return LogFinding(channels[0] if channels else "", message, False, MODEL_CHECK, log.name, shown)
 
 
-def _exchange_findings(
-    model: Fittable, log: Experiment, parameters: ParameterSet, found: Sequence[LogFinding]
-) -> Iterator[LogFinding]:
-    """That two columns are exchanged, where a log has faults in two channels, and none once they are."""
-    several = len({f.channel for f in found if f.fault and f.log == log.name}) > 1
-    pair = find_exchange(model, log, parameters) if several else None
-    if pair is not None:
-        message = f"with the columns of {pair[0]} and {pair[1]} exchanged nothing is wrong: say so in [columns]"
-        yield LogFinding(pair[0], message, False, EXCHANGE_CHECK, log.name, evidence(log, *pair))
-
-
 def _log_findings(model: Fittable, given: Sequence[Experiment], logs: Sequence[Experiment]) -> Iterator[LogFinding]:
-    """What was mended in each log, or doubted of its noise, and which measured samples are missing."""
+    """Findings on what was mended in each log, on its noise, and on measured samples that are missing."""
     for log, checked in zip(given, logs, strict=True):
         for sentence in log_remarks(model, [log], [checked]):
             yield LogFinding("", sentence.removeprefix(f"{checked.name}: "), False, LOG_CHECK, checked.name)
@@ -325,14 +314,6 @@ def _log_findings(model: Fittable, given: Sequence[Experiment], logs: Sequence[E
                 rows = (log.source.first_row + int(at[0]), log.source.first_row + int(at[-1])) if log.source else None
                 message = f"{count}; a fit goes without"
                 yield LogFinding(channel, message, False, LOG_CHECK, checked.name, rows=rows)
-
-
-def _free(logs: Sequence[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:
-    """The fault that nothing is to be identified."""
-    try:
-        check_free(logs, parameters)
-    except ModelError as error:
-        yield LogFinding("", str(error), True, FREE_CHECK)
 
 
 def _rank(finding: LogFinding, found: Sequence[LogFinding], logs: Sequence[Experiment]) -> LogFinding:
@@ -419,7 +400,16 @@ def _log_lines(log: Experiment) -> Iterator[Line]:
     rate = f"every {write_value(step, 's', 4)} ({write_value(1 / step, 'Hz', 5)})"
     yield _line(f"{log.name or 'log'}: {rows}, {t[0]:.6g} s to {t[-1]:.6g} s, {rate}", 2)
     for channel in log.trajectory:
-        yield _line(f"{channel}: {_range(log, channel)}{_origin(log, channel)}", 4)
+        column, unit = log.trajectory[channel], log.unit(channel)
+        low, high = (write_value(float(f(column)), unit, 3) for f in (np.nanmin, np.nanmax))
+        missing = int(np.isnan(column).sum())
+        lost = f", {missing} sample{'s' * (missing > 1)} missing" if missing else ""
+        origin, read = "", source.columns.get(channel) if source else None
+        if read is not None:  # the column, and what says its unit where the name does not
+            of_unit = f" in {read.unit}" if read.unit_from not in ("its name", "its end", "") else ""
+            by = f" ({read.unit_from})" if of_unit and read.unit_from == "the file's units" else ""
+            origin = f", column {read.name!r}{of_unit}{by}" + (f", as {read.said_by} says" if read.said_by else "")
+        yield _line(f"{channel}: {low} to {high}{lost}{origin}", 4)
     if source and "time" in source.columns:
         yield _line(f"time: column {source.columns['time'].name!r}", 4)
     if source and source.sidecar:
@@ -431,53 +421,21 @@ def _log_lines(log: Experiment) -> Iterator[Line]:
     yield from (_line(remark, 4) for remark in log.remarks)
 
 
-def _range(log: Experiment, channel: str) -> str:
-    column, unit = log.trajectory[channel], log.unit(channel)
-    low, high = (write_value(float(f(column)), unit, 3) for f in (np.nanmin, np.nanmax))
-    missing = int(np.isnan(column).sum())
-    return f"{low} to {high}" + (f", {missing} sample{'s' * (missing > 1)} missing" if missing else "")
-
-
-def _origin(log: Experiment, channel: str) -> str:
-    """The column of a channel, and what says its unit where the name does not."""
-    column = log.source.columns.get(channel) if log.source else None
-    if column is None:
-        return ""
-    unit = f" in {column.unit}" if column.unit_from not in ("its name", "its end", "") else ""
-    by = f" ({column.unit_from})" if unit and column.unit_from == "the file's units" else ""
-    said = f", as {column.said_by} says" if column.said_by else ""
-    return f", column {column.name!r}{unit}{by}{said}"
-
-
-def _assumption_lines(assumptions: Sequence[Assumption]) -> Iterator[Line]:
-    """As a file would say it, with the reason."""
-    file, sections = "", list(dict.fromkeys(a.key.partition("]")[0] for a in assumptions))
-    for a in sorted(assumptions, key=lambda a: sections.index(a.key.partition("]")[0])):
-        if a.file != file:
-            file = a.file
-            yield _line(f"in {file}:", 2)
-        yield _line(f"{a.key} = {a.text}: {a.reason}", 4)
-
-
-def _verdict_parts(found: Checkup) -> Iterator[Line | Table]:
-    """A row a parameter, then why some are not identifiable."""
+def _verdict_parts(found: Checkup, finest: float = 0.1) -> Iterator[Line | Table]:
+    """A row a parameter, then why some are not identifiable; below `finest` [%] the model's errors count."""
     if found.verdict is None:
         return
     rows = []
     for name, row in found.verdict.table.iterrows():
         unit = found.parameters[str(name).partition("[")[0]].unit
-        known = _deviation(float(row["value"]), float(row["relative"]), float(row["stderr"]), unit)
-        value = write_value(float(row["value"]), unit, 4)
-        rows.append((str(name), value, known if row["identifiable"] else UNIDENTIFIABLE_NOTE))
+        value, relative, stderr = (float(row[k]) for k in ("value", "relative", "stderr"))
+        share = 100 * (relative if math.isfinite(relative) else stderr / abs(value) if value else math.inf)
+        known = f"+-{write_value(stderr, unit, 2)}" if math.isfinite(stderr) else "not computed"
+        if share < finest:
+            known = f"+-{finest} % or better"
+        elif math.isfinite(relative) and share < 100:
+            known = f"+-{share:.2g} %"
+        known = known if row["identifiable"] else UNIDENTIFIABLE_NOTE
+        rows.append((str(name), write_value(value, unit, 4), known))
     yield Table(text_columns("parameter", "start", "deviation"), tuple(rows))
     yield from (_line(sentence, 2) for sentence in found.verdict.sentences)
-
-
-def _deviation(value: float, relative: float, stderr: float, unit: str) -> str:
-    """The standard deviation; of less than `MIN_PERCENT` of the value only that."""
-    share = 100 * (relative if math.isfinite(relative) else stderr / abs(value) if value else math.inf)
-    if share < MIN_PERCENT:
-        return f"+-{MIN_PERCENT} % or better"
-    if math.isfinite(relative) and share < 100:
-        return f"+-{share:.2g} %"
-    return f"+-{write_value(stderr, unit, 2)}" if math.isfinite(stderr) else "not computed"

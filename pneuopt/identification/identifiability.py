@@ -12,6 +12,7 @@ A newcomer adds a rule: ``rule(mended, finding, ambient) -> MendedLog | None`` a
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -42,7 +43,6 @@ from pneuopt.identification.result import (
     with_values_in_words,
 )
 from pneuopt.identification.tolerances import (
-    CHANGE,
     HARMLESS_DEVIATION,
     INFORMATION_ROUNDING,
     LEVEL,
@@ -50,12 +50,10 @@ from pneuopt.identification.tolerances import (
     MAX_INFLATION,
     MAX_PRIOR_DEVIATION,
     MAX_PRIOR_VARIANCE_SHARE,
-    MAX_REDUCTION_SEGMENTS,
     MAX_RELATIVE_DEVIATION,
     MIN_COMBINATION_SHARE,
     MIN_FORCE_SHARE,
     MIN_STOP_FORCE,
-    STOP_DEPTH,
     UNIDENTIFIABLE_DEVIATION,
 )
 from pneuopt.identification.widths import excerpts
@@ -114,12 +112,32 @@ def identifiability(
     """
     check_smooth(as_estimation_model(system))
     problem = pose_problem(system, experiments, parameters, method or LeastSquares())
-    return verdict_from_sensitivities(problem, problem.candidates()[0])
+    return verdict_from_sensitivities(problem, problem.candidates[0])
 
 
 def verdict_from_sensitivities(problem: EstimationProblem, start: Start, variance: float = 1.0) -> Verdict:
-    """The verdict from the sensitivities at a start or fit; `variance` of the residuals in noise variances."""
-    return _make_verdict(problem, start, _root_information(problem, start) / math.sqrt(variance))
+    """The verdict from the sensitivities at a start or fit; `variance` of the residuals in noise variances.
+
+    They are taken along the start's states and without gaps: a segment begins with the sensitivities of all before it.
+    Where they are not finite, or the start is so stiff that integrating it would take hours, all figures are NaN.
+    """
+    segments = segment(problem.transcription(start))
+    parameters = segments.transcription.parameters
+    q = np.array([p.value for p in parameters.values()])
+    chain = np.array([p.value if p.log else 1.0 for p in parameters.values() if p.free])
+    nodes = start_nodes(segments)
+    segments, substeps = choose_integration(segments, nodes, q, problem.method.substeps)
+    if substeps > MAX_SEARCH_SUBSTEPS:
+        return _make_verdict(problem, start, np.full((len(chain), len(chain)), np.nan))
+    run = segments.run(nodes, q, substeps, sensitivities=True)
+    assert run.dy is not None
+    assert run.dx_end is not None
+    weighted = np.where(np.isfinite(segments.measured)[..., None], run.dy / segments.noise[..., None], 0.0)
+    roots = [np.zeros((0, len(chain)))]
+    ends = (np.flatnonzero(~segments.linked) + 1).tolist()  # of each chain of linked segments
+    for first, last in zip([0, *ends[:-1]], ends, strict=True):
+        roots.append(_log_root_information(segments, weighted[first:last], run.dx_end[first:last], first, chain))
+    return _make_verdict(problem, start, _triangularise(np.concatenate(roots)) / math.sqrt(variance))
 
 
 def verdict_from_covariance(
@@ -146,7 +164,7 @@ def foresee_unidentifiable(problem: EstimationProblem) -> tuple[str, ...]:
     """Sentences on what logs cannot identify, before the search: motion and outputs show it too little."""
     if not problem.system.states:  # a static map is fitted as soon
         return ()
-    start, free = problem.candidates()[0], problem.unknowns().free_names
+    start, free = problem.candidates[0], problem.unknowns().free_names
     hints = problem.system.plant.identification_hints
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
@@ -154,7 +172,7 @@ def foresee_unidentifiable(problem: EstimationProblem) -> tuple[str, ...]:
     if not lacking:
         return ()
     part = replace(problem, experiments=excerpts(problem.experiments))
-    verdict = verdict_from_sensitivities(part, part.candidates()[0])
+    verdict = verdict_from_sensitivities(part, part.candidates[0])
     alike, table = {n for group in verdict.indistinguishable for n in group}, verdict.table
     by_reason: dict[str, list[str]] = {}
     for name in (n for n in lacking if n in verdict.reasons):  # a stretch has own names for what each log has its own
@@ -246,14 +264,11 @@ def _make_verdict(
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=list(IdentifiableRow.__annotations__))
-    groups = (tuple(names[i] for i in np.flatnonzero(row)) for row in weak)
-    harmful = tuple(group for group in groups if _is_harmful(table.loc[list(group)]))
+    groups = [[names[i] for i in np.flatnonzero(row)] for row in weak]
+    worst = [table.loc[group, ["inflation", "relative"]].max() for group in groups]
+    exceeds = [w["inflation"] > MAX_INFLATION and w["relative"] > HARMLESS_DEVIATION for w in worst]
+    harmful = tuple(tuple(group) for group, is_harmful in zip(groups, exceeds, strict=True) if is_harmful)
     return Verdict(table, harmful, reasons, identification_hints=hints)
-
-
-def _is_harmful(members: "pd.DataFrame") -> bool:
-    """Whether a weak combination leaves one of its parameters noticeably uncertain."""
-    return bool(members["inflation"].max() > MAX_INFLATION and members["relative"].max() > HARMLESS_DEVIATION)
 
 
 def _comparison_size(name: str, p: Parameter, problem: EstimationProblem) -> float:
@@ -300,35 +315,13 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
     return spread, alone, weak[weak.sum(axis=1) > 1]
 
 
-def _root_information(problem: EstimationProblem, start: Start) -> Array:
-    """A square root of the information about the free parameters, as searched, with the start states eliminated.
-
-    It is taken along the start's states and without gaps: a segment begins with the sensitivities of all before it. It
-    is NaN where it is not finite, or the start so stiff that integrating it would take hours.
-    """
-    segments = segment(problem.transcription(start))
-    parameters = segments.transcription.parameters
-    q = np.array([p.value for p in parameters.values()])
-    chain = np.array([p.value if p.log else 1.0 for p in parameters.values() if p.free])
-    nodes = start_nodes(segments)
-    segments, substeps = choose_integration(segments, nodes, q, problem.method.substeps)
-    if substeps > MAX_SEARCH_SUBSTEPS:
-        return np.full((len(chain), len(chain)), np.nan)
-    run = segments.run(nodes, q, substeps, sensitivities=True)
-    assert run.dy is not None
-    assert run.dx_end is not None
-    weighted = np.where(np.isfinite(segments.measured)[..., None], run.dy / segments.noise[..., None], 0.0)
-    roots = [np.zeros((0, len(chain)))]
-    ends = (np.flatnonzero(~segments.linked) + 1).tolist()  # of each chain of linked segments
-    for first, last in zip([0, *ends[:-1]], ends, strict=True):
-        roots.append(_log_root_information(segments, weighted[first:last], run.dx_end[first:last], first, chain))
-    return _triangularise(np.concatenate(roots))
-
-
 def _log_root_information(
-    segments: Segments, weighted: Array, end_sensitivities: Array, first: int, chain: Array
+    segments: Segments, weighted: Array, end_sensitivities: Array, first: int, chain: Array, at_once: int = 2000
 ) -> Array:
-    """Square root of one log's information about the parameters; QR eliminates its start state, ordered first."""
+    """Square root of one log's information about the parameters; QR eliminates its start state, ordered first.
+
+    So many segments are reduced at once: memory against time.
+    """
     n, k = end_sensitivities.shape[1], len(chain)
     carried = np.concatenate([np.eye(n), np.zeros((n, k))], axis=1)
     carried[np.isfinite(segments.fixed_start[first])] = 0.0
@@ -343,7 +336,7 @@ def _log_root_information(
         with np.errstate(over="ignore", invalid="ignore"):
             rows.append(y.reshape(-1, y.shape[-1]) @ moved)
             carried = x @ moved
-        if len(rows) == MAX_REDUCTION_SEGMENTS or i == len(weighted) - 1:
+        if len(rows) == at_once or i == len(weighted) - 1:
             root, rows = _triangularise(np.concatenate([root, *rows])), []
     return np.asarray(root[n:, n:])
 
@@ -432,7 +425,7 @@ def is_refused(finding: LogFinding, found: Iterable[LogFinding], experiments: Se
 
 
 def accept_remedy(finding: LogFinding) -> str:
-    """How a user says that a log is right all the same."""
+    """The remedy for a log that is right all the same."""
     return f"if the log is right, accept = [{finding.check!r}] in its sidecar, or --accept {finding.check}"
 
 
@@ -481,8 +474,9 @@ def _agree(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
 class _Body:
     """The body of a plant at rest: which signals push it, and how strongly."""
 
-    def __init__(self, plant: System, axis: Axis, known: ParameterSet) -> None:
+    def __init__(self, plant: System, axis: Axis, known: ParameterSet, change: float = 1e-3) -> None:
         self.plant, self.axis, self.known = plant, axis, known
+        self.change = change  # [1] of a value or of its unit, for the slopes of the force
         self.vector = parameter_vector(plant.parameters, known)
         ends = [limit.limit(known) for limit in plant.validity_limits if limit.state == axis.position]
         self.ends = tuple(ends) if len(ends) == 2 else ()
@@ -504,14 +498,16 @@ class _Body:
         for q in (*self.plant.states, *self.plant.inputs):
             if q.name == self.axis.speed or q.name.startswith("friction."):
                 continue
-            weight = (self.force(vector, {q.name: base[q.name] + CHANGE * q.nominal}) - at_base) / (CHANGE * q.nominal)
+            weight = (self.force(vector, {q.name: base[q.name] + self.change * q.nominal}) - at_base) / (
+                self.change * q.nominal
+            )
             weights[q.name] = weight
         sizes = {q.name: abs(weights.get(q.name, 0.0)) * q.nominal for q in (*self.plant.states, *self.plant.inputs)}
         pushes = {n: weight for n, weight in weights.items() if sizes[n] > MIN_FORCE_SHARE * max(sizes.values())}
         return pushes, float(at_base - sum(weight * base[n] for n, weight in pushes.items()))
 
     def asymmetry(self, vector: Array) -> float:
-        """What friction takes more at the nominal speed one way than the other."""
+        """The friction at the nominal speed one way, less that of the other way."""
         fast = next(s.nominal for s in self.plant.states if s.name == self.axis.speed)
         ways = [self.force(vector, {self.axis.speed: speed}) for speed in (fast, -fast)]
         return sum(ways) - 2 * self.force(vector, {})
@@ -519,7 +515,7 @@ class _Body:
     def with_change(self, name: str) -> Array:
         """The vector with one parameter changed a little."""
         vector, k = self.vector.copy(), list(self.plant.parameters).index(name)
-        vector[k] += CHANGE * (abs(vector[k]) or 1.0)
+        vector[k] += self.change * (abs(vector[k]) or 1.0)
         return vector
 
     def offset_parameter(self) -> str:
@@ -531,19 +527,24 @@ class _Body:
                 return name
         return ""
 
-    def stops(self) -> tuple[float, ...]:
-        """Both ends of the position at which the model's stops push back; none where it has none."""
+    def stops(self, depth: float = 1e-3) -> tuple[float, ...]:
+        """Both ends of the position, if the model's stops push back `depth` [m] beyond them; else none."""
         free = self.force(self.vector, {})
         found = []
         for end, other in zip(self.ends, self.ends[::-1], strict=True):
-            depth = math.copysign(STOP_DEPTH, end - other)
-            found.append(abs(self.force(self.vector, {self.axis.position: end + depth}) - free) > MIN_STOP_FORCE)
+            beyond = end + math.copysign(depth, end - other)
+            found.append(abs(self.force(self.vector, {self.axis.position: beyond}) - free) > MIN_STOP_FORCE)
         return self.ends if found and all(found) else ()
 
 
 def find_exchange(model: Fittable, log: Experiment, parameters: ParameterSet) -> tuple[str, str] | None:
     """Two channels with which exchanged the log doctor finds no fault; None where there is no such pair, or several."""
-    pairs = [pair for pair in combinations(log.trajectory, 2) if _is_right(model, exchange(log, *pair), parameters)]
+    pairs = []
+    for pair in combinations(log.trajectory, 2):
+        with suppress(InputError):
+            (full,) = check_logs(model, exchange(log, *pair), parameters)
+            found = examine(full, axis_from_model(model.plant, full, parameters))
+            pairs += [] if any(f.fault for f in found) else [pair]
     return pairs[0] if len(pairs) == 1 else None
 
 
@@ -556,14 +557,6 @@ def exchange(log: Experiment, a: str, b: str) -> Experiment:
             values[name] = columns[name].factor * raw + columns[name].offset
     noise = {n: sigma for n, sigma in log.noise.items() if n not in (a, b)}
     return replace(log, trajectory=log.trajectory.with_columns(values), noise=noise, holes=())
-
-
-def _is_right(model: Fittable, log: Experiment, parameters: ParameterSet) -> bool:
-    try:
-        (full,) = check_logs(model, log, parameters)
-    except InputError:
-        return False
-    return not any(f.fault for f in examine(full, axis_from_model(model.plant, full, parameters)))
 
 
 Rule = Callable[[MendedLog, LogFinding, float], MendedLog | None]
@@ -625,14 +618,10 @@ def _at_stop(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | No
 
 
 def _turn_sign(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
-    """Of a force that brakes on balance; of two pressures, nobody knows which sensor is meant."""
+    """Turn the sign of a force that brakes on balance; of two pressures nobody knows which sensor is meant."""
     if finding.channel not in mended.log.trajectory:
         return None
     return convert(mended, finding.channel, -1.0, 0.0, "for it brakes the motion on balance")
-
-
-def _to_metres(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
-    return convert(mended, finding.channel, 1e-3, 0.0, "for it moves as fast as mm that are read as m")
 
 
 def _to_absolute(mended: MendedLog, finding: LogFinding, ambient: float) -> MendedLog | None:
@@ -645,7 +634,9 @@ RULES: dict[str, Rule] = {
     "jumps": _between_jumps,
     "stops": _at_stop,
     "work": _turn_sign,
-    "scale": _to_metres,
+    "scale": lambda mended, finding, _: convert(
+        mended, finding.channel, 1e-3, 0.0, "for it moves as fast as mm that are read as m"
+    ),
     "pressures": _to_absolute,
 }
 """By the name of the check."""

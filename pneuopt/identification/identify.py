@@ -336,7 +336,14 @@ def _predict_log(
     behaviour = input_behaviour(system, experiment)
     if not system.states:
         return simulate(system, inputs, known, initial={}, intersample=behaviour)
-    initial, columns = _fit_states(system, experiment, fixed, window, method), dict[str, Array]()
+    problem = EstimationProblem(system, (experiment,), fixed, method)
+    windows = replace(problem, window=math.inf if window is None else window)
+    check_window(windows)
+    fit = solve_least_squares(problem.transcription(problem.candidates[0]), method)
+    if window is not None:  # from that fit: over a whole log in one segment, stiction would trap the start
+        windows = replace(windows, method=replace(method, segment_time=window))
+        fit = solve_least_squares(windows.transcription(windows.start_from(fit)), windows.method)
+    initial, columns = fit.trajectories[0], dict[str, Array]()
     runs = known_runs(experiment) if window is None else window_runs(experiment, window)
     for begin, end in runs:
         state = {s.name: float(initial[s.name][begin]) for s in system.states}
@@ -344,19 +351,6 @@ def _predict_log(
         for name in run:
             columns.setdefault(name, np.full(len(inputs), np.nan))[begin:end] = run[name]
     return Trajectory(inputs.t, columns)
-
-
-def _fit_states(
-    system: Fittable, experiment: Experiment, fixed: ParameterSet, window: float | None, method: LeastSquares
-) -> Trajectory:
-    """The states of a log with known parameters; over a whole log in one segment, stiction would trap the start."""
-    problem = EstimationProblem(system, (experiment,), fixed, method)
-    if window is None:
-        return solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method).trajectories[0]
-    check_window(replace(problem, window=window))
-    windows = replace(problem, window=window, method=replace(method, segment_time=window))
-    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
-    return solve_least_squares(windows.transcription(windows.start_from(fit)), windows.method).trajectories[0]
 
 
 def _result(

@@ -19,7 +19,7 @@ from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Enco
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import DiscreteSystem, Motion, Symbols, System, define, names
-from pneuopt.identification.tolerances import DIFFERENTIATION_WINDOW, SAMPLE_TIME_TOLERANCE
+from pneuopt.identification.tolerances import SAMPLE_TIME_TOLERANCE
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
@@ -146,7 +146,10 @@ class LoggedLoop:
         out: list[Start] = []
         for was_at_rest in (True, False):
             replayed = {n: self._replay_controller(log, n, was_at_rest=was_at_rest) for n, log in logs.items()}
-            plant = {n: self._plant_log(log, replayed[n]) for n, log in logs.items()}
+            plant = {}
+            for n, log in logs.items():
+                measured = log.measured.with_columns({self.loop.command.name: replayed[n]["control"]})
+                plant[n] = Log(measured, log.parameters.select(self.loop.plant.parameters))
             controller = {n: {s: run[s] for s in run if s != "control"} for n, run in replayed.items()}
             label = "from rest" if was_at_rest else "from an empty integral"
             for start in self.loop.plant.starts(plant)[: None if was_at_rest else 1]:
@@ -234,11 +237,6 @@ class LoggedLoop:
         rested = x0["pid.integral"] + x0["pid.transfer"]  # noise keeps the error of a rest from being zero
         return x0 | {"pid.integral": rested if was_at_rest else 0.0, "pid.transfer": 0.0}
 
-    def _plant_log(self, log: Log, replayed: Trajectory) -> Log:
-        plant = self.loop.plant
-        measured = log.measured.with_columns({self.loop.command.name: replayed["control"]})
-        return Log(measured, log.parameters.select(plant.parameters))
-
 
 def _add_acting_input(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSystem:
     """The loop's step with one more input that lets the controller act (1) or rest (0)."""
@@ -273,13 +271,18 @@ def _acting_samples(t: Array, sample_time: float, name: str) -> Array:
     return np.asarray(acts, dtype=float)
 
 
-def _signal_along_log(measured: Trajectory, wanted: str, feedback: str, reference: str, name: str) -> Array:
-    """A signal that the controller sees along a log, without holes; a speed or position follows from the other."""
+def _signal_along_log(
+    measured: Trajectory, wanted: str, feedback: str, reference: str, name: str, window: int = 21
+) -> Array:
+    """A signal that the controller sees along a log, without holes; a speed or position follows from the other.
+
+    A position is differentiated over so many samples.
+    """
     if wanted in measured:
         return measured.fill_gaps(wanted)
     t, step = measured.t, float(np.median(np.diff(measured.t)))
     if wanted == "speed" and "position" in measured:
-        window = min(DIFFERENTIATION_WINDOW, (len(t) - 1) // 2 * 2 + 1)
+        window = min(window, (len(t) - 1) // 2 * 2 + 1)
         return np.asarray(savgol_filter(measured.fill_gaps("position"), window, 2, deriv=1, delta=step))
     message = f"{name}: the loop feeds back {wanted!r}; log it, or the motion it follows from"
     require(wanted == "position" and "speed" in measured, message, LogError)

@@ -5,7 +5,6 @@ residual over the channel's own scale (1.4826 MAD), and the next fit starts wher
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -175,7 +174,14 @@ def _refit(
     weights = {} if loss is None else {n: np.fmax(loss.weight(r / scales[n]), MIN_WEIGHT) for n, r in residuals.items()}
     problem = replace(problem, weights={n: np.nan_to_num(w, nan=1.0) for n, w in weights.items()}, method=method)
     found = solve_least_squares(problem.transcription(problem.start_from(fit)), method)
-    inflation = 1.0 if loss is None else _sandwich_factor(loss, residuals, scales, weights)
+    if loss is None:
+        return problem, replace(found, variance_inflation=1.0)
+    # the variance by Huber's sandwich, at the scale of each channel, over that of weighted least squares
+    parts = [(r, np.broadcast_to(scales[n], r.shape), weights[n]) for n, r in residuals.items()]
+    r, s, w = (np.concatenate([part[i].ravel() for part in parts]) for i in range(3))
+    known = np.isfinite(r)
+    r, s, w = r[known], s[known], w[known]
+    inflation = float(np.mean((w * r) ** 2) * np.mean(w) / (np.mean(loss.slope(r / s)) ** 2 * np.mean(w * r**2)))
     return problem, replace(found, variance_inflation=inflation)
 
 
@@ -198,17 +204,6 @@ def _estimate_noise(problem: EstimationProblem, experiment: Experiment, run: Tra
         level = noise_level(experiment.trajectory[channel] - run[channel], run.t)
         levels[channel] = level if level > 0 else experiment.noise[channel]
     return experiment.with_noise(levels)
-
-
-def _sandwich_factor(
-    loss: Loss, residuals: Mapping[str, Array], scales: Mapping[str, Array], weights: Mapping[str, Array]
-) -> float:
-    """Variance by Huber's sandwich, at the scale of each channel, over that of a weighted least squares."""
-    parts = [(r, np.broadcast_to(scales[n], r.shape), weights[n]) for n, r in residuals.items()]
-    r, s, w = (np.concatenate([part[i].ravel() for part in parts]) for i in range(3))
-    known = np.isfinite(r)
-    r, s, w = r[known], s[known], w[known]
-    return float(np.mean((w * r) ** 2) * np.mean(w) / (np.mean(loss.slope(r / s)) ** 2 * np.mean(w * r**2)))
 
 
 def _is_stationary(before: tuple[EstimationProblem, Fit], after: tuple[EstimationProblem, Fit]) -> bool:

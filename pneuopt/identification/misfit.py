@@ -48,19 +48,17 @@ from pneuopt.identification.tolerances import (
     SLOW_RATIO,
     TIME_BLOCKS,
 )
-from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.status import Code, Status
-from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.filters import FitScores, fit_scores
-from pneuopt.shooting.least_squares import Fit, Optimum, solve_least_squares
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
 from pneuopt.shooting.segments import Segments, segment
 from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """What the residuals of a fit tell about its intervals."""
+    """The diagnosis of a fit's residuals, for its intervals."""
 
     covariance: Array | None  # of all free parameters; NaN for those that the fit has not determined
     dof: Array  # degrees of freedom of each variance, for Student's t
@@ -96,7 +94,7 @@ class Misfit:
         return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
 
     def assess(self, status: Status) -> Status:
-        """The status of a fit with what its residuals tell."""
+        """The status of a fit with the diagnosis of its residuals."""
         status = status.with_details(*self.sentences)
         if not (self.is_excessive and status.converged):
             return status
@@ -106,12 +104,12 @@ class Misfit:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What a user should know, and what would help."""
+        """Sentences for the user: the misfit, and the logs that would help."""
         found = []
         if self.signals:
             found.append(f"residuals depend on {join_names(self.signals)}: model error, estimates may be biased")
         if self.restarts:
-            found.append("over whole logs the model misses more than their noise: estimates from windows may be biased")
+            found.append("over whole logs the misfit exceeds the noise: estimates from windows may be biased")
         if self.rejected_widths:
             widths = f"{join_names(self.rejected_widths)} that the logs reject"
             found.append(f"the model has a value of {widths}: the estimates that it moves may be biased")
@@ -252,10 +250,18 @@ def robust_covariance(
     enough = np.minimum(np.max([s.dof for s in within], axis=0), MIN_TIME_DOF)
     spreads = [(s._replace(dof=np.maximum(s.dof, LEAST_TIME_DOF)), s.dof >= enough) for s in within]
     spreads += [(s, s.dof >= MIN_LOG_DOF) for s in between]
-    covariance, degrees = _widest(white, dof, spreads)
+    # for each parameter the widest interval among those that count for it
+    variances, degrees, together = np.diag(white).copy(), np.full(len(white), dof), white.copy()
+    for spread, counts in spreads:
+        own, own_dof = np.diag(spread.covariance), np.where(counts, spread.dof, dof)
+        wider = counts & (t_quantile(own_dof) * np.sqrt(own) > t_quantile(degrees) * np.sqrt(variances))
+        variances, degrees = np.where(wider, own, variances), np.where(wider, own_dof, degrees)
+        together += spread.covariance
+    stretch = np.sqrt(variances / np.diag(together))
     lone = between[0].dof < MIN_LOG_DOF if between else none
     fine, coarse = (np.diag(spread.covariance) for spread in (within[0], within[max(len(times) - 1, 0)]))
     slow = len(times) > 1 and bool(np.median(coarse / fine) > SLOW_RATIO)
+    covariance = together * np.outer(stretch, stretch)
     return RobustCovariance(covariance, degrees, widened=True, is_slow=slow, lone=lone)
 
 
@@ -278,7 +284,14 @@ def disagreement_p(clusters: Clusters, variance: float) -> float:
     square with the mean and the variance that it has by chance (Satterthwaite 1946).
     """
     scale, own = _whiten(clusters)
-    scores = _simulate_scores(own) if clusters.by_chance is None else clusters.by_chance @ scale.T
+    if clusters.by_chance is None:
+        # scores z_g at the true parameters have the covariance H_g, a cluster's share; fitted, z_g - H_g sum(z)
+        values, vectors = np.linalg.eigh(own)
+        normal = np.random.default_rng(0).standard_normal((SIMULATIONS, *own.shape[:2]))
+        true = np.einsum("gij,gj,ngj->ngi", vectors, np.sqrt(np.maximum(values, 0.0)), normal)
+        scores = true - np.einsum("gij,nj->ngi", own, true.sum(axis=1))
+    else:
+        scores = clusters.by_chance @ scale.T
     assumed = ASSUMED_SHARE / clusters.count * np.eye(len(scale))
     every = np.concatenate([(clusters.scores @ scale.T)[None], scores])
     seen, *chance = np.einsum("ngi,gij,ngj->n", every, np.linalg.inv(own + assumed), every, optimize=True)
@@ -289,17 +302,6 @@ def disagreement_p(clusters: Clusters, variance: float) -> float:
 def t_quantile(dof: Array | float, level: float = LEVEL) -> Array:
     """Half width of an interval in standard deviations, by Student's t."""
     return np.asarray(t.ppf(0.5 + level / 2, dof))
-
-
-def _simulate_scores(own: Array) -> Array:
-    """Whitened scores of fits to independent residuals, shape (SIMULATIONS, K, k), by each cluster's share H_g.
-
-    The scores z_g at the true parameters have the covariance H_g; at the estimates they are z_g - H_g sum(z).
-    """
-    values, vectors = np.linalg.eigh(own)
-    normal = np.random.default_rng(0).standard_normal((SIMULATIONS, *own.shape[:2]))
-    true = np.einsum("gij,gj,ngj->ngi", vectors, np.sqrt(np.maximum(values, 0.0)), normal)
-    return np.asarray(true - np.einsum("gij,nj->ngi", own, true.sum(axis=1)))
 
 
 def _whiten(clusters: Clusters) -> tuple[Array, Array]:
@@ -332,21 +334,6 @@ def _degrees_of_freedom(directions: Array, own: Array) -> float:
     return float(np.trace(M)) ** 2 / squares if squares > 0 else 0.0
 
 
-def _widest(white: Array, dof: float, spreads: Sequence[tuple[Spread, Mask]]) -> tuple[Array, Array]:
-    """For each parameter the variance with the widest interval, and its degrees of freedom.
-
-    The mask tells for which parameters a spread counts.
-    """
-    variance, freedom, together = np.diag(white).copy(), np.full(len(white), dof), white.copy()
-    for spread, counts in spreads:
-        own, own_dof = np.diag(spread.covariance), np.where(counts, spread.dof, dof)
-        wider = counts & (t_quantile(own_dof) * np.sqrt(own) > t_quantile(freedom) * np.sqrt(variance))
-        variance, freedom = np.where(wider, own, variance), np.where(wider, own_dof, freedom)
-        together += spread.covariance
-    stretch = np.sqrt(variance / np.diag(together))
-    return together * np.outer(stretch, stretch), freedom
-
-
 class Signal(NamedTuple):
     """A simulated signal, its mean in each segment, and the probability that the residuals depend on it by chance."""
 
@@ -370,30 +357,28 @@ def motion_p(values: Array, residuals: Array, derivatives: Array, scores: FitSco
 
 
 def _is_excessive(problem: EstimationProblem, fit: Fit, variance: float) -> bool:
-    """Whether residuals exceed the noise so far, or the variation of a channel where its noise is estimated."""
+    """Whether residuals exceed the noise so far, or the variation of a channel where its noise is estimated.
+
+    Within windows the variation is what the start of each does not explain.
+    """
     if variance <= MAX_MISFIT**2:
         return False
-    pairs = zip(problem.experiments, fit.trajectories, strict=True)
-    shares = [_missed_share(problem, e, run, c) for e, run in pairs for c in outputs_in_log(problem.system, e)]
+    shares = []
+    for e, run in zip(problem.experiments, fit.trajectories, strict=True):
+        for channel in outputs_in_log(problem.system, e):
+            measured = e.trajectory[channel]
+            if math.isinf(problem.window):
+                shares.append(agreement(measured, run[channel])["nrmse"])
+                continue
+            size = 0.0
+            for begin, end in window_runs(e, problem.window):
+                at = np.flatnonzero(np.isfinite(measured[begin:end]))
+                values = measured[begin:end][at]
+                if at.size >= 3:  # a start state explains a straight line
+                    size += float(np.sum((values - np.polyval(np.polyfit(at, values, 1), at)) ** 2))
+            rest = float(np.nansum((measured - run[channel]) ** 2))
+            shares.append(math.sqrt(rest / size) if size > 0 else math.nan)
     return problem.noise_is_stated or float(np.nanmean(shares)) > MAX_NRMSE
-
-
-def _missed_share(problem: EstimationProblem, experiment: Experiment, run: Trajectory, channel: str) -> float:
-    """Residuals over the variation of a channel; within windows, over what the start of each does not explain."""
-    measured = experiment.trajectory[channel]
-    if math.isinf(problem.window):
-        return agreement(measured, run[channel])["nrmse"]
-    bends = np.concatenate([_bend(measured[a:b]) for a, b in window_runs(experiment, problem.window)])
-    size = float(np.nansum(bends**2))
-    return math.sqrt(float(np.nansum((measured - run[channel]) ** 2)) / size) if size > 0 else math.nan
-
-
-def _bend(values: Array) -> Array:
-    """What a straight line leaves of some samples; NaN where one is missing."""
-    known, at = np.isfinite(values), np.arange(len(values), dtype=float)
-    if known.sum() < 3:
-        return values * math.nan
-    return np.asarray(values - np.polyval(np.polyfit(at[known], values[known], 1), at))
 
 
 def _hotelling_p(rows: Array) -> float:
@@ -415,24 +400,20 @@ def _signals_behind_residuals(scores: FitScores, known: Sequence[str]) -> list[S
     segments = scores.optimum.equations.segments
     blocks, (sums, derivatives) = _split_in_time(segments, MOTION_BLOCKS), scores.residual_sums()
     measured = np.flatnonzero(segments.counts)
-    means = {n: v for n, v in _segment_means(scores.optimum).items() if n in known}
-    found = []
-    for name, values in means.items():
-        ps = [motion_p(values, sums[:, i], derivatives[:, i], scores, blocks) for i in measured]
-        found.append(Signal(name, values, min(ps)))
-    level = MOTION_LEVEL / max(1, len(found) * len(measured))
-    return sorted((s for s in found if s.p < level), key=lambda s: s.p)
-
-
-def _segment_means(optimum: Optimum) -> dict[str, Array]:
-    """The mean of each state and input over each segment, of those that vary."""
-    segments, x = optimum.equations.segments, optimum.run.x
+    x = scores.optimum.run.x
     assert x is not None
     real = np.arange(segments.t.shape[1]) < segments.lengths[:, None]
     signals = np.concatenate([x, segments.inputs], axis=2)
     means = np.sum(signals * real[..., None], axis=1) / segments.lengths[:, None]
     columns = zip(names((*segments.system.states, *segments.system.inputs)), means.T, strict=True)
-    return {n: v for n, v in columns if np.ptp(v) > MIN_SIGNAL_SPREAD * np.abs(v).max(initial=0.0)}
+    found = []
+    for name, values in columns:
+        if name not in known or not np.ptp(values) > MIN_SIGNAL_SPREAD * np.abs(values).max(initial=0.0):
+            continue  # it does not vary
+        ps = [motion_p(values, sums[:, i], derivatives[:, i], scores, blocks) for i in measured]
+        found.append(Signal(name, values, min(ps)))
+    level = MOTION_LEVEL / max(1, len(found) * len(measured))
+    return sorted((s for s in found if s.p < level), key=lambda s: s.p)
 
 
 def _classes(values: Array, *, of_size: bool = False) -> Indices:
@@ -482,7 +463,7 @@ def suspect_widths(misfit: Misfit, problem: EstimationProblem, fit: Fit, varianc
 
 
 def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth]:
-    """What each width of a model would change if a converged fit estimated it, too.
+    """The changes by each width of a model, if a converged fit estimated it, too.
 
     Nothing where gaps stand for noise of the states, whose costs have other weights.
     """
@@ -498,27 +479,18 @@ def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth
     if found.optimum is None:
         return
     for name in names:
-        moved = _step_with(found.optimum, free.index(name), [free.index(n) for n in names])
-        if moved is not None:
-            fall, step = moved
-            change = (scales * step)[free.index(name)] / found.parameters.value(name)
-            yield RejectedWidth(name, fall, (scales * step)[own] / max(1.0, -change))
+        arrow, keep = found.optimum.equations.arrow, found.optimum.keep.copy()
+        reduced, place = arrow.eliminate(0.0), free.index(name)
+        keep[[free.index(n) for n in names]] = False
+        without = reduced and reduced.step(keep)
+        keep[place] = found.optimum.keep[place]
+        step = reduced and reduced.step(keep)
+        if step and without:
+            fall, moves = arrow.descent_rate(step) - arrow.descent_rate(without), scales * step.parameters
+            yield RejectedWidth(name, fall, moves[own] / max(1.0, -moves[place] / found.parameters.value(name)))
 
 
 def fixed_widths(problem: EstimationProblem) -> list[str]:
     """The widths of the model that are not free; a free one is an estimate itself."""
     names = dict.fromkeys(n for w in problem.system.plant.identification_hints.widths for n in (w.name, *w.follows))
     return [n for n in names if n in problem.parameters and not problem.parameters[n].free]
-
-
-def _step_with(optimum: Optimum, width: int, widths: list[int]) -> tuple[float, Array] | None:
-    """The fall of twice the cost by a width, and the Gauss-Newton step of all parameters with it; None without one."""
-    arrow, keep = optimum.equations.arrow, optimum.keep.copy()
-    reduced = arrow.eliminate(0.0)
-    keep[widths] = False
-    without = reduced and reduced.step(keep)
-    keep[width] = optimum.keep[width]
-    step = reduced and reduced.step(keep)
-    if not step or not without:
-        return None
-    return arrow.descent_rate(step) - arrow.descent_rate(without), step.parameters

@@ -25,7 +25,6 @@ from pneuopt.identification.tolerances import (
     MAX_BRIDGE,
     MAX_NOISE_FACTOR,
     MAX_REST_DISTANCE,
-    MIN_EXCURSION,
     MIN_RUN,
     MOVING_SPEED_SHARE,
     RANGE_TOLERANCE,
@@ -72,13 +71,9 @@ class EstimationProblem:
         """Whether some segment continues another; not so in windows of one segment each."""
         return self.method.segment_time < self.window
 
+    @cached_property
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
-        return self._candidates
-
-    @cached_property
-    def _candidates(self) -> Sequence[Start]:
-        """The starts, which several readers share."""
         known = {
             e.name: (apply_conditions(self.parameters, e), input_behaviour(self.system, e)) for e in self.experiments
         }
@@ -117,11 +112,17 @@ class EstimationProblem:
     def transcription(self, candidate: Start) -> Transcription:
         """The problem as multiple shooting, started from a candidate."""
         phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
-        residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
+        residuals = []
+        for i, e in enumerate(self.experiments):
+            outputs = outputs_in_log(self.system, e)
+            noise = np.array([e.noise[o] for o in outputs])
+            if e.name in self.weights:
+                noise = noise[:, None] / np.sqrt(self.weights[e.name].T)
+            residuals.append(Residuals(i, outputs, e.trajectory.matrix(outputs), noise))
         parameters = self.unknowns().with_values(candidate.parameters)
         held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.fixed.items()}
         parameters = parameters | ParameterSet(held)
-        return Transcription(self._discrete, parameters, phases, residuals)
+        return Transcription(self._discrete, parameters, phases, tuple(residuals))
 
     @cached_property
     def _discrete(self) -> DiscreteSystem:
@@ -149,7 +150,12 @@ class EstimationProblem:
         breaks = [end for begin, end in experiment.holes if begin > 0 and end < len(t)]
         if not math.isinf(self.window):
             breaks = sorted({*breaks, *(begin for begin, _ in window_runs(experiment, self.window) if begin > 0)})
-        nodes = regular_nodes(len(t), self._samples_a_segment(h), breaks)
+        if self.system.states:
+            samples = self.method.segment_time / float(np.median(h))
+            a_segment = len(h) if math.isinf(samples) else max(2, round(samples))
+        else:  # a static map has no gaps, and is cut only for batches and blocks of time
+            a_segment = min(max(1, len(h) // STATIC_SEGMENTS), 100)
+        nodes = regular_nodes(len(t), a_segment, breaks)
         guess = states.matrix(names(self.system.states))
         for begin, end in experiment.holes:
             h[max(begin - 1, 0) : end] = 0.0  # the state stands still where its inputs are unknown
@@ -157,20 +163,6 @@ class EstimationProblem:
         driven = append_slopes(t, driven, self._linear, self._rising(experiment))
         start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
         return Phase(experiment.name, t, h, driven, nodes, start, guess=guess, breaks=np.array(breaks, dtype=np.intp))
-
-    def _samples_a_segment(self, h: Array) -> int:
-        """Samples between two nodes; a static map has no gaps, and is cut only for batches and blocks of time."""
-        if not self.system.states:
-            return min(max(1, len(h) // STATIC_SEGMENTS), 100)
-        samples = self.method.segment_time / float(np.median(h))
-        return len(h) if math.isinf(samples) else max(2, round(samples))
-
-    def _residuals(self, index: int, experiment: Experiment) -> Residuals:
-        outputs = outputs_in_log(self.system, experiment)
-        noise = np.array([experiment.noise[o] for o in outputs])
-        if experiment.name in self.weights:
-            noise = noise[:, None] / np.sqrt(self.weights[experiment.name].T)
-        return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
 
 
 def as_estimation_model(model: HasSystem | ClosedLoop | Fittable) -> Fittable:
@@ -269,14 +261,14 @@ def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], param
 
 
 def find_log_warnings(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
-    """What the model finds in logs; see `emit_log_warnings`."""
+    """Sentences on faults that the model finds in logs; see `emit_log_warnings`."""
     every = system.parameters | parameters
     known = {e.name: every.with_values(e.conditions).fixed(*e.conditions) for e in experiments}
     return tuple(system.log_warnings({e.name: Log(e.trajectory, known[e.name]) for e in experiments}))
 
 
 def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> tuple[str, ...]:
-    """What was mended in logs, and stated noise levels that the logs themselves do not show; a sentence each."""
+    """Sentences on what was mended in logs, and on stated noise levels that the logs themselves do not show."""
     out: list[str] = []
     for log, named in zip(given, checked, strict=True):
         if ignored := [n for n in log.trajectory if n not in named.trajectory]:
@@ -342,7 +334,7 @@ def outputs_in_log(system: Fittable, experiment: Experiment) -> tuple[str, ...]:
 
 
 def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Intersample]:
-    """How each of the system's inputs runs between two samples of a log: as the log says, or as is usual."""
+    """The behaviour of each of the system's inputs between two samples: as stated for the log, or as is usual."""
     said = experiment.intersample
     return {q.name: said.get(q.name) or usual_intersample(q.name, q.unit) for q in system.inputs}
 
@@ -484,7 +476,7 @@ class _Command(NamedTuple):
         """Whether the command runs from a voltage to both sides of half the range above it, and rests near there."""
         low, high, rest = ((v - zero) / self.half for v in (self.low, self.high, self.rest))
         is_within = low >= -RANGE_TOLERANCE and high <= 2 + RANGE_TOLERANCE
-        is_two_way = low < 1 - MIN_EXCURSION and high > 1 + MIN_EXCURSION
+        is_two_way = low < 1 - RANGE_TOLERANCE and high > 1 + RANGE_TOLERANCE
         return is_within and is_two_way and abs(rest - 1) < MAX_REST_DISTANCE
 
     def __str__(self) -> str:
@@ -501,20 +493,14 @@ def _commands(
     channels = [q.name for q in system.plant.inputs if q.unit == limit.unit and q.name in log]
     if not channels or not np.isfinite(log[channels[0]]).any():
         return []
-    ends = float(np.nanmin(log[channels[0]])), float(np.nanmax(log[channels[0]]))
-    rest = _resting_command(experiment, channels[0])
-    return [_Command(experiment.name, channels[0], limit.unit, *ends, rest, half)]
-
-
-def _resting_command(experiment: Experiment, channel: str) -> float:
-    """Median of the command where the drive stands; over the whole log where that is not to be seen."""
-    log = experiment.trajectory
+    command, speed = log[channels[0]], np.zeros(0)
     if "speed" in log:
         speed = np.abs(log["speed"])
     elif "position" in log:
         speed = np.abs(np.gradient(log["position"], log.t))
-    else:
-        return float(np.nanmedian(log[channel]))
     known = speed[np.isfinite(speed)]
+    # the drive rests where it stands; over the whole log where that is not to be seen
     still = speed <= MOVING_SPEED_SHARE * float(np.quantile(known, 0.99)) if known.size else np.zeros(len(log), bool)
-    return float(np.nanmedian(log[channel][still] if still.any() else log[channel]))
+    rest = float(np.nanmedian(command[still] if still.any() else command))
+    ends = float(np.nanmin(command)), float(np.nanmax(command))
+    return [_Command(experiment.name, channels[0], limit.unit, *ends, rest, half)]

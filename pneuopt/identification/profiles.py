@@ -16,7 +16,6 @@ from pneuopt.identification.problem import EstimationProblem, as_estimation_mode
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.statistics import confidence_interval
 from pneuopt.identification.tolerances import (
-    DELTA_METHOD_STEP,
     END_TOLERANCE,
     MAX_LOG_PROBE,
     MAX_LOG_STEP,
@@ -256,7 +255,12 @@ def _bracket(refits: _Refits, side: int, target: float) -> None:
     """Refit on one side until the deviance exceeds the level, then closely around that point; or to the bound."""
     p = refits.parameter
     bound = refits.to_search(p.lower if side < 0 else p.upper)
-    inside, step = refits.points[0], (first := _first_step(refits, target))
+    inside, first = refits.points[0], 1.05 * target * refits.spread  # a little beyond the end of the linear interval
+    if p.log:
+        first = min(first, MAX_LOG_STEP) if math.isfinite(first) else MAX_LOG_STEP
+    elif not 0 < first < math.inf:
+        first = 0.1 * max(abs(p.value), 1e-6)
+    step = first
     probes = [point for point in refits.points if side * point.z > side * inside.z]  # of the curvature
     for _ in range(MAX_REFITS_A_SIDE):
         z = side * min(side * inside.z + step, side * bound)
@@ -293,14 +297,6 @@ def _interval_end(refits: _Refits, side: int, target: float) -> float:
 def _is_at_level(refits: _Refits, point: _ProfilePoint, target: float) -> bool:
     """Whether a refit lies so near the level that no other one is needed."""
     return abs(refits.deviance_root(point) - target) < END_TOLERANCE * target
-
-
-def _first_step(refits: _Refits, target: float) -> float:
-    """The first step from the estimate, as searched: a little beyond the end of the linear interval."""
-    p, linear = refits.parameter, 1.05 * target * refits.spread
-    if p.log:
-        return min(linear, MAX_LOG_STEP) if math.isfinite(linear) else MAX_LOG_STEP
-    return linear if math.isfinite(linear) and linear > 0 else 0.1 * max(abs(p.value), 1e-6)
 
 
 def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePoint, target: float) -> None:
@@ -390,17 +386,19 @@ def propagate_intervals(
     return values, np.array([confidence_interval(v, s, log=False, dof=d) for v, s, d in every])
 
 
-def _linearise(result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]) -> tuple[Array, Array]:
-    """The figures at the estimates, shape (n,), and their slopes by these, shape (n, k)."""
+def _linearise(
+    result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike], step: float = 1e-3
+) -> tuple[Array, Array]:
+    """The figures at the estimates, shape (n,), and their slopes (n, k) by these over a step [standard deviations]."""
     known = {n: p.value for n, p in result.parameters.items()}
     found = {str(n): float(v) for n, v in result.estimates["value"].items()}
     at = {**known, **{n: known[n.partition("[")[0]] if math.isnan(v) else v for n, v in found.items()}}
     variances = np.diag(result.covariance.to_numpy(dtype=float))
     slopes = []
     for name, variance in zip(map(str, result.covariance.index), variances, strict=True):
-        step = DELTA_METHOD_STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
-        up, down = (np.asarray(function({**at, name: at[name] + side * step}), dtype=float) for side in (1, -1))
-        slopes.append((up - down) / (2 * step))
+        change = step * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
+        up, down = (np.asarray(function({**at, name: at[name] + side * change}), dtype=float) for side in (1, -1))
+        slopes.append((up - down) / (2 * change))
     value = np.asarray(function(at), dtype=float)
     return value, np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
 

@@ -6,7 +6,7 @@ Below: their tables and words, the motion that a set of logs shows, what it lack
 
 import math
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -16,7 +16,6 @@ import numpy as np
 from pneuopt.dynamics.hooks import IdentificationHints, Lack, LoggedMotion
 from pneuopt.identification.tolerances import MOVING_SPEED_SHARE
 from pneuopt.logs.experiment import Experiment
-from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Column, Line, Report, Table, format_number, number_columns, text_columns
 from pneuopt.quantities.results import Result, Shown
@@ -91,7 +90,7 @@ class Verdict(Shown):
         }
 
     def summary(self) -> Report:
-        """What the logs do not identify, and why."""
+        """Sentences on what the logs do not identify, and why."""
         return Report(tuple(map(Line, self.sentences or ("the logs identify every free parameter",))))
 
 
@@ -121,7 +120,7 @@ class ChosenWidth:
         kept = self.value == self.given
         how = "stays at" if kept else "narrowed to" if self.value < self.given else "widened to"
         reason = "; narrower ones take too many integration steps" if self.too_stiff else ""
-        return f"{self.name} {how} {write_value(self.value, self.unit, 3)}, as the logs ask{reason}"
+        return f"{self.name} {how} {write_value(self.value, self.unit, 3)}, the best width tried{reason}"
 
 
 @dataclass(frozen=True)
@@ -306,7 +305,7 @@ class IdentificationResult(Result):
     window: ChosenWindow | None = None
 
     def summary(self) -> Report:
-        """How the fit ended, estimates with intervals and marks, what is unidentifiable, agreement with the logs."""
+        """The end of the fit, estimates with intervals and marks, what is unidentifiable, agreement with the logs."""
         sentences = tuple(map(Line, self.verdict.sentences if self.verdict else ()))
         estimates = report_estimates(self.estimates, self.widths)
         return report_status(self.status) + estimates + Report(sentences) + report_agreement(self.fit)
@@ -314,7 +313,26 @@ class IdentificationResult(Result):
 
 def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> Report:
     """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen."""
-    rows = [_estimate_row(str(n), row) for n, row in estimates.to_dict(orient="index").items()]
+    rows = []
+    for name, row in estimates.to_dict(orient="index").items():
+        estimate, spread, low, high = (float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high"))
+        value = format_number(estimate, 4)
+        if math.isnan(low) and math.isfinite(row["range_low"]):
+            low, high = float(row["range_low"]), float(row["range_high"])
+            spread = (high - low) / 4  # the digits then show a fiftieth of the range, which is no confidence interval
+            interval = f"range{TIED}{_format_to_stderr(low, spread)}{TIED}to {_format_to_stderr(high, spread)}"
+        elif math.isfinite(low) and math.isinf(high):
+            interval = f"above{TIED}{format_number(low, 4)}"
+        elif math.isinf(low) and math.isfinite(high):
+            interval = f"below{TIED}{format_number(high, 4)}"
+        elif not math.isfinite(spread) or high - low > 1e3 * abs(estimate) > 0:
+            interval = "not determined"
+        else:
+            value = _format_to_stderr(estimate, spread)
+            interval = f"{_format_to_stderr(low, spread)}{TIED}to {_format_to_stderr(high, spread)}"
+        value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
+        mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
+        rows.append((str(name), value, interval, str(row["unit"]), str(mark)))
     rows += [(w.name, format_number(w.value, 3), "-", w.unit, "chosen") for w in widths]
     columns = *text_columns("parameter"), *number_columns("value", f"95{TIED}% interval"), *text_columns("unit", "mark")
     table = (Table(columns, tuple(rows)),) if rows else ()
@@ -356,31 +374,6 @@ def _agreement_in_short(fit: "pd.DataFrame") -> Table:
     return Table(columns, tuple(rows))
 
 
-def _estimate_row(name: str, row: Mapping[Hashable, Any]) -> tuple[str, str, str, str, str]:
-    value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
-    if math.isnan(row["ci_low"]) and math.isfinite(row["range_low"]):
-        low, high = float(row["range_low"]), float(row["range_high"])
-        spread = (high - low) / 4  # the digits then show a fiftieth of the range, which is no confidence interval
-        interval = f"range{TIED}{_join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))}"
-    value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
-    mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
-    return name, value, interval, str(row["unit"]), str(mark)
-
-
-def _format_interval(value: float, spread: float, low: float, high: float) -> tuple[str, str]:
-    if math.isfinite(low) and math.isinf(high):
-        return format_number(value, 4), f"above{TIED}{format_number(low, 4)}"
-    if math.isinf(low) and math.isfinite(high):
-        return format_number(value, 4), f"below{TIED}{format_number(high, 4)}"
-    if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
-        return format_number(value, 4), "not determined"
-    return _format_to_stderr(value, spread), _join_ends(_format_to_stderr(low, spread), _format_to_stderr(high, spread))
-
-
-def _join_ends(low: str, high: str) -> str:
-    return f"{low}{TIED}to {high}"
-
-
 def _format_to_stderr(value: float, spread: float) -> str:
     """The value with the digits that show two of its standard error."""
     if not 0 < spread < math.inf or value == 0 or not spread < abs(value):
@@ -393,7 +386,7 @@ AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE = "at its bound", "unidentifiable"
 
 
 class Mark(StrEnum):
-    """How far an estimate and its interval can be trusted.
+    """The trust in an estimate and its interval.
 
     Attributes
     ----------
@@ -486,14 +479,3 @@ def _write_values(words: str, values: ParameterSet) -> str:
 
 def _base_name(name: str) -> str:
     return name.partition("[")[0]
-
-
-def _acceleration(t: Array, v: Array) -> Array:
-    every = max(1, len(t) // 200)
-    return np.asarray(np.diff(v[::every]) / np.diff(t[::every]))
-
-
-def _count_reversals(v: Array, level: float) -> int:
-    """Changes of direction, from beyond a level to beyond it on the other side."""
-    side = np.sign(v[np.abs(v) > level])
-    return int(np.count_nonzero(np.diff(side)))

@@ -34,18 +34,14 @@ from pneuopt.identification.result import (
 from pneuopt.identification.tolerances import (
     ALIKE_SQUARES,
     CLEAR_DEVIATIONS,
-    GAP_SUBSTEPS,
     LAST_TRIAL_ITERATIONS,
     MAX_FREED_TRIALS,
     MAX_LINEAR_DEVIATION,
-    MAX_TESTS,
     MIN_EXPLAINED_SHARE,
     MIN_PROMISED_SHARE,
     MIN_RELATIVE_CHANGE,
-    MIN_REPORTED_GAP,
     MODEL_ERROR_LEVEL,
     PROFILE_DRAG_DEVIATIONS,
-    RESIDUAL_BLOCK_SAMPLES,
     TRIAL_FIT_ITERATIONS,
     WHOLE_SHARE,
 )
@@ -71,15 +67,7 @@ def review_fit(
     """
     start = problem.start_from(result)
     if not result.status.converged:
-        verdict = _verdict_at(problem, start, result)
-        status = (
-            result.status
-            if result.status.code is Code.INTERRUPTED
-            else _locate_failure(problem, start, result.status, verdict)
-        )
-        estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict)
-        unknown = result.covariance * math.nan
-        return replace(result, estimates=estimates, covariance=unknown, status=status, verdict=verdict), ()
+        return _review_failure(problem, start, result), ()
     result = replace(result, estimates=_blank_intervals(result.estimates, unidentifiable))
     profiles, waiting = _profiles(problem, result)
     result = _widen_dragged(result, profiles)
@@ -94,9 +82,20 @@ def review_fit(
         given = problem.unknowns()
         unchanged = [n for n, v in problem.fixed.items() if v == given.value(n)]
         verdict = add_unidentifiable(verdict, unidentifiable, local, unchanged)
-    estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
-    covariance = _widen_covariance(result.covariance, estimates["stderr"])
-    status = _name_part(problem, _name_interruption(result.status, waiting), verdict)
+    estimates = _blank_intervals(result.estimates, verdict.unidentifiable)
+    for name, found in profiles.items():
+        # the linear interval is that of the curvature at the peak, which says little of the side on which it is flat
+        estimates.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
+        farther = max(found.high - found.estimate, found.estimate - found.low) / math.sqrt(found.threshold)
+        deviation = math.nan if found.is_open else max(farther, float(result.estimates["stderr"][name]))
+        estimates.loc[name, "stderr"] = deviation
+    estimates = _add_notes(estimates, verdict)
+    covariance, status = _widen_covariance(result.covariance, estimates["stderr"]), result.status
+    if waiting:
+        words = f"the estimates are found, the interval of {waiting[0]} is not"
+        detail = f"the intervals of {join_names(waiting)} are of the linear model, which is doubtful here"
+        status = Status(Code.INTERRUPTED, (words, detail, *status.sentences[1:], "run again for the intervals"))
+    status = _name_part(problem, status, verdict)
     result = replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
     return result, tuple(profiles.values())
 
@@ -120,15 +119,6 @@ def _verdict_at(problem: EstimationProblem, start: Start, result: Identification
     return verdict_from_sensitivities(
         problem, start, max(1.0, result.stats["chi_square_ratio"] * result.stats["variance_inflation"])
     )
-
-
-def _name_interruption(status: Status, waiting: Sequence[str]) -> Status:
-    """The status of a fit, interrupted where intervals still waited for their profiles."""
-    if not waiting:
-        return status
-    verdict = f"the estimates are found, the interval of {waiting[0]} is not"
-    detail = f"the intervals of {join_names(waiting)} are of the linear model, which is doubtful here"
-    return Status(Code.INTERRUPTED, (verdict, detail, *status.sentences[1:], "run again for the intervals"))
 
 
 def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple[dict[str, Profile], list[str]]:
@@ -188,20 +178,6 @@ def _parameters_outside_interval(profile: Profile, estimates: "pd.DataFrame") ->
             yield str(name)
 
 
-def _replace_intervals(estimates: "pd.DataFrame", profiles: Mapping[str, Profile], verdict: Verdict) -> "pd.DataFrame":
-    """The estimates with the profiles' intervals, and standard deviations that reach their farther ends.
-
-    There is none where an interval is open. The linear one is that of the likelihood's curvature at its peak, which
-    says little of the side on which a profile is flat.
-    """
-    out = _blank_intervals(estimates, verdict.unidentifiable)
-    for name, found in profiles.items():
-        out.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
-        farther = max(found.high - found.estimate, found.estimate - found.low) / math.sqrt(found.threshold)
-        out.loc[name, "stderr"] = math.nan if found.is_open else max(farther, float(estimates["stderr"][name]))
-    return out
-
-
 def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
     """A note on each estimate at a bound or unidentifiable; NaN for the value of the latter."""
     unidentifiable, bound = set(verdict.unidentifiable), estimates["at_bound"]
@@ -211,14 +187,16 @@ def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
     return out.assign(value=out["value"].where(known), mark=out["mark"].where(known, Mark.UNIDENTIFIABLE))
 
 
-def _locate_failure(problem: EstimationProblem, start: Start, status: Status, verdict: Verdict) -> Status:
-    """The status of a failure with its worst place and the remedies."""
-    status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
-    if verdict.unidentifiable:
-        status = status.with_remedies(
-            _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
-        )
-    return status.with_remedies(*advise_widths(problem))
+def _review_failure(problem: EstimationProblem, start: Start, result: IdentificationResult) -> IdentificationResult:
+    """The result without intervals; its status names the worst place and the remedies, unless it was interrupted."""
+    verdict, status = _verdict_at(problem, start, result), result.status
+    estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict)
+    if status.code is not Code.INTERRUPTED:
+        status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
+        advice = _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
+        status = status.with_remedies(*(advice if verdict.unidentifiable else ()), *advise_widths(problem))
+    unknown = result.covariance * math.nan
+    return replace(result, estimates=estimates, covariance=unknown, status=status, verdict=verdict)
 
 
 def _name_part(problem: EstimationProblem, status: Status, verdict: Verdict) -> Status:
@@ -238,30 +216,30 @@ def _name_unidentifiable(verdict: Verdict) -> str:
     return f"the logs do not identify {join_names(names)}" if names else ""
 
 
-def _worst_residual(problem: EstimationProblem, start: Start) -> str:
-    """A sentence on the log, channel and time span of the largest residuals; empty if all are near the noise."""
+def _worst_residual(problem: EstimationProblem, start: Start, block: int = 50) -> str:
+    """A sentence on the block of samples with the largest residuals; empty if all are near the noise."""
     worst, message = MAX_CHI_SQUARE_RATIO, ""
     for log in problem.experiments:
         t, run = log.trajectory.t, start.states[log.name]
         for channel in outputs_in_log(problem.system, log):
             residuals = (log.trajectory[channel] - run[channel]) / log.noise[channel]
-            for first in range(0, len(t), RESIDUAL_BLOCK_SAMPLES):
-                part = residuals[first : first + RESIDUAL_BLOCK_SAMPLES]
+            for first in range(0, len(t), block):
+                part = residuals[first : first + block]
                 size = math.sqrt(float(np.nanmean(part**2))) if np.isfinite(part).any() else 0.0
                 if size > worst:
-                    last = min(first + RESIDUAL_BLOCK_SAMPLES, len(t)) - 1
+                    last = min(first + block, len(t)) - 1
                     worst, message = size, f"{channel} of {log.name} from {t[first]:.4g} to {t[last]:.4g} s"
     return f"the worst residuals, {worst:.3g} times the noise, are {message}" if message else ""
 
 
-def _worst_gap(problem: EstimationProblem, start: Start) -> str:
-    """A sentence on the state, log and time of the largest gap between segments; empty if there is none."""
+def _worst_gap(problem: EstimationProblem, start: Start, substeps: int = 20, smallest: float = 1e-4) -> str:
+    """A sentence on the state, log and time of the largest gap; of less than `smallest` [nominal sizes] it is empty."""
     segments = segment(problem.transcription(start))
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     nodes = start_nodes(segments)
-    ends = segments.run(nodes, q, GAP_SUBSTEPS, sensitivities=False).x_end
+    ends = segments.run(nodes, q, substeps, sensitivities=False).x_end
     gaps = np.abs(segment_gaps(segments, nodes, ends))
-    if not gaps.size or not np.isfinite(gaps).all() or gaps.max() < MIN_REPORTED_GAP:
+    if not gaps.size or not np.isfinite(gaps).all() or gaps.max() < smallest:
         return ""
     row, column = np.unravel_index(int(np.argmax(gaps)), gaps.shape)
     state = problem.system.states[int(column)]
@@ -312,12 +290,12 @@ class FixedValueTest:
     tests: int = field(default=0)  # how many fits have been tested
 
     def explains(self, problem: EstimationProblem, fit: Fit) -> bool:
-        """Whether a fixed value explains most of what a fit misses; `found` then names it."""
+        """Whether a fixed value explains most of the misfit of a fit; `found` then names it."""
         is_cut = fit.status.code in (Code.INTERRUPTED, Code.DIVERGED)
         if (
             is_cut
             or problem.weights
-            or self.tests >= MAX_TESTS
+            or self.tests >= MAX_FREED_TRIALS
             or not (2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count or fit.jumps is not None)
             or not math.isfinite(fit.stats["cost"])
         ):
@@ -345,16 +323,11 @@ def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     alike = sorted(
         (t for t in trials if t.squares <= level), key=lambda trial: (trial.name.startswith(NATURE), trial.squares)
     )
-    return replace(alike[0], alike=tuple(t.name for t in alike[1:]), lag=_dead_time(problem, alike[0]))
-
-
-def _dead_time(problem: EstimationProblem, value: WrongValue) -> float:
-    """The dead time that delays slow commands as a lower bandwidth of the final control element does [s]; or 0."""
-    axis = problem.system.plant.axis
-    element = axis.final_element if axis is not None else None
-    if element is None or value.name != element.bandwidth:
-        return 0.0
-    return max(0.0, (1 / value.found - 1 / value.given) / (2 * math.pi))
+    best, axis, lag = alike[0], problem.system.plant.axis, 0.0
+    if axis is not None and axis.final_element is not None and best.name == axis.final_element.bandwidth:
+        # a dead time delays slow commands as a lower bandwidth does
+        lag = max(0.0, (1 / best.found - 1 / best.given) / (2 * math.pi))
+    return replace(best, alike=tuple(t.name for t in alike[1:]), lag=lag)
 
 
 def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
@@ -376,7 +349,7 @@ def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict
 
 
 def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -> WrongValue | None:
-    """What a fit with a value freed explains; None where that is too little, or it hardly changes."""
+    """The value that a fit finds with it freed; None where that explains too little, or it hardly changes."""
     freed = replace(problem, parameters=problem.parameters.freed(name))
     found = _search_freed(freed, fit, 1 + (1 - MIN_EXPLAINED_SHARE) * excess / fit.count)
     if found is None:

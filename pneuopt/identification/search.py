@@ -46,9 +46,7 @@ from pneuopt.identification.tolerances import (
     CLEAR_DEVIATIONS,
     DECIDING,
     EXCERPT_SEGMENTS,
-    FIRST_ITERATIONS,
     GAP_FACTOR,
-    GUESS_BOUND_WIDTH,
     GUESS_STAGES,
     HOPELESS_MISFIT,
     LEVELS,
@@ -63,15 +61,14 @@ from pneuopt.identification.tolerances import (
     MIN_LENGTH_RATIO,
     MIN_WINDOW_SAMPLES,
     MIN_WINDOWS,
-    NEXT_ITERATIONS,
     PART_SEGMENTS,
     REFIT_STAGES,
     SAME_COST_RATIO,
     SAME_MISFIT_RATIO,
     SHORT_ITERATIONS,
     WINDOW_FACTOR,
+    WINDOW_ITERATIONS,
 )
-from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code, Status
@@ -81,7 +78,6 @@ from pneuopt.shooting.filters import PredictionErrors, filter_nodes
 from pneuopt.shooting.least_squares import (
     BudgetSpentError,
     Fit,
-    LeastSquares,
     SearchEnd,
     close_gaps,
     solve_least_squares,
@@ -112,8 +108,11 @@ def fit_from_starts(
         for start in starts_by_cost(problem, confirms, left_after, lambda: _cost_after_guesses(problem, fits)):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
-            known = _joinable_costs(fits) if is_plain else ()
-            tried = replace(problem, method=_method_after(problem, fits)) if known else problem
+            # a search that joins the best one only confirms it: without noise of the states where that did not settle
+            is_joinable = is_plain and bool(fits) and is_optimum(fits[0][1]) and not fits[0][0].fixed
+            known = fits[0][1].stage_costs if is_joinable else ()
+            settles = is_joinable and problem.method.allows_state_noise and fits[0][1].status.converged
+            tried = replace(problem, method=replace(problem.method, allows_state_noise=settles)) if known else problem
             held, fit = fit_fixing_unidentifiable(tried, start, limit, known)
             held = replace(held, method=problem.method)
             if fit.end is SearchEnd.DUPLICATE:
@@ -179,7 +178,7 @@ def starts_by_cost(
     `confirms` tells whether the first optimum only needs confirmation, by the next start as it is; `left_after` after
     how many stages the first start was left, `left_cost` what it cost after as many as the others get.
     """
-    candidates = problem.candidates()
+    candidates = problem.candidates
     yield candidates[0]
     while len(candidates) > 1 and confirms():
         candidates = candidates[1:]
@@ -216,15 +215,18 @@ def _cost_after_guesses(problem: EstimationProblem, fits: Sequence[Candidate]) -
     return next((cost for stage, cost in fits[0][1].stage_costs if stage == gap), math.nan)
 
 
-def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
-    """What a start reaches in some stages with its guesses held, the start from there, and whether that is the noise.
+def _settle_start(
+    problem: EstimationProblem, candidate: Start, stages: int, width: float = 1e-9
+) -> tuple[tuple[float, float], Start, bool]:
+    """The cost of a start after some stages with its guesses held, the start from there, and whether that is the noise.
 
     A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones. With
-    noise of the states a wrong guess explains any log.
+    noise of the states a wrong guess explains any log. Bounds of some `width` [1] hold a guess, for equal
+    ones would compile other equations.
     """
     transcription = problem.transcription(candidate)
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
-    bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
+    bounds = {n: (v - width * abs(v), v + width * abs(v)) for n, v in guesses.items()}
     held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
     method = replace(problem.method, stages=problem.method.stages[:stages], allows_state_noise=False)
     fit = solve_least_squares(held, method)
@@ -277,7 +279,7 @@ def _hold_unidentifiable(
 
 
 def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
-    """Where a search did not settle in a parameter, the fit of the others with that one held where it came to."""
+    """The fit of the other parameters, where a search did not settle in one: that one is held where it came to."""
     held, part = problem, fit
     last = problem.method.stages[-REFIT_STAGES:]
     warm = replace(
@@ -294,17 +296,16 @@ def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> t
             return problem, replace(fit, status=part.status)
         if part.status.code is Code.DIVERGED:
             return problem, fit
-    return (problem, fit) if _rests_on_held(held, part) else (held, part)
-
-
-def _rests_on_held(problem: EstimationProblem, fit: Fit) -> bool:
-    """Whether the logs tell nothing of any other parameter where those held may be ten times as large."""
-    if fit.covariance is None or fit.prior_covariance is None:
-        return False
-    names = fit.parameters.free_names
-    values, free = np.array([fit.parameters.value(n) for n in names]), [n not in problem.fixed for n in names]
-    covariance = fit.covariance + fit.prior_covariance
-    return bool(prior_dominated(covariance, fit.prior_covariance, values, problem.fixed.values())[free].all())
+    if part.covariance is None or part.prior_covariance is None:
+        return held, part
+    # where those held may be ten times as large, the logs may tell nothing of any other
+    values = np.array([part.parameters.value(n) for n in part.parameters.free_names])
+    covariance, free = (
+        part.covariance + part.prior_covariance,
+        [n not in held.fixed for n in part.parameters.free_names],
+    )
+    leans = prior_dominated(covariance, part.prior_covariance, values, held.fixed.values())
+    return (problem, fit) if leans[free].all() else (held, part)
 
 
 def explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
@@ -331,17 +332,6 @@ def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
     """
     best = fits[0][1]
     return is_optimum(best) and (len(fits) == 1 or best.jumps is not None)
-
-
-def _joinable_costs(fits: Sequence[Candidate]) -> tuple[tuple[float, float], ...]:
-    """The costs at the end of the best search's stages, at which another one that joins it only confirms it."""
-    return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].fixed else ()
-
-
-def _method_after(problem: EstimationProblem, fits: Sequence[Candidate]) -> LeastSquares:
-    """The method of a start that is to confirm the best one: without noise of the states where that did not settle."""
-    settles = problem.method.allows_state_noise and fits[0][1].status.converged
-    return replace(problem.method, allows_state_noise=settles)
 
 
 def _are_enough(fits: Sequence[Candidate]) -> bool:
@@ -422,28 +412,20 @@ def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candid
     tried before; with one that is not clearly above another that bounds it, one that has led to the same.
     """
     for found in _tries(problem):
-        held, fit, label = _settle(*found) if tried else found
+        held, fit, label = found
+        if tried and fit.status.code is Code.NOT_CONVERGED and is_at_noise(held, fit):
+            held, fit = fit_without_unsettled(*found)
         is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.fixed or bool(tried))
-        is_sure = is_in_order(held, fit) or any(_is_confirmed(fit, other) for _, other, _ in tried)
+        pairs = (sorted((fit, other), key=lambda each: each.stats["cost"]) for _, other, _ in tried)
+        is_sure = is_in_order(held, fit) or any(are_alike(better, worse) for better, worse in pairs)
         tried.append((held, fit, label))
         if (is_answer and is_sure) or fit.status.code is Code.INTERRUPTED:
             return held, fit, label
     return None
 
 
-def _is_confirmed(fit: Fit, other: Fit) -> bool:
-    """Whether both ended at one optimum, whichever of them is the better."""
-    return are_alike(*sorted((fit, other), key=lambda each: each.stats["cost"]))
-
-
-def _settle(problem: EstimationProblem, fit: Fit, label: str) -> Candidate:
-    """The fit; where it is at the noise but for a parameter that did not settle, that of the others."""
-    is_unsettled = fit.status.code is Code.NOT_CONVERGED and is_at_noise(problem, fit)
-    return (*(fit_without_unsettled(problem, fit, label) if is_unsettled else (problem, fit)), label)
-
-
 def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
-    """What is tried before a long search of long logs; nothing where they are short.
+    """The attempts before a long search of long logs; none where they are short.
 
     First a short search: most logs need no more, and one that is cut near the noise goes on. Then the fit from states
     that are filtered, and that from the parameters of a part of each log. The states of the whole logs are filtered by
@@ -452,7 +434,7 @@ def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
     parts = cut_excerpts(problem)
     if parts is None:
         return
-    rough, stages = problem.candidates()[0], problem.method.stages
+    rough, stages = problem.candidates[0], problem.method.stages
     few = stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)
     method = replace(problem.method, stages=few, max_misfit=HOPELESS_MISFIT, allows_state_noise=False)
     short = solve_least_squares(problem.transcription(rough), method)
@@ -497,15 +479,23 @@ def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> 
 
 
 def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
-    """The problem with an excerpt in place of each long log."""
-    if math.isfinite(problem.window) or not problem.has_gaps or len(problem.candidates()) < 2:
+    """The problem with its liveliest part in place of each long log."""
+    if math.isfinite(problem.window) or not problem.has_gaps or len(problem.candidates) < 2:
         return None
     if not problem.system.states or any(e.holes for e in problem.experiments) or problem.weights:
         return None
-    parts = tuple(_cut(problem, e) for e in problem.experiments)
+    parts = []
+    for e in problem.experiments:
+        run, step, part = e.trajectory, float(np.median(np.diff(e.trajectory.t))), e
+        count = math.ceil(EXCERPT_SEGMENTS * max(problem.method.segment_time, step) / step)
+        if len(run) >= MIN_LENGTH_RATIO * count:
+            columns = [run.fill_gaps(name) for name in outputs_in_log(problem.system, e)]
+            begin = liveliest_part(np.column_stack(columns), count)
+            part = replace(e, trajectory=run.rows(begin, begin + count), source=None)
+        parts.append(part)
     whole, kept = (sum(len(e.trajectory) for e in each) for each in (problem.experiments, parts))
     is_huge = sum(e.trajectory.duration for e in problem.experiments) > MAX_SEGMENTS * problem.method.segment_time
-    return replace(problem, experiments=parts) if whole >= MIN_LENGTH_RATIO * kept and not is_huge else None
+    return replace(problem, experiments=tuple(parts)) if whole >= MIN_LENGTH_RATIO * kept and not is_huge else None
 
 
 def filter_states(problem: EstimationProblem, start: Start, gathered: float = GATHERED_DEVIATION) -> Start:
@@ -543,26 +533,20 @@ def liveliest_part(columns: Array, count: int) -> int:
     return int(first[np.argmax(np.log(variances).sum(axis=1))])
 
 
-def _cut(problem: EstimationProblem, experiment: Experiment) -> Experiment:
-    """The liveliest part of a log; the log itself where it is short."""
-    run = experiment.trajectory
-    step = float(np.median(np.diff(run.t)))
-    count = math.ceil(EXCERPT_SEGMENTS * max(problem.method.segment_time, step) / step)
-    if len(run) < MIN_LENGTH_RATIO * count:
-        return experiment
-    columns = [run.fill_gaps(name) for name in outputs_in_log(problem.system, experiment)]
-    begin = liveliest_part(np.column_stack(columns), count)
-    return replace(experiment, trajectory=run.rows(begin, begin + count), source=None)
-
-
 # a parameter over the one that bounds it [1]: finer and wider ones cost time, others miss the valley
 RATIOS = np.geomspace(1.1, 2.4, 8)
 
 
 def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit | None:
     """The fit with tight gaps from where the prediction errors of a filter lead; None where no guess predicts."""
-    bounded, guesses = _bounded_parameters(problem), [c for c in problem.candidates() if c.trial_parameters]
-    if not bounded or len(guesses) < 2 or not _is_plain(problem):
+    free = set(problem.parameters.free_names) - set(problem.fixed)
+    order = problem.system.plant.identification_hints.at_least
+    bounded = {n: m for n, m in order.items() if n in free and m in free}
+    guesses = [c for c in problem.candidates if c.trial_parameters]
+    # a filter follows whole logs from segment to segment
+    is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
+    is_plain = is_whole and bool(problem.system.states) and not problem.weights
+    if not bounded or len(guesses) < 2 or not is_plain:
         return None
     segments = segment(problem.transcription(guesses[0]))
     scaling = ParameterScaling(segments.transcription)
@@ -585,19 +569,6 @@ def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit |
     start = filter_states(tight, start, last[-1].gap)
     method = replace(tight.method, max_misfit=max_misfit)
     return solve_least_squares(tight.transcription(start), method)
-
-
-def _is_plain(problem: EstimationProblem) -> bool:
-    """Whether a filter can follow the logs from segment to segment."""
-    is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
-    return is_whole and bool(problem.system.states) and not problem.weights
-
-
-def _bounded_parameters(problem: EstimationProblem) -> dict[str, str]:
-    """The free parameters that another one bounds, and that one."""
-    free = set(problem.parameters.free_names) - set(problem.fixed)
-    order = problem.system.plant.identification_hints.at_least
-    return {n: m for n, m in order.items() if n in free and m in free}
 
 
 def _hypotheses(guesses: Sequence[Start], bounded: dict[str, str]) -> Iterator[tuple[tuple[int, int], Start]]:
@@ -685,7 +656,9 @@ def enforce_ordering(problem: EstimationProblem, fit: Fit, label: str) -> tuple[
         return problem, fit
     start = problem.start_from(fit, label)
     start = replace(start, parameters={**start.parameters, **values})
-    ordered = replace(problem, fixed={**problem.fixed, **_without_effect(problem, start), **values})
+    begun = given.with_values(start.parameters)
+    unseen = {n: begun.value(n) for n in verdict_from_sensitivities(problem, start).unidentifiable}
+    ordered = replace(problem, fixed={**problem.fixed, **unseen, **values})
     if len(ordered.fixed) >= len(found.free_names):
         return problem, fit
     held, other = fit_fixing_unidentifiable(ordered, start)
@@ -698,26 +671,17 @@ def mark_order(problem: EstimationProblem, result: IdentificationResult) -> Iden
     """Mark estimates that the logs put below another one beyond chance, though no plant has them there."""
     estimates, status = result.estimates.copy(), result.status
     for low, high in problem.system.plant.identification_hints.at_least.items():
-        if low in estimates.index and _is_below(result, low, high):
-            estimates.loc[[n for n in (low, high) if n in estimates.index], "mark"] = Mark.BIAS_POSSIBLE
+        if low not in estimates.index:
+            continue
+        names = [n for n in (low, high) if n in estimates.index]
+        signs = np.array([1.0 if n == high else -1.0 for n in names])
+        variance = float(signs @ result.covariance.loc[names, names].to_numpy() @ signs)
+        below = result.parameters.value(high) - float(result.estimates["value"][low])
+        if variance >= 0 and below > CLEAR_DEVIATIONS * math.sqrt(variance):
+            estimates.loc[names, "mark"] = Mark.BIAS_POSSIBLE
             words = f"{low} is below {high}, which no drive has: model error, both may be biased"
             status = status.with_details(words)
     return replace(result, estimates=estimates, status=status)
-
-
-def _is_below(result: IdentificationResult, low: str, high: str) -> bool:
-    """Whether an estimate is below another parameter, free or fixed, beyond chance."""
-    names = [n for n in (low, high) if n in result.estimates.index]
-    signs = [1.0 if n == high else -1.0 for n in names]
-    values = {low: float(result.estimates["value"][low]), high: result.parameters.value(high)}
-    variance = float(signs @ result.covariance.loc[names, names].to_numpy() @ signs)
-    return variance >= 0 and values[high] - values[low] > CLEAR_DEVIATIONS * math.sqrt(variance)
-
-
-def _without_effect(problem: EstimationProblem, start: Start) -> dict[str, float]:
-    """The parameters that the logs do not identify at a start, with its values."""
-    values = problem.unknowns().with_values(start.parameters)
-    return {n: values.value(n) for n in verdict_from_sensitivities(problem, start).unidentifiable}
 
 
 Windowed = tuple[EstimationProblem, Fit, ChosenWindow]
@@ -741,15 +705,17 @@ def check_window(problem: EstimationProblem) -> None:
 
 def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
     """The fit in windows of the length with the narrowest intervals; None unless whole logs failed by their gaps."""
-    if not _has_failed_by_gaps(problem, fit):
+    absorbed = fit.stats["gap_share"] > MAX_GAP_SHARE and math.isfinite(fit.stats["cost"])
+    can_cut = not problem.is_whole and bool(problem.system.states) and problem.system.motion().sample_time is None
+    if not (fit.status.code is Code.NOT_CONVERGED and absorbed and can_cut):
         return None
     lengths = [problem.window] if math.isfinite(problem.window) else _lengths(problem)
-    trials, start, iterations = list[_Trial](), problem.start_from(fit), FIRST_ITERATIONS
+    trials, start, iterations = list[_WindowTrial](), problem.start_from(fit), 2 * WINDOW_ITERATIONS
     for length in reversed(lengths):
         trials.append(_try_length(problem, start, length, iterations))
         if trials[-1].fit.status.code is Code.INTERRUPTED:
             break
-        start, iterations = trials[-1].problem.start_from(trials[-1].fit), NEXT_ITERATIONS
+        start, iterations = trials[-1].problem.start_from(trials[-1].fit), WINDOW_ITERATIONS
     found = [trial for trial in trials if trial.is_answer]
     if not found:
         return None
@@ -775,7 +741,7 @@ def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
     return segments.trajectories(segments.run(nodes, q, substeps, states=True))
 
 
-class _Trial(NamedTuple):
+class _WindowTrial(NamedTuple):
     """The fit in windows of one length."""
 
     length: float
@@ -808,7 +774,7 @@ class _Trial(NamedTuple):
         known = float(np.mean(self.half_widths < sizes)) if sizes.size else 1.0
         return self.fit.status.converged and known > MIN_KNOWN_SHARE
 
-    def agrees(self, shorter: "_Trial") -> bool:
+    def agrees(self, shorter: "_WindowTrial") -> bool:
         """Whether its estimates agree with those of shorter windows, in which the model's errors add up less."""
         names = [n for n in self.fit.parameters.free_names if n in shorter.fit.parameters.free_names]
         apart = np.abs([self.fit.parameters.value(n) - shorter.fit.parameters.value(n) for n in names])
@@ -816,13 +782,6 @@ class _Trial(NamedTuple):
         own, other = self.half_widths, shorter.half_widths
         widths = [own[free.index(n)] + other[others.index(n)] for n in names]
         return bool(np.all(apart <= np.array(widths)))
-
-
-def _has_failed_by_gaps(problem: EstimationProblem, fit: Fit) -> bool:
-    """Whether gaps have taken the misfit of a search that ended by itself, of a plant that windows can cut."""
-    absorbed = fit.stats["gap_share"] > MAX_GAP_SHARE and math.isfinite(fit.stats["cost"])
-    can_cut = not problem.is_whole and bool(problem.system.states) and problem.system.motion().sample_time is None
-    return fit.status.code is Code.NOT_CONVERGED and absorbed and can_cut
 
 
 def _lengths(problem: EstimationProblem) -> list[float]:
@@ -836,12 +795,12 @@ def _lengths(problem: EstimationProblem) -> list[float]:
     return [shortest * WINDOW_FACTOR**k for k in range(count)]
 
 
-def _try_length(problem: EstimationProblem, start: Start, length: float, iterations: int) -> _Trial:
-    """The fit in windows of one length, a segment each, and what its residuals tell."""
+def _try_length(problem: EstimationProblem, start: Start, length: float, iterations: int) -> _WindowTrial:
+    """The fit in windows of one length, a segment each, with the diagnosis of its residuals."""
     # without gaps all stages are alike; steps are refined where the search has converged
     last = replace(problem.method.stages[-1], iterations=iterations, refine=1)
     cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=(last,)))
     held, found = fit_fixing_unidentifiable(cut, start)
     held = replace(held, method=replace(held.method, stages=problem.method.stages))
     freedom = degrees_of_freedom(held, found)
-    return _Trial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))
+    return _WindowTrial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))

@@ -160,8 +160,15 @@ def select_model(
     systems = {name: as_system(model, f"candidates[{name!r}]") for name, model in candidates.items()}
     experiments, held_out = as_experiments(experiments), as_experiments(held_out)
     check_parameters(parameters)
-    given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
-    _check_names(given, parameters, free)
+    given = {}
+    for name, system in systems.items():
+        own = system.parameters | parameters.select(n for n in parameters if n in system.parameters)
+        matched = [n for n in own if any(fnmatch.fnmatch(n, pattern) for pattern in free)]
+        given[name] = own.freed(*matched) if matched else own
+    every = sorted({n for own in given.values() for n in own})
+    unknown = [n for n in parameters if n not in every] + [p for p in free if not fnmatch.filter(every, p)]
+    if unknown:
+        raise UnknownNameError("parameter", unknown[0], every)
     if progress is not None:
         method = replace(method or LeastSquares(), progress=ProgressReporter(progress, "select_model"))
     found = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
@@ -221,7 +228,7 @@ def try_candidate(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # a fit says them
         problem = replace(pose_problem(system, experiments, parameters, method), window=window)
-    candidates, best = problem.candidates(), known or Trial()
+    candidates, best = problem.candidates, known or Trial()
     others = [problem.start_from(near)] if near and candidates[0].trial_parameters else []
     for start in itertools.chain(others, itertools.islice(candidates, 1 if known else 0, MAX_TRIALS)):
         best = best.better(_try_start(problem, start, allowed))
@@ -295,7 +302,10 @@ def fit_candidates(
         alike.announce("trying", name, len(trials), len(candidates))
         trials[name] = alike.try_shortly(candidates[name], allowed=allowed)
         allowed = _hopeless_squares(min(trials.values(), key=lambda trial: trial.squares))
-    for name in _by_rank(candidates, trials):
+    # the leader first, the simplest of those near the least squares, the others by their squares
+    near = [n for n, trial in trials.items() if trial.squares <= LEADER_RATIO * min(t.squares for t in trials.values())]
+    leader = min(near or trials, key=lambda n: len(candidates[n].parameters.free_names))
+    for name in sorted(trials, key=lambda n: (n != leader, trials[n].squares)):
         alike.announce("fitting", name, len(out), len(candidates))
         out[name] = fit = alike.fit(candidates[name])
         if fit.status.converged:
@@ -311,14 +321,6 @@ def _richest_first(candidates: Mapping[str, Candidate]) -> list[str]:
 def _hopeless_squares(best: Trial) -> tuple[float, ...]:
     """The squares after each stage beyond which another candidate is hopeless."""
     return tuple(HOPELESS_RATIO * squares for squares in best.by_stage)
-
-
-def _by_rank(candidates: Mapping[str, Candidate], trials: Mapping[str, Trial]) -> list[str]:
-    """The candidates' names, the leader first: the simplest near the least squares, the others by their squares."""
-    least = min(trial.squares for trial in trials.values())
-    near = [n for n, trial in trials.items() if trial.squares <= LEADER_RATIO * least]
-    leader = min(near or trials, key=lambda n: len(candidates[n].parameters.free_names))
-    return sorted(trials, key=lambda n: (n != leader, trials[n].squares))
 
 
 def _fit_beside(
@@ -392,7 +394,7 @@ def _fit_one(
 
 @dataclass(frozen=True)
 class _Alike:
-    """How all candidates are fitted."""
+    """The way in which all candidates are fitted."""
 
     experiments: tuple[Experiment, ...]
     method: LeastSquares
@@ -488,22 +490,6 @@ class _CandidateRow:
         return f"{self.at_bound} at a bound" if self.at_bound else self.unphysical
 
 
-def _candidate_parameters(system: System, parameters: ParameterSet, free: Sequence[str]) -> ParameterSet:
-    own = system.parameters | parameters.select(n for n in parameters if n in system.parameters)
-    matched = [n for n in own if any(fnmatch.fnmatch(n, pattern) for pattern in free)]
-    return own.freed(*matched) if matched else own
-
-
-def _check_names(given: Mapping[str, ParameterSet], parameters: ParameterSet, free: Sequence[str]) -> None:
-    every = sorted({n for own in given.values() for n in own})
-    for name in parameters:
-        if name not in every:
-            raise UnknownNameError("parameter", name, every)
-    for pattern in free:
-        if not fnmatch.filter(every, pattern):
-            raise UnknownNameError("parameter", pattern, every)
-
-
 def _candidate_rows(
     candidates: Mapping[str, System],
     found: Mapping[str, IdentificationResult | Refutation],
@@ -520,7 +506,12 @@ def _candidate_rows(
     for name, fit in found.items():
         k, deviance, inside, p, bic = len(_free_names(fit)), _chi_square(fit, fits) / scale, "", math.nan, math.nan
         if name in comparable:
-            inside, bic = _largest_submodel(name, candidates, comparable), bayes_information(deviance, k, count)
+            own, states = _free_names(fit), set(names(candidates[name].states))
+            simpler = [
+                n for n in comparable if _free_names(found[n]) < own and set(names(candidates[n].states)) <= states
+            ]
+            inside = max(simpler, key=lambda n: len(_free_names(found[n])), default="")
+            bic = bayes_information(deviance, k, count)
         if inside and name in predicted:
             less = k - len(_free_names(found[inside]))
             p = likelihood_ratio_p(_chi_square(found[inside], fits) / scale - deviance, less)
@@ -539,36 +530,24 @@ def _candidate_rows(
 
 
 def _notes(system: System, fit: IdentificationResult | Refutation) -> tuple[str, str, str, str]:
-    """What is unidentifiable, what is at a bound, what is unphysical, and the message."""
+    """Notes on what is unidentifiable, at a bound or unphysical, and the message."""
     if isinstance(fit, Refutation):
         return "", "", "", fit.reason
-    notes = ", ".join(_names_noted(fit, UNIDENTIFIABLE_NOTE)), ", ".join(_names_noted(fit, AT_BOUND_NOTE))
-    return *notes, _unphysical(fit, system.identification_hints.at_least), fit.status.message
+    unknown, bound = (
+        [str(n) for n, own in fit.estimates["note"].items() if own == note]
+        for note in (UNIDENTIFIABLE_NOTE, AT_BOUND_NOTE)
+    )
+    order, found = (
+        system.identification_hints.at_least,
+        fit.parameters.select(n for n in fit.parameters if n not in unknown),
+    )
+    below = [(n, m) for n, m in order.items() if n in found and m in found and found.value(n) < found.value(m)]
+    unphysical = ", ".join(f"{n} ({found.value(n):.4g}) below {m} ({found.value(m):.4g})" for n, m in below)
+    return ", ".join(unknown), ", ".join(bound), unphysical, fit.status.message
 
 
 def _free_names(fit: IdentificationResult | Refutation) -> set[str]:
     return {*fit.free} if isinstance(fit, Refutation) else {str(n) for n in fit.estimates.index}
-
-
-def _unphysical(fit: IdentificationResult, at_least: Mapping[str, str]) -> str:
-    """Which parameters are below those that no plant has them below, where the logs identify them; empty if none is."""
-    found = fit.parameters.select(n for n in fit.parameters if n not in _names_noted(fit, UNIDENTIFIABLE_NOTE))
-    below = [(n, m) for n, m in at_least.items() if n in found and m in found and found.value(n) < found.value(m)]
-    return ", ".join(f"{n} ({found.value(n):.4g}) below {m} ({found.value(m):.4g})" for n, m in below)
-
-
-def _names_noted(fit: IdentificationResult, note: str) -> list[str]:
-    """The names of the parameters with a note."""
-    return [str(n) for n, own in fit.estimates["note"].items() if own == note]
-
-
-def _largest_submodel(
-    name: str, candidates: Mapping[str, System], fits: Mapping[str, IdentificationResult | Refutation]
-) -> str:
-    """The richest candidate whose free parameters and states are among this one's; "" if there is none."""
-    own, states = _free_names(fits[name]), set(names(candidates[name].states))
-    simpler = [n for n in fits if _free_names(fits[n]) < own and set(names(candidates[n].states)) <= states]
-    return max(simpler, key=lambda n: len(_free_names(fits[n])), default="")
 
 
 def _chi_square(
@@ -589,7 +568,15 @@ def _choose(rows: Mapping[str, _CandidateRow]) -> tuple[str, str]:
     sound = {n: row for n, row in rows.items() if row.is_sound} or {n: row for n, row in rows.items() if row.converged}
     lowest = next(iter(sound))
     tied = [n for n, row in sound.items() if row.bic - sound[lowest].bic < TIE]
-    name, why = _break_tie(sound, tied)
+    best = min(tied, key=lambda n: sound[n].held_out_nrmse)
+    level = [n for n in tied if not sound[n].held_out_nrmse > MAX_HELD_OUT_RATIO * sound[best].held_out_nrmse]
+    simplest = min(level, key=lambda n: sound[n].free)
+    name, why = lowest, ""
+    if sound[best].held_out_nrmse * MAX_HELD_OUT_RATIO < sound[lowest].held_out_nrmse:
+        name, why = best, f"as held-out runs decide between it and {lowest}, whose BIC is within {TIE:g}"
+    elif sound[simplest].free < sound[lowest].free:
+        name = simplest
+        why = f"as {lowest}, whose BIC is within {TIE:g}, has more parameters and predicts no better"
     while inside := sound[name].contains:
         row = sound[name]
         by_chance = row.p_value > NESTED_TEST_LEVEL
@@ -602,26 +589,13 @@ def _choose(rows: Mapping[str, _CandidateRow]) -> tuple[str, str]:
     return name, why
 
 
-def _break_tie(rows: Mapping[str, _CandidateRow], tied: Sequence[str]) -> tuple[str, str]:
-    """Of candidates with about the same BIC the one that predicts held-out runs best, or the one with fewest terms."""
-    lowest = tied[0]
-    best = min(tied, key=lambda n: rows[n].held_out_nrmse)
-    if rows[best].held_out_nrmse * MAX_HELD_OUT_RATIO < rows[lowest].held_out_nrmse:
-        return best, f"as held-out runs decide between it and {lowest}, whose BIC is within {TIE:g}"
-    level = [n for n in tied if not rows[n].held_out_nrmse > MAX_HELD_OUT_RATIO * rows[best].held_out_nrmse]
-    simplest = min(level, key=lambda n: rows[n].free)
-    if rows[simplest].free < rows[lowest].free:
-        return simplest, f"as {lowest}, whose BIC is within {TIE:g}, has more parameters and predicts no better"
-    return lowest, ""
-
-
 def _separate(
     rows: Mapping[str, _CandidateRow],
     chosen: str,
     fits: Mapping[str, IdentificationResult],
     systems: Mapping[str, System],
 ) -> str:
-    """What separates the chosen candidate from the next sound one, or would; "" where there is no other."""
+    """Words on what separates the chosen candidate from the next sound one, or would; "" where there is no other."""
     others = [n for n, row in rows.items() if row.is_sound and n != chosen]
     if not others:
         return ""

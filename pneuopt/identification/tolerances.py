@@ -10,20 +10,14 @@ REFIT_STAGES = 3  # last stages of a method that a refit runs, near its answer
 SIGNIFICANT_FALL = 10.8  # [variances] fall of squared residuals that counts: chance exceeds it once in a thousand
 MIN_WINDOW_SAMPLES = 20  # measured samples of the shortest window: of fewer its start state takes most
 
-# Checkup
-
-MIN_PERCENT = 0.1  # [%] standard deviation over the value, below which the model's errors count, and not the noise
-
 # Compare logs
 
 MIN_RELATIVE_DIFFERENCE = 0.02  # [1] that a disagreement must exceed, too: an interval does not hold a model's bias
 
 # Examination
 
-CHANGE = 1e-3  # [1] of a parameter's value, or of its unit, by which forces are seen to depend on it
-STOP_DEPTH = 1e-3  # [m] beyond a limit of the position, at which a model's end stop pushes back
 MIN_FORCE_SHARE = 1e-3  # [1] force of a signal over the largest one's, from which it counts
-MIN_STOP_FORCE = 10.0  # [N] by which a model's end stop pushes back at that depth; a spring takes less
+MIN_STOP_FORCE = 10.0  # [N] by which a model's end stop pushes back 1 mm beyond a limit; a spring takes less
 
 # Identifiability; standard deviations are over the value, or per e-fold of a logarithm
 
@@ -37,12 +31,10 @@ MIN_COMBINATION_SHARE = 0.3  # [1] of a weak combination's largest part, from wh
 INFORMATION_ROUNDING = 1e-9  # [1] root of information over the largest, below which it is rounding
 MAX_PRIOR_VARIANCE_SHARE = 0.1  # [1] of an estimate's variance from priors, beyond which it does not rest on the logs
 MAX_PRIOR_DEVIATION = 0.1  # [1] up to which such an estimate is identified all the same
-MAX_REDUCTION_SEGMENTS = 2000  # whose sensitivities are reduced together: memory against time
 
 # Logged loop
 
 SAMPLE_TIME_TOLERANCE = 1e-3  # [sample times] of a log's time about the controller's: rounded, not another moment
-DIFFERENTIATION_WINDOW = 21  # samples over which a position is differentiated where the fed-back speed is not logged
 
 # Losses
 
@@ -77,8 +69,7 @@ MAX_NOISE_FACTOR = 3.0  # [1] between a stated noise level and the one that the 
 MAX_BRIDGE = 10  # missing samples in a row that are bridged; at more a log is cut
 MIN_RUN = 10  # samples with an output between two holes, that find the start state of a part
 MAX_REST_DISTANCE = 0.2  # [half ranges] of the resting command from the middle of its range
-RANGE_TOLERANCE = 0.02  # [half ranges] by which noise may leave the range
-MIN_EXCURSION = 0.02  # [half ranges] to both sides of the middle, of a two-way log
+RANGE_TOLERANCE = 0.02  # [half ranges] that are noise: beyond the range, and to both sides of its middle
 
 # Profiles
 
@@ -87,22 +78,16 @@ END_TOLERANCE = 0.02  # [1] of an end's distance from the estimate, or of the le
 MAX_LOG_STEP = 1.5  # [e-folds] between two refits of a log parameter
 MAX_LOG_PROBE = 0.3  # [e-folds] over which the curvature at the estimate is measured
 REFIT_ITERATIONS = 40  # of a refit
-DELTA_METHOD_STEP = 1e-3  # [standard deviations] over which a slope is taken
 
 # Review
 
 PROFILE_DRAG_DEVIATIONS = 3.0  # that another parameter moves along a profile, beyond which it is profiled, too
-RESIDUAL_BLOCK_SAMPLES = 50  # of the blocks among which the worst residuals are named
-GAP_SUBSTEPS = 20  # integration steps a sample for the gaps that are shown
-MIN_REPORTED_GAP = 1e-4  # [nominal sizes] of a state: smaller gaps are integration errors
 MIN_PROMISED_SHARE = 0.5  # [1] of the misfit that a freed value must explain by the linearised equations to be tried
 MIN_EXPLAINED_SHARE = 0.8  # [1] the same by a fit, to be named
 WHOLE_SHARE = 0.98  # [1] of the misfit, from which a value explains all of it
-TRIAL_FIT_ITERATIONS, LAST_TRIAL_ITERATIONS = (
-    4,
-    10,
-)  # of a trial's stages: a value that explains the logs took 17 in all
-MAX_FREED_TRIALS, MAX_TESTS = 2, 2  # values that are tried in a test, and tests of one problem
+# of a trial's stages, and of its last one: a value that explains the logs took 17 in all
+TRIAL_FIT_ITERATIONS, LAST_TRIAL_ITERATIONS = 4, 10
+MAX_FREED_TRIALS = 2  # values that are tried in a test, and tests of one problem
 MIN_RELATIVE_CHANGE = 0.03  # [1] of a wrong value: a Coulomb law at a Stribeck curve asks for 1.3 % of the mass
 ALIKE_SQUARES = 20.0  # [variances of the residuals] above the best, up to which logs do not tell two values apart
 
@@ -110,7 +95,6 @@ ALIKE_SQUARES = 20.0  # [variances of the residuals] above the best, up to which
 
 GUESS_STAGES = 3  # of a search with guesses held
 HOPELESS_MISFIT = 3.0  # [noise variances a sample] beyond which the first start waits for the others
-GUESS_BOUND_WIDTH = 1e-9  # [1] of the bounds that hold a guess; equal ones would compile other equations
 ACCEPTED_CHI_SQUARE_RATIO = 1.05  # [1] up to which no other start is tried: a wrong basin of bristles has left 1.1
 SAME_MISFIT_RATIO = 1.02  # [1] cost of a settled start over the first one's, up to which the guess is not wrong
 MIN_DOUBTED = 2  # fits after which the problem is doubted
@@ -124,8 +108,8 @@ PART_SEGMENTS = 300  # of all logs, that the filter follows
 BEST = 4  # sets that descend
 # deviation that the states gather along a segment [nominal sizes], the steps at most, and the sets that go on
 LEVELS = ((1e-3, 4, 2), (3e-4, 6, 1), (1e-4, 6, 1), (3e-5, 6, 1))
-# [1] cost a sample at which no set goes on (of what would lead to the noise .9), from which deviation on it counts
-MAX_COST, DECIDING = 1.3, 3e-4
+MAX_COST = 1.3  # [1] cost a sample at which no set goes on; of what would lead to the noise .9
+DECIDING = LEVELS[1][0]  # [nominal sizes] deviation from which on that cost counts
 # [1] squared residuals over the noise's and the gaps' share of them, above which windows are tried: a sensor's lag has
 # 60 and .17, a plant that runs away from its log .9
 MAX_CLOSED_MISFIT, MAX_CLOSED_SHARE = 100.0, 0.3
@@ -144,14 +128,11 @@ MAX_HELD_OUT_RATIO = 1.02  # [1] held-out NRMSE over a simpler model's, above wh
 # Tracking
 
 MIN_LOGS = 4  # from which a drift is tested: three leave one degree of freedom, with which nothing is significant
-HISTORIES = 40_000  # drawn: the level of a look is then known to a tenth
-POWERS = (0.8, 0.9)  # [1] probabilities of seeing the drift, for which the number of logs is named
 
 # Widths
 
 CONFIRMING_STAGES = 4  # of the method, that confirm another width
 MAX_TRIAL_SAMPLES = 8000  # of all logs
-EXCERPTS = 4  # stretches in which a longer log is tried
 FORESEEN_RATIO = 0.5  # [1] foreseen cost over the given width's, below which no search confirms a narrower one
 MIN_RELATIVE_FALL = 2e-3  # [1] of the cost, that counts
 MAX_HIDING_SHARE = 0.25  # [1] width over what it hides: above, a rounded edge shifts the dead zone fitted with it
@@ -160,5 +141,5 @@ MAX_HIDING_SHARE = 0.25  # [1] width over what it hides: above, a rounded edge s
 
 MIN_WINDOWS = 12  # of all logs
 MIN_KNOWN_SHARE = 0.5  # [1] of the parameters that windows must determine to better than their own size
-FIRST_ITERATIONS, NEXT_ITERATIONS = 60, 30  # in the first windows, and in those that begin with their answer
+WINDOW_ITERATIONS = 30  # in windows that begin with the answer of others; twice as many in the first ones
 WINDOW_FACTOR = 2.0  # [1] from one length to the next

@@ -31,7 +31,7 @@ from pneuopt.identification.identify import identify
 from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.problem import as_estimation_model, as_experiments, check_logs
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.identification.tolerances import CLEAR_DEVIATIONS, HISTORIES, MIN_LOGS, MIN_RELATIVE_DIFFERENCE, POWERS
+from pneuopt.identification.tolerances import CLEAR_DEVIATIONS, MIN_LOGS, MIN_RELATIVE_DIFFERENCE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, check_names, require
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tracking(Shown):
-    """What became of a drive's parameters, log by log.
+    """The estimates of a drive's parameters log by log, and their drift.
 
     Attributes
     ----------
@@ -212,7 +212,11 @@ def fit_line(times: Array, values: Array, errors: Array) -> DriftLine:
     dof = len(x) - 2
 
     def excess(variance: float) -> float:
-        return _squares(x, y, s**2 + variance) - dof
+        """Weighted squares of the residuals of a line over their degrees of freedom."""
+        w = 1 / (s**2 + variance)
+        dx, dy = x - np.average(x, weights=w), y - np.average(y, weights=w)
+        slope = (w @ (dx * dy)) / (w @ dx**2)
+        return float(w @ (dy - slope * dx) ** 2) - dof
 
     top = float(np.ptp(y)) ** 2 + 1e-300
     while excess(top) > 0:
@@ -226,31 +230,22 @@ def fit_line(times: Array, values: Array, errors: Array) -> DriftLine:
     return DriftLine(mean, slope, centre, float(w.sum()) ** -0.5, error, variance**0.5, dof, p)
 
 
-def _squares(x: Array, y: Array, variance: Array) -> float:
-    """Weighted squares of the residuals of a line."""
-    w = 1 / variance
-    x, y = x - np.average(x, weights=w), y - np.average(y, weights=w)
-    slope = (w @ (x * y)) / (w @ x**2)
-    return float(w @ (y - slope * x) ** 2)
+@lru_cache(maxsize=32)
+def look_level(times: tuple[float, ...], level: float, histories: int = 40_000) -> float:
+    """The p-value of a look that raises an alarm, so that a history of such logs has one by chance at `level`.
+
+    That many are drawn, which give the level to a tenth.
+    """
+    return float(np.quantile(_p_values(times, 0.0, histories).min(axis=1), level))
 
 
-def look_level(times: tuple[float, ...], level: float) -> float:
-    """The p-value of a look that raises an alarm, so that a history of such logs has one by chance at `level`."""
-    return float(np.quantile(_smallest(times), level))
-
-
-def power(times: tuple[float, ...], drift: float, level: float) -> Array:
+def power(times: tuple[float, ...], drift: float, level: float, histories: int = 10_000) -> Array:
     """The probability (n,) that a drift is seen with each log or an earlier one, with looks at `level`.
 
     The drift is by time, in standard deviations of an estimate about its line: its error and the scatter together.
     """
-    seen = np.minimum.accumulate(_p_values(times, drift, HISTORIES // 4), axis=1) <= level
+    seen = np.minimum.accumulate(_p_values(times, drift, histories), axis=1) <= level
     return np.asarray(np.concatenate([np.zeros(MIN_LOGS - 1), seen.mean(axis=0)]))
-
-
-@lru_cache(maxsize=32)
-def _smallest(times: tuple[float, ...]) -> Array:
-    return np.asarray(_p_values(times, 0.0, HISTORIES).min(axis=1))
 
 
 def _p_values(times: tuple[float, ...], drift: float, count: int) -> Array:
@@ -317,21 +312,18 @@ def _track_one(
     columns |= {"line": middle, "line_low": middle - half, "line_high": middle + half}
     row: dict[str, object] = {"value": middle[-1], "ci_low": middle[-1] - half[-1], "ci_high": middle[-1] + half[-1]}
     units = [str(f.loc[name, "unit"]) for f in frames if name in f.index and "unit" in f.columns]
-    row |= {"unit": units[0] if units else "", **_percent_a_week(line), "p": line.p, "scatter": line.scatter}
+    row["unit"], first = units[0] if units else "", abs(float(line.at(np.zeros(1))[0][0]))
+    width = float(t_quantile(line.dof)) * line.slope_error
+    for end, change in (("", 0.0), ("_low", -width), ("_high", width)):
+        row[f"percent_a_week{end}"] = 100 * (line.slope + change) / first
+    row |= {"p": line.p, "scatter": line.scatter}
     row["alarm"] = stamps[alarms[0]] if len(alarms) else pd.NaT
     error = math.hypot(line.scatter, float(np.sqrt(np.mean(found[known, 1] ** 2))))
-    seen = power(planned, asked * abs(line.at(weeks[:1])[0][0]) / error, look)
-    for wanted in POWERS:
-        row[f"logs_{100 * wanted:.0f}"] = float(np.argmax(seen >= wanted) + 1) if seen[-1] >= wanted else math.nan
+    seen = power(planned, asked * first / error, look)
+    for percent in (80, 90):
+        is_seen = seen >= percent / 100
+        row[f"logs_{percent}"] = float(np.argmax(is_seen) + 1) if is_seen[-1] else math.nan
     return row, pd.DataFrame(columns, index=pd.DatetimeIndex(list(stamps), name="date"))
-
-
-def _percent_a_week(line: DriftLine) -> dict[str, float]:
-    """The slope over the line's value at the first date, and the ends of its interval."""
-    width = float(t_quantile(line.dof)) * line.slope_error
-    first = abs(float(line.at(np.zeros(1))[0][0]))
-    ends = zip(("", "_low", "_high"), (0.0, -width, width), strict=True)
-    return {f"percent_a_week{end}": 100 * (line.slope + d) / first for end, d in ends}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -399,6 +391,8 @@ def compare_logs(
     InputError
         If there is one log only, or logs, system and parameters do not fit together.
     """
+    import pandas as pd
+
     experiments = as_experiments(experiments)
     require(len(experiments) > 1, f"{len(experiments)} log leaves nothing to compare; give at least two", LogError)
     logs = check_logs(as_estimation_model(system), experiments, parameters)
@@ -408,46 +402,21 @@ def compare_logs(
         if own.free_names:
             fits[log.name] = identify(system, [log], own, method=method, throw=False)
     shared = [n for n in parameters.free_names if not parameters[n].per_log]
-    table = _comparison_table(shared, fits, parameters)
-    differing = _disagreements(table)
-    return LogComparison(table, not len(differing), _comparison_reason(table, differing, len(fits)), fits)
-
-
-def _comparison_table(
-    shared: Sequence[str], fits: Mapping[str, IdentificationResult], known: ParameterSet
-) -> "pd.DataFrame":
-    import pandas as pd
-
     rows = []
     for name in shared:
-        own = {log: _compared_estimate(fit, name) for log, fit in fits.items()}
-        for log, (value, stderr) in own.items():
-            others, spread = _inverse_variance_mean([e for n, e in own.items() if n != log])
+        found = {log: _estimate(fit.estimates, name) for log, fit in fits.items() if fit.status.converged}
+        for source in fits:
+            value, stderr = found.get(source, (math.nan, math.nan))
+            known = np.array([e for n, e in found.items() if n != source and math.isfinite(e[1])]).reshape(-1, 2)
+            weight = known[:, 1] ** -2.0  # mean of the others by their variances
+            others = float(np.average(known[:, 0], weights=weight)) if len(known) else math.nan
+            spread = float(weight.sum()) ** -0.5 if len(known) else math.nan
             deviation = (value - others) / math.hypot(stderr, spread)
             figures = {"value": value, "stderr": stderr, "others": others, "deviation": deviation}
-            rows.append({"parameter": name, "log": log, **figures, "unit": known[name].unit})
-    return pd.DataFrame(rows).set_index(["parameter", "log"])
-
-
-def _compared_estimate(fit: IdentificationResult, name: str) -> tuple[float, float]:
-    """Value and standard deviation of a parameter; NaN where the log alone does not identify it.
-
-    With few degrees of freedom it is that of a normal distribution with the same interval.
-    """
-    if not fit.status.converged or name not in fit.estimates.index:
-        return math.nan, math.nan
-    value, stderr, dof = (float(fit.estimates[column][name]) for column in ("value", "stderr", "dof"))
-    width = stderr * float(t_quantile(dof) / t_quantile(math.inf))
-    return (value, width) if math.isfinite(width) else (math.nan, math.nan)
-
-
-def _inverse_variance_mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Inverse-variance mean of the finite estimates, and its standard deviation."""
-    finite = np.array([e for e in estimates if math.isfinite(e[1])]).reshape(-1, 2)
-    if not len(finite):
-        return math.nan, math.nan
-    weight = 1 / np.maximum(finite[:, 1], 1e-300) ** 2
-    return float(np.average(finite[:, 0], weights=weight)), float(1 / math.sqrt(weight.sum()))
+            rows.append({"parameter": name, "log": source, **figures, "unit": parameters[name].unit})
+    table = pd.DataFrame(rows).set_index(["parameter", "log"])
+    differing = _disagreements(table)
+    return LogComparison(table, not len(differing), _comparison_reason(table, differing, len(fits)), fits)
 
 
 def _disagreements(table: "pd.DataFrame") -> "pd.DataFrame":

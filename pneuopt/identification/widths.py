@@ -21,7 +21,6 @@ from pneuopt.identification.problem import EstimationProblem, known_runs
 from pneuopt.identification.result import ChosenWidth
 from pneuopt.identification.tolerances import (
     CONFIRMING_STAGES,
-    EXCERPTS,
     FORESEEN_RATIO,
     MAX_HIDING_SHARE,
     MAX_TRIAL_SAMPLES,
@@ -33,7 +32,7 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.equations import weigh_gaps
-from pneuopt.shooting.least_squares import BudgetSpentError, Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.least_squares import BudgetSpentError, LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.segments import choose_integration, segment, stable_substeps, start_nodes
 from pneuopt.shooting.tolerances import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.transcription import Transcription
@@ -87,7 +86,7 @@ def advise_widths(problem: EstimationProblem) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Trial:
+class _WidthTrial:
     """A short search with some widths: its cost, that foreseen with the gaps that confirm a width, what it found."""
 
     widths: dict[str, float]
@@ -97,7 +96,7 @@ class _Trial:
     parameters: ParameterSet
     too_stiff: bool
 
-    def is_better_than(self, other: "_Trial") -> bool:
+    def is_better_than(self, other: "_WidthTrial") -> bool:
         """Whether the cost is lower beyond chance."""
         if not self.cost < inf:
             return False
@@ -113,7 +112,7 @@ class _Trial:
         return 2 * self.cost / max(1, self.count)
 
 
-def _race_widths(problem: EstimationProblem, names: Set[str]) -> tuple[_Trial, set[str]]:
+def _race_widths(problem: EstimationProblem, names: Set[str]) -> tuple[_WidthTrial, set[str]]:
     """The best trial over the named widths, and the widths of which a narrower one would be too stiff."""
     race, too_stiff = _Race(problem), set[str]()
     best = race.run({n: problem.parameters.value(n) for n in sorted(names)})
@@ -142,7 +141,7 @@ def _is_open(problem: EstimationProblem, name: str) -> bool:
     return not said.free and (said == problem.system.parameters[name] or said.source == CHOSEN_WIDTH)
 
 
-def _search_width(race: "_Race", width: Width, best: _Trial) -> tuple[_Trial, bool]:
+def _search_width(race: "_Race", width: Width, best: _WidthTrial) -> tuple[_WidthTrial, bool]:
     """Narrow a width as long as that lowers the cost, or shows what it hides; else widen it as long."""
     given, too_stiff = best, False
     for factor in (1 / width.factor, 1 / sqrt(width.factor)):
@@ -154,7 +153,7 @@ def _search_width(race: "_Race", width: Width, best: _Trial) -> tuple[_Trial, bo
     return (best if _is_confirmed(race, width, given, best) else given), too_stiff
 
 
-def _follow(race: "_Race", width: Width, best: _Trial, factor: float) -> tuple[_Trial, bool]:
+def _follow(race: "_Race", width: Width, best: _WidthTrial, factor: float) -> tuple[_WidthTrial, bool]:
     """Multiply a width by a factor until that helps no more."""
     while True:
         trial = race.run_scaled(best, width, factor)
@@ -165,10 +164,15 @@ def _follow(race: "_Race", width: Width, best: _Trial, factor: float) -> tuple[_
         best = trial
 
 
-def _is_confirmed(race: "_Race", width: Width, given: _Trial, best: _Trial) -> bool:
+def _is_confirmed(race: "_Race", width: Width, given: _WidthTrial, best: _WidthTrial) -> bool:
     """Whether tighter gaps, too, prefer a width to the given one; they are searched only where that is not foreseen."""
-    if best is given or _is_foreseen(width, given, best):
+    if best is given:
         return True
+    if best.widths[width.name] < given.widths[width.name] and 0 < best.foreseen < inf:
+        # by the linearised equations; far better, or as good and a width that hides less
+        tight, wide = (replace(t, cost=t.foreseen) for t in (best, given))
+        if tight.cost < FORESEEN_RATIO * wide.cost or _is_too_wide(width, tight, wide):
+            return True
     trial, other = (race.run(t.widths, confirms=True) for t in (best, given))
     is_wider = trial.widths[width.name] > other.widths[width.name]
     if is_wider and other.cost < inf and trial.misfit > MODEL_ERROR_LEVEL**2:
@@ -176,20 +180,12 @@ def _is_confirmed(race: "_Race", width: Width, given: _Trial, best: _Trial) -> b
     return _is_better(width, trial, other)
 
 
-def _is_foreseen(width: Width, given: _Trial, best: _Trial) -> bool:
-    """Whether the linearised equations say that tighter gaps, too, prefer a narrower width by far, or see more."""
-    if not (best.widths[width.name] < given.widths[width.name] and 0 < best.foreseen < inf):
-        return False
-    tight, other = (replace(t, cost=t.foreseen) for t in (best, given))
-    return tight.cost < FORESEEN_RATIO * other.cost or _is_too_wide(width, tight, other)
-
-
-def _is_better(width: Width, trial: _Trial, other: _Trial) -> bool:
+def _is_better(width: Width, trial: _WidthTrial, other: _WidthTrial) -> bool:
     """Whether a trial follows the logs better than another, or as well while it shows what the other hides."""
     return trial.is_better_than(other) or _is_too_wide(width, trial, other)
 
 
-def _is_too_wide(width: Width, trial: _Trial, best: _Trial) -> bool:
+def _is_too_wide(width: Width, trial: _WidthTrial, best: _WidthTrial) -> bool:
     """Whether a width is too wide for what it hides, and a narrower one follows the logs as well."""
     is_narrower = trial.widths[width.name] < best.widths[width.name]
     if width.hides not in best.parameters or not (is_narrower and trial.cost <= best.cost + best.significant_fall):
@@ -205,7 +201,7 @@ class _Race:
         self.confirming_stages = method.stages[:CONFIRMING_STAGES]
         self._problem = replace(problem, experiments=excerpts(problem.experiments), weights={}, method=method)
 
-    def run_scaled(self, trial: _Trial, width: Width, factor: float) -> _Trial | None:
+    def run_scaled(self, trial: _WidthTrial, width: Width, factor: float) -> _WidthTrial | None:
         """A trial with a width and its followers multiplied by a factor; None beyond the bounds."""
         p = self._problem.parameters
         scaled = {n: trial.widths[n] * factor for n in _names(width) if n in trial.widths}
@@ -213,7 +209,7 @@ class _Race:
             return None
         return self.run({**trial.widths, **scaled})
 
-    def run(self, widths: dict[str, float], *, confirms: bool = False) -> _Trial:
+    def run(self, widths: dict[str, float], *, confirms: bool = False) -> _WidthTrial:
         """A short search from the model's first start, which depends on the widths, too.
 
         One that confirms goes on to tight gaps, whatever they cost: costs compare at the same gaps only.
@@ -223,28 +219,23 @@ class _Race:
         # an empty last stage: the last one of a method would iterate to its end
         stages = (*stages, replace(stages[-1], iterations=0))
         method = replace(problem.method, stages=stages, allows_state_noise=not confirms)
-        transcription = problem.transcription(problem.candidates()[0])
+        transcription = problem.transcription(problem.candidates[0])
         is_narrower = any(v < self._problem.parameters.value(n) for n, v in widths.items())
         if is_narrower and is_too_stiff(transcription, method, implicit=False):
-            return _Trial(widths, inf, inf, 0, problem.parameters, too_stiff=True)
+            return _WidthTrial(widths, inf, inf, 0, problem.parameters, too_stiff=True)
         fit = solve_least_squares(transcription, method)
         if fit.status.code is Code.INTERRUPTED:
             method.budget.check()
             raise KeyboardInterrupt
         too_stiff = fit.stats["iterations"] == 0 and is_too_stiff(transcription, method)
         cost = inf if too_stiff or not fit.stats["cost"] < inf else fit.stats["cost"]
-        foreseen = inf if too_stiff else _foresee(fit, self.confirming_stages[-1].gap)
-        return _Trial(widths, cost, foreseen, fit.count, fit.parameters, too_stiff)
-
-
-def _foresee(fit: Fit, gap: float) -> float:
-    """The cost to which other gaps would lead by the equations at the end of a search; infinite if there is none."""
-    if fit.optimum is None:
-        return inf
-    sigma = fit.optimum.gap_deviations * (gap / fit.stats["gap_deviation"])
-    equations = fit.optimum.equations
-    tight = weigh_gaps(equations.segments, equations.linearisation, sigma)
-    return 0.5 * max(0.0, tight.promised_squares(fit.optimum.keep))
+        foreseen = inf
+        if fit.optimum is not None and not too_stiff:  # by the equations at the end of the search, with other gaps
+            gap, equations = self.confirming_stages[-1].gap, fit.optimum.equations
+            sigma = fit.optimum.gap_deviations * (gap / fit.stats["gap_deviation"])
+            tight = weigh_gaps(equations.segments, equations.linearisation, sigma)
+            foreseen = 0.5 * max(0.0, tight.promised_squares(fit.optimum.keep))
+        return _WidthTrial(widths, cost, foreseen, fit.count, fit.parameters, too_stiff)
 
 
 def is_too_stiff(transcription: Transcription, method: LeastSquares, *, implicit: bool = True) -> bool:
@@ -256,7 +247,7 @@ def is_too_stiff(transcription: Transcription, method: LeastSquares, *, implicit
     return (method.substeps or stable_substeps(segments, nodes, q, RK4_MAX_H_LAMBDA)) > MAX_SEARCH_SUBSTEPS
 
 
-def excerpts(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
+def excerpts(experiments: Sequence[Experiment], stretches: int = 4) -> tuple[Experiment, ...]:
     """The logs, or evenly spread stretches of them where they are long."""
     total = sum(len(e.trajectory) for e in experiments)
     if total <= MAX_TRIAL_SAMPLES:
@@ -264,13 +255,11 @@ def excerpts(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
     share, out = MAX_TRIAL_SAMPLES / total, list[Experiment]()
     for e in experiments:
         n = len(e.trajectory)
-        size, each = n // EXCERPTS, round(share * n / EXCERPTS)
-        parts = [_excerpt(e, k * size, k * size + max(10, each)) for k in range(EXCERPTS)]
-        out += [replace(part, name=f"{e.name}@{k}") for k, part in enumerate(parts) if known_runs(part)]
+        size, each = n // stretches, round(share * n / stretches)
+        for k in range(stretches):
+            begin, end = k * size, k * size + max(10, each)
+            holes = [(max(a, begin) - begin, min(b, end) - begin) for a, b in e.holes if a < end and b > begin]
+            run = e.trajectory.rows(begin, end)
+            part = replace(e, trajectory=run, holes=tuple(holes), name=f"{e.name}@{k}")
+            out += [part] if known_runs(part) else []
     return tuple(out)
-
-
-def _excerpt(experiment: Experiment, begin: int, end: int) -> Experiment:
-    """The samples `begin:end` of a log, with the holes among them."""
-    own = [(max(a, begin) - begin, min(b, end) - begin) for a, b in experiment.holes if a < end and b > begin]
-    return replace(experiment, trajectory=experiment.trajectory.rows(begin, end), holes=tuple(own))

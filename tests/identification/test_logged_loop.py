@@ -93,16 +93,20 @@ def test_a_lagging_sensor_is_part_of_the_loop() -> None:
     assert fit.estimates["value"]["load.mass"] == pytest.approx(3.0, rel=0.01)
 
 
-def test_a_delay_and_a_feedforward_are_part_of_the_loop() -> None:
-    drive = ForceDrive(Coulomb()).system()
-    loop = ClosedLoop(drive, PID(2e-3, delay=1), feedforward=Feedforward(0.05))
-    known = given(loop).with_values({"feedforward.gain": 100.0})
+def speed_steps(loop: ClosedLoop, known: ParameterSet) -> Experiment:
+    """A log of a speed loop's reference and its noisy position, while the reference steps up and back."""
     t = np.arange(600) * 1e-3
     wanted = np.where(t < 0.1, 0.0, np.where(t < 0.35, 0.3, -0.2))
     run = simulate(loop, Trajectory(t, {"reference": wanted}), known, initial=[0.0] * len(loop.states))
     noisy = run["position"] + NOISE["position"] * np.random.default_rng(1).standard_normal(t.size)
-    log = Experiment(Trajectory(t, {"speed_reference": wanted, "position": noisy}), {"position": NOISE["position"]})
-    fit = identify(loop, [log], known.freed("friction.coulomb", "load.mass"))
+    return Experiment(Trajectory(t, {"speed_reference": wanted, "position": noisy}), {"position": NOISE["position"]})
+
+
+def test_a_delay_and_a_feedforward_are_part_of_the_loop() -> None:
+    drive = ForceDrive(Coulomb()).system()
+    loop = ClosedLoop(drive, PID(2e-3, delay=1), feedforward=Feedforward(0.05))
+    known = given(loop).with_values({"feedforward.gain": 100.0})
+    fit = identify(loop, [speed_steps(loop, known)], known.freed("friction.coulomb", "load.mass"))
     assert fit.estimates["value"]["load.mass"] == pytest.approx(3.0, rel=0.01)
 
 
@@ -112,12 +116,7 @@ def test_what_compensators_add_is_part_of_the_loop() -> None:
     loop = ClosedLoop(drive, PID(2e-3), compensators=(Knocker(), DeadZoneInverse()))
     sizes = {"knocker.amplitude": 8.0, "knocker.smoothing": 2.0, "dead_zone_inverse.width": 5.0}
     known = given(loop).with_values({**sizes, "dead_zone_inverse.smoothing": 2.0})
-    t = np.arange(600) * 1e-3
-    wanted = np.where(t < 0.1, 0.0, np.where(t < 0.35, 0.3, -0.2))
-    run = simulate(loop, Trajectory(t, {"reference": wanted}), known, initial=[0.0] * len(loop.states))
-    noisy = run["position"] + NOISE["position"] * np.random.default_rng(1).standard_normal(t.size)
-    log = Experiment(Trajectory(t, {"speed_reference": wanted, "position": noisy}), {"position": NOISE["position"]})
-    fit = identify(loop, [log], known.freed("friction.coulomb", "load.mass"))
+    fit = identify(loop, [speed_steps(loop, known)], known.freed("friction.coulomb", "load.mass"))
     assert fit.estimates["value"]["load.mass"] == pytest.approx(3.0, rel=0.01)
 
 

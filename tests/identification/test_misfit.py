@@ -253,9 +253,7 @@ def test_windows_that_start_anew_where_whole_logs_do_not_fit_leave_a_bias_possib
     assert plain.mark(0, is_optimum=True) is Mark.EXACT
     anew = replace(plain, restarts=True)
     assert anew.mark(0, is_optimum=True) is Mark.BIAS_POSSIBLE
-    assert anew.sentences == (
-        "over whole logs the model misses more than their noise: estimates from windows may be biased",
-    )
+    assert anew.sentences == ("over whole logs the misfit exceeds the noise: estimates from windows may be biased",)
 
 
 Rows = list[tuple[Array, Array]]
@@ -454,7 +452,7 @@ def fitted(friction: FrictionModel, width: float = 1.0) -> tuple[EstimationProbl
     if WIDTH in given:
         given = given.with_values({WIDTH: width * own.value(WIDTH)})
     problem = EstimationProblem(system, tuple(check_logs(system, [log], given)), given, LeastSquares())
-    return problem, solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    return problem, solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
 
 
 def test_the_width_that_made_the_log_is_not_rejected() -> None:

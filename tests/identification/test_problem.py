@@ -60,7 +60,7 @@ def problem() -> EstimationProblem:
 
 def test_a_fit_becomes_the_start_of_the_next_one() -> None:
     posed = problem()
-    fit = solve_least_squares(posed.transcription(posed.candidates()[0]))
+    fit = solve_least_squares(posed.transcription(posed.candidates[0]))
     start = posed.start_from(fit, "again")
     assert start.label == "again"
     assert start.parameters == {n: fit.parameters.value(n) for n in fit.parameters.free_names}
@@ -72,7 +72,7 @@ def test_a_fit_becomes_the_start_of_the_next_one() -> None:
 
 def test_a_result_without_a_value_starts_at_the_given_one() -> None:
     posed = problem()
-    fit = solve_least_squares(posed.transcription(posed.candidates()[0]))
+    fit = solve_least_squares(posed.transcription(posed.candidates[0]))
     estimates = pd.DataFrame({"value": {"load.mass": 4.5, "friction.viscous": np.nan}})
     table, runs = pd.DataFrame(), {"run": fit.trajectories[0]}
     result = IdentificationResult(fit.parameters, estimates, table, table, runs, fit.status, fit.stats, {})

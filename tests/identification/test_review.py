@@ -72,7 +72,7 @@ def test_a_value_that_is_wrong_beside_slow_errors_is_named() -> None:
 def test_a_fit_at_the_noise_is_not_tested_and_a_small_change_not_named() -> None:
     """A Coulomb law that meets a Stribeck curve asks for 1.3 % more mass."""
     problem = posed(Coulomb())
-    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    fit = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
     test = FixedValueTest()
     assert not test.explains(problem, replace(fit, stats={**fit.stats, "cost": 0.5 * fit.count}))
     assert test.tests == 0
@@ -103,7 +103,7 @@ def test_what_a_user_knows_best_is_named_last(
     names: tuple[str, ...], squares: tuple[float, ...], named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, found = posed(Coulomb()), dict(zip(names, squares, strict=True))
-    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    fit = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
     axis = Axis(final_element=FinalElement("valve", "spool", "air", "", "", "valve.bandwidth", "", ()))
     problem = replace(problem, system=replace(problem.system.plant, axis=axis))
     monkeypatch.setattr(review, "_promised_squares", lambda *_: (2e6, dict.fromkeys(names, 1e3)))

@@ -99,7 +99,7 @@ def posed(friction: FrictionModel) -> EstimationProblem:
 def test_the_first_start_costs_nothing_more() -> None:
     problem = posed(Stribeck())
     first = next(search.starts_by_cost(problem))
-    assert first.label == problem.candidates()[0].label
+    assert first.label == problem.candidates[0].label
     assert first.trial_parameters == (VELOCITY,)
 
 
@@ -113,7 +113,7 @@ def test_the_others_settle_with_their_guess_held_and_come_by_cost(monkeypatch: p
 
     monkeypatch.setattr(search, "solve_least_squares", spied)
     problem = posed(Stribeck())
-    candidates = problem.candidates()
+    candidates = problem.candidates
     _, *settled = search.starts_by_cost(problem)
     order = [candidates[i].parameters[VELOCITY] for i in sorted(range(len(reached)), key=reached.__getitem__)]
     assert [s.parameters[VELOCITY] for s in settled] == order
@@ -125,7 +125,7 @@ def test_a_start_that_explains_the_log_as_it_settles_comes_before_the_others_set
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem, settled = posed(Stribeck()), list[str]()
-    first, second, third, *others = problem.candidates()
+    first, second, third, *others = problem.candidates
 
     def settle(problem: EstimationProblem, start: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
         settled.append(start.label)
@@ -153,12 +153,12 @@ def test_a_start_explains_the_log_by_tight_gaps_only(
 ) -> None:
     problem = posed(Stribeck())
     monkeypatch.setattr(search, "ACCEPTED_CHI_SQUARE_RATIO", accepted)
-    assert search._settle_start(problem, problem.candidates()[candidate], stages)[2] == explains
+    assert search._settle_start(problem, problem.candidates[candidate], stages)[2] == explains
 
 
 def test_the_others_settle_by_no_more_stages_than_the_first_start_had() -> None:
     problem = posed(Stribeck())
-    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    fit = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
     left = [
         replace(
             fit, end=SearchEnd.ABANDONED, status=SearchEnd.ABANDONED.status, stats={**fit.stats, "gap_deviation": gap}
@@ -174,7 +174,7 @@ def test_without_guesses_the_candidates_are_tried_as_they_are() -> None:
 
 def test_an_interruption_keeps_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(problem: EstimationProblem, *_: Callable[[], bool]) -> Iterator[Start]:
-        wrong = problem.candidates()[0]
+        wrong = problem.candidates[0]
         yield Start(wrong.states, {**wrong.parameters, "friction.coulomb": 3.0})
         raise KeyboardInterrupt
 
@@ -197,7 +197,7 @@ def test_an_interruption_keeps_an_earlier_and_better_start(monkeypatch: pytest.M
             raise KeyboardInterrupt
 
     def two(problem: EstimationProblem, *_: Callable[[], bool]) -> Iterator[Start]:
-        good = problem.candidates()[0]
+        good = problem.candidates[0]
         yield good
         armed.append(True)
         yield Start(good.states, {**good.parameters, "friction.coulomb": 3.0}, "far off")
@@ -216,7 +216,7 @@ def test_an_interruption_keeps_an_earlier_and_better_start(monkeypatch: pytest.M
 def test_a_refit_is_taken_only_where_the_logs_do_not_reject_its_held_values(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the given value the sum of squares rises by 20; where the search had left the parameter, it does not."""
     problem = posed(Coulomb())
-    start = problem.candidates()[0]
+    start = problem.candidates[0]
     good = solve_least_squares(problem.transcription(start), problem.method)
     first = replace(good, unidentifiable=("friction.viscous",))
     worse = replace(good, chi_square=good.chi_square + 20, stats={**good.stats, "cost": good.stats["cost"] + 10})
@@ -249,7 +249,7 @@ def test_a_start_that_is_too_stiff_to_be_searched_holds_nothing(monkeypatch: pyt
 
     monkeypatch.setattr(search, "solve_least_squares", counted)
     problem = posed(Stribeck())
-    start = problem.candidates()[0]
+    start = problem.candidates[0]
     stiff = replace(start, parameters={**start.parameters, "friction.static": 5e4, VELOCITY: 0.004})
     held, fit = search.fit_fixing_unidentifiable(problem, stiff)
     assert "so stiff that a sample takes" in fit.status.verdict
@@ -270,7 +270,7 @@ def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatc
     monkeypatch.setattr(search, "fit_fixing_unidentifiable", noted)
     monkeypatch.setattr(search, "_settle_start", lambda *_: pytest.fail("settled"))
     assert search.fit_from_starts(problem)[1].status.converged
-    assert labels == [c.label for c in problem.candidates()[:2]]
+    assert labels == [c.label for c in problem.candidates[:2]]
 
 
 @pytest.mark.parametrize(("window", "segment", "stages"), [(math.inf, 0.01, GUESS_STAGES), (0.1, 0.1, 1)])
@@ -293,7 +293,7 @@ def test_guesses_are_settled_once_where_no_gap_tightens(
 def test_a_first_start_that_is_far_off_waits_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a rig that hunts, the search from the first of six starts went on for a minute; another one had the answer."""
     problem, stages = posed(Stribeck()), list[int]()
-    good = problem.candidates()
+    good = problem.candidates
     far = {"friction.coulomb": 4.0, "friction.static": 4.0, "friction.viscous": 500.0, VELOCITY: 0.5}
 
     def counted(transcription: Transcription, method: LeastSquares) -> Fit:
@@ -302,7 +302,9 @@ def test_a_first_start_that_is_far_off_waits_for_the_others(monkeypatch: pytest.
         return fit
 
     monkeypatch.setattr(search, "solve_least_squares", counted)
-    monkeypatch.setattr(EstimationProblem, "candidates", lambda _: [replace(good[0], parameters=far), *good[1:]])
+    monkeypatch.setattr(
+        EstimationProblem, "candidates", property(lambda _: [replace(good[0], parameters=far), *good[1:]])
+    )
     monkeypatch.setattr(search, "HOPELESS_MISFIT", 0.0)
     _, fit, label = search.fit_from_starts(problem)
     assert fit.status.converged
@@ -315,7 +317,7 @@ def test_a_first_start_that_is_far_off_waits_for_the_others(monkeypatch: pytest.
 
 def test_a_lone_start_that_is_far_off_is_searched_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, tried = posed(Stribeck()), list[str]()
-    first = problem.candidates()[0]
+    first = problem.candidates[0]
 
     def noted(transcription: Transcription, method: LeastSquares) -> Fit:
         fit = solve_least_squares(transcription, method)
@@ -323,7 +325,7 @@ def test_a_lone_start_that_is_far_off_is_searched_to_its_end(monkeypatch: pytest
         return fit
 
     monkeypatch.setattr(search, "solve_least_squares", noted)
-    monkeypatch.setattr(EstimationProblem, "candidates", lambda _: [first])
+    monkeypatch.setattr(EstimationProblem, "candidates", property(lambda _: [first]))
     monkeypatch.setattr(search, "HOPELESS_MISFIT", 0.0)
     _, fit, _ = search.fit_from_starts(problem)
     assert fit.status.converged
@@ -348,7 +350,7 @@ def test_a_fit_at_the_noise_that_leaves_one_parameter_unsettled_takes_one_more_s
     held, fit, _ = search.fit_from_starts(problem)
     assert fit.status.converged
     assert set(held.fixed) == {VELOCITY}
-    assert labels == [c.label for c in problem.candidates()[:2]]
+    assert labels == [c.label for c in problem.candidates[:2]]
 
 
 def test_a_start_that_joins_the_best_confirms_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -366,7 +368,7 @@ def test_a_start_that_joins_the_best_confirms_it(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(search, "_settle_start", lambda *_: pytest.fail("settled"))
     _, fit, label = search.fit_from_starts(problem)
     assert fit.status.converged
-    assert label == problem.candidates()[0].label
+    assert label == problem.candidates[0].label
     assert known == [(), fit.stage_costs]
 
 
@@ -398,7 +400,7 @@ def test_a_confirming_start_looks_for_no_noise_of_the_states_where_the_best_foun
 def test_noise_of_the_states_asks_for_no_second_equal_optimum(jumps: bool, cost: float, enough: bool) -> None:
     """Every estimate is marked with it; an infinite cost stands for a second start that did not converge."""
     problem = posed(Stribeck())
-    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    fit = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
     best = replace(fit, chi_square=1e9, jumps=np.zeros((1, 2)) if jumps else None)
     failed = Status(Code.NOT_CONVERGED, ("friction.static would still move",))
     status, share = (fit.status, cost) if cost < math.inf else (failed, 1.0)
@@ -422,12 +424,12 @@ def test_no_more_guesses_settle_where_another_one_costs_the_same(
     monkeypatch.setattr(search, "_settle_start", settle)
     starts = list(search.starts_by_cost(problem, left_after=lambda: 5, left_cost=lambda: 100.0))
     assert len(settled) == settles
-    assert {s.label for s in starts} == {s.label for s in problem.candidates()}  # the others are tried as they are
+    assert {s.label for s in starts} == {s.label for s in problem.candidates}  # the others are tried as they are
 
 
 def test_the_cost_that_others_are_held_to_is_that_after_as_many_stages() -> None:
     problem = posed(Stribeck())
-    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    fit = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
     costs = tuple((stage.gap, float(i)) for i, stage in enumerate(problem.method.stages))
     found = [search._cost_after_guesses(problem, [(problem, replace(fit, stage_costs=c), "")]) for c in (costs, ())]
     assert found[0] == GUESS_STAGES - 1
@@ -449,7 +451,7 @@ def test_a_fit_that_has_lost_static_friction_takes_one_more_start(
     monkeypatch.setattr(search, "fit_fixing_unidentifiable", found)
     monkeypatch.setattr(search, "ACCEPTED_CHI_SQUARE_RATIO", 2.0)  # this log has 1.6
     assert search.fit_from_starts(problem)[1].status.converged
-    assert labels == [c.label for c in problem.candidates()[:starts]]
+    assert labels == [c.label for c in problem.candidates[:starts]]
 
 
 SAMPLE, NOISE = 2e-3, {"position": 2e-5, "pressure_a": 1e3, "pressure_b": 1e3}  # [s], [m], [Pa]
@@ -509,7 +511,7 @@ def test_short_logs_and_windows_have_no_excerpt() -> None:
 def test_filtered_states_fit_the_parameters() -> None:
     """The speed along the log comes four times nearer to the truth than that of a filter of the position alone."""
     problem, states = posed_long_log(6.0)
-    rough = problem.candidates()[0]
+    rough = problem.candidates[0]
     true = {n: b32()[1].value(n) for n in FREE}
     filtered = filter_states(problem, replace(rough, parameters=true))
     error, before = (
@@ -585,7 +587,7 @@ def test_states_that_are_far_off_are_filtered_before_wide_gaps_too(
 
     monkeypatch.setattr(search, "filter_states", spied)
     problem, _ = posed_long_log()
-    assert search._fit_filtered(problem, problem.candidates()[0], is_far=is_far) is not None
+    assert search._fit_filtered(problem, problem.candidates[0], is_far=is_far) is not None
     assert len(runs) == filtered
 
 
@@ -593,7 +595,7 @@ def test_wide_gaps_that_do_not_explain_a_long_log_lead_to_no_tight_ones() -> Non
     problem, _ = posed_long_log()
     (log,) = problem.experiments
     precise = replace(problem, experiments=(replace(log, noise={n: v / 3 for n, v in log.noise.items()}),))
-    assert search._fit_filtered(precise, problem.candidates()[0], is_far=False) is None
+    assert search._fit_filtered(precise, problem.candidates[0], is_far=False) is None
 
 
 def explain_all(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -744,7 +746,7 @@ def test_an_interruption_hands_back_the_best_of_all_tries(monkeypatch: pytest.Mo
 def test_ctrl_c_between_the_tries_ends_all(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the search with wide gaps, or in the tight one after it, for which the next try was taken up."""
     problem, _ = posed_long_log()
-    rough, runs = problem.candidates()[0], list[int]()
+    rough, runs = problem.candidates[0], list[int]()
 
     def cut(transcription: Transcription, method: LeastSquares) -> Fit:
         fit = solve_least_squares(transcription, method)
@@ -782,10 +784,10 @@ def posed_stick_slip(friction: FrictionModel, *, disturbance: float = 0.0) -> Es
 
 def spoil(problem: EstimationProblem) -> None:
     """Give all starts less static friction and other velocities than the logs show, as too long a filter does."""
-    guesses = [c for c in problem.candidates() if c.trial_parameters]
+    guesses = [c for c in problem.candidates if c.trial_parameters]
     assert len(guesses) > 2
     spoilt = [replace(c, parameters={**c.parameters, STATIC: 1.05 * c.parameters["friction.coulomb"]}) for c in guesses]
-    problem.__dict__["_candidates"] = spoilt
+    problem.__dict__["candidates"] = spoilt
 
 
 def test_it_finds_what_the_starts_miss(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -821,7 +823,7 @@ def test_what_a_filter_cannot_follow_is_left_to_the_starts(case: str) -> None:
     (log,) = problem.experiments
     if case == "a hole":
         problem = replace(problem, experiments=(replace(log, holes=((300, 500),)),))
-        problem.__dict__["_candidates"] = posed_stick_slip(Stribeck()).candidates()
+        problem.__dict__["candidates"] = posed_stick_slip(Stribeck()).candidates
     elif case == "windows":
         problem = replace(problem, window=0.2)
     elif case == "weights":
@@ -840,7 +842,7 @@ def test_the_end_of_the_budget_ends_the_filter() -> None:
 
 def test_each_guess_is_tried_with_each_ratio_and_no_two_neighbours_descend() -> None:
     problem = posed_stick_slip(Stribeck())
-    guesses = [c for c in problem.candidates() if c.trial_parameters]
+    guesses = [c for c in problem.candidates if c.trial_parameters]
     found = dict(search._hypotheses(guesses, {STATIC: "friction.coulomb"}))
     assert len(found) == len(guesses) * len(search.RATIOS)
     velocities = [found[i, 0].parameters[VELOCITY] for i in range(len(guesses))]
@@ -866,7 +868,7 @@ def test_the_part_is_the_liveliest() -> None:
     position[:600] = position[600]
     still = replace(log, trajectory=log.trajectory.with_columns({"position": position}))
     problem = replace(problem, experiments=(still,))
-    segments = segment(problem.transcription(posed_stick_slip(Stribeck()).candidates()[0]))
+    segments = segment(problem.transcription(posed_stick_slip(Stribeck()).candidates[0]))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "PART_SEGMENTS", 30)
         part = search._liveliest(segments, problem)
@@ -880,7 +882,7 @@ def test_the_part_is_the_liveliest() -> None:
 def test_a_fit_that_is_no_answer_is_left_for_the_other_starts(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It ended at the noise with static friction next to Coulomb's, which the logs showed to be far above."""
     problem = posed_stick_slip(Stribeck())
-    _, fit = fit_fixing_unidentifiable(problem, problem.candidates()[0])
+    _, fit = fit_fixing_unidentifiable(problem, problem.candidates[0])
     wrong = {
         "residuals": replace(fit, chi_square=2.0 * fit.count),
         "order": replace(
@@ -898,7 +900,7 @@ def test_a_fit_that_is_no_answer_is_left_for_the_other_starts(fault: str, monkey
 
 def test_ctrl_c_ends_all_with_the_first_start(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = posed_stick_slip(Stribeck())
-    _, fit = fit_fixing_unidentifiable(problem, problem.candidates()[0])
+    _, fit = fit_fixing_unidentifiable(problem, problem.candidates[0])
     left, cut = (
         replace(fit, end=END, status=END.status),
         replace(fit, status=Status(Code.INTERRUPTED)),
@@ -925,7 +927,7 @@ def test_it_is_tried_where_the_first_start_is_left(
 
     def predicted(posed: EstimationProblem, max_misfit: float) -> Fit:
         calls.append(max_misfit)
-        return fit_fixing_unidentifiable(posed, posed.candidates()[0])[1]
+        return fit_fixing_unidentifiable(posed, posed.candidates[0])[1]
 
     monkeypatch.setattr(search, "fit_fixing_unidentifiable", first)
     monkeypatch.setattr(search, "fit_from_predictions", predicted)
@@ -964,7 +966,7 @@ def open_fit() -> tuple[EstimationProblem, Fit]:
     """The problem of that log, and the end of its search, with tight gaps that take a part of the misfit."""
     model = as_estimation_model(DRIVE.system())
     problem = EstimationProblem(model, (late_log(),), model.parameters | DRIVE.parameters.freed(*SLIDING), METHOD)
-    return problem, solve_least_squares(problem.transcription(problem.candidates()[0]), METHOD)
+    return problem, solve_least_squares(problem.transcription(problem.candidates[0]), METHOD)
 
 
 def values(fit: Fit) -> Array:
@@ -1006,7 +1008,7 @@ def test_gaps_of_a_model_that_runs_away_are_not_closed(
 
 def optimum() -> tuple[EstimationProblem, Fit]:
     problem = posed(Stribeck())
-    return problem, solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    return problem, solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
 
 
 def profile(estimate: float, best: Mapping[str, float]) -> Profile:
@@ -1105,7 +1107,7 @@ def problem_and_fit(
     noise = 1e-5 * np.random.default_rng(0).standard_normal(T.size)
     log = po.Experiment(po.Trajectory(T, {"force": push, "position": run["position"] + noise}), {"position": 1e-5})
     problem = EstimationProblem(SYSTEM, tuple(check_logs(SYSTEM, [log], given)), given, po.LeastSquares(), fixed=held)
-    first = problem.candidates()[0]
+    first = problem.candidates[0]
     start = replace(first, parameters={**first.parameters, **HEAVY_TRUTH, **begin, **held})
     return problem, solve_least_squares(problem.transcription(start), problem.method)
 
@@ -1169,7 +1171,7 @@ def test_friction_that_no_drive_has_is_named_and_marked() -> None:
 
 def unsettled_optimum() -> tuple[EstimationProblem, Fit]:
     problem = posed(Stribeck())
-    return problem, solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    return problem, solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
 
 
 def unsettled(done: Fit, name: str, off: float) -> Fit:
@@ -1384,13 +1386,20 @@ def test_both_errors_are_in_the_file(tmp_path: Path) -> None:
     assert row["free_run_rmse"] > 10 * row["rmse"] > 0
 
 
+def missed_by_gaps() -> tuple[Mock, Mock]:
+    """A problem, and a fit of whole logs whose gaps carry half the cost."""
+    problem, whole = Mock(window=math.inf, is_whole=False), Mock(stats={"gap_share": 0.5, "cost": 1.0})
+    problem.system.motion.return_value.sample_time, whole.status.code = None, Code.NOT_CONVERGED
+    return problem, whole
+
+
 @pytest.mark.parametrize(("bias", "chosen"), [(0.5, 0.4), (3.0, 0.2)])
 def test_longer_windows_are_chosen_only_if_shorter_ones_agree(
     bias: float, chosen: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Narrow intervals of long windows, in which a model's errors add up, have held no truth."""
-    problem, tried = Mock(window=math.inf), list[float]()
-    whole = Mock(stats={"gap_share": 0.5})
+    problem, whole = missed_by_gaps()
+    tried = list[float]()
 
     def trial(_: EstimationProblem, start: object, length: float, __: int) -> Mock:
         tried.append(length)
@@ -1399,10 +1408,9 @@ def test_longer_windows_are_chosen_only_if_shorter_ones_agree(
         parameters = ParameterSet({"gain": Parameter(value, "1", free=True)})
         own = Mock(length=length, is_answer=True, rank=(0, False, math.log(width)), half_widths=np.array([width]))
         own.fit.parameters, own.problem.start_from.return_value = parameters, "warm"
-        own.agrees = lambda other: windows._Trial.agrees(own, other)
+        own.agrees = lambda other: windows._WindowTrial.agrees(own, other)
         return own
 
-    monkeypatch.setattr(windows, "_has_failed_by_gaps", lambda *_: True)
     monkeypatch.setattr(windows, "_lengths", lambda _: [0.1, 0.2, 0.4])
     monkeypatch.setattr(windows, "_try_length", trial)
     found = windows.fit_in_windows(problem, whole)
@@ -1420,10 +1428,9 @@ def test_a_budget_that_ends_in_one_length_leaves_the_others(monkeypatch: pytest.
         own.fit.status.code = Code.CONVERGED if length == 0.4 else Code.INTERRUPTED
         return own
 
-    monkeypatch.setattr(windows, "_has_failed_by_gaps", lambda *_: True)
     monkeypatch.setattr(windows, "_lengths", lambda _: [0.1, 0.2, 0.4])
     monkeypatch.setattr(windows, "_try_length", trial)
-    found = windows.fit_in_windows(Mock(window=math.inf), Mock(stats={"gap_share": 0.5}))
+    found = windows.fit_in_windows(*missed_by_gaps())
     assert tried == [0.4, 0.2]
     assert found is not None
     assert found[2].duration == 0.4

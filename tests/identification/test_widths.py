@@ -101,7 +101,7 @@ def test_a_narrower_width_that_is_foreseen_is_not_searched_with_tight_gaps(monke
     monkeypatch.setattr(widths, "solve_least_squares", record)
     chosen = choose_widths(posed)[1]
     assert set(searched) == {2}  # a trial's stage, and an empty one
-    monkeypatch.setattr(widths, "_is_foreseen", lambda *_: False)
+    monkeypatch.setattr(widths, "FORESEEN_RATIO", 0.0)
     assert [w.value for w in choose_widths(posed)[1]] == [w.value for w in chosen]
     assert searched.count(1 + CONFIRMING_STAGES) == 2
 
@@ -147,7 +147,7 @@ def test_a_width_is_narrowed_no_further_than_simulation_and_tuning_by_runge_kutt
     steps = 45.0 / (found.value * 5.0) * 1e-3 / 2.785  # of RK4 a sample, by hand
     assert 1 < steps < 20
     assert found.too_stiff
-    start = chosen.transcription(chosen.candidates()[0])
+    start = chosen.transcription(chosen.candidates[0])
     assert not widths.is_too_stiff(start, chosen.method, implicit=False)
 
 
@@ -200,7 +200,7 @@ def test_widths_are_confirmed_at_the_same_gaps(monkeypatch: pytest.MonkeyPatch) 
         return fit
 
     monkeypatch.setattr(widths, "solve_least_squares", record)
-    monkeypatch.setattr(widths, "_is_foreseen", lambda *_: False)
+    monkeypatch.setattr(widths, "FORESEEN_RATIO", 0.0)
     choose_widths(posed)
     assert gaps == [LeastSquares().stages[CONFIRMING_STAGES - 1].gap] * 2
 
@@ -211,15 +211,15 @@ def test_a_width_that_tight_gaps_do_not_confirm_is_not_taken(tight_cost: float, 
     width = Width(WIDTH, 4.0)
     parameters = po.ParameterSet({WIDTH: po.Parameter(1e-3, "m/s", 1e-6, 1.0)})
 
-    def trial(value: float, cost: float) -> widths._Trial:
-        return widths._Trial({WIDTH: value}, cost, np.inf, 1000, parameters, too_stiff=False)
+    def trial(value: float, cost: float) -> widths._WidthTrial:
+        return widths._WidthTrial({WIDTH: value}, cost, np.inf, 1000, parameters, too_stiff=False)
 
     class Race:
-        def run_scaled(self, at: widths._Trial, _: Width, factor: float) -> widths._Trial:
+        def run_scaled(self, at: widths._WidthTrial, _: Width, factor: float) -> widths._WidthTrial:
             value = at.widths[WIDTH] * factor
             return trial(value, 300.0 if value == pytest.approx(2.5e-4) else 1e4)
 
-        def run(self, at: dict[str, float], *, confirms: bool) -> widths._Trial:
+        def run(self, at: dict[str, float], *, confirms: bool) -> widths._WidthTrial:
             assert confirms
             return trial(at[WIDTH], 500.0 if at[WIDTH] == 1e-3 else tight_cost)
 
