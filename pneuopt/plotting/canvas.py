@@ -252,19 +252,15 @@ def _as_element(document: bytes, name: str, alt: str) -> str:
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
         own = element.attrib.pop("id", "")
-        element.attrib = {key.rpartition("}")[2]: _mend_value(key, v, name) for key, v in element.attrib.items()}
-        element.attrib |= {"id": f"{name}-{own}"} if own in used else {}
+        attributes = {key.rpartition("}")[2]: value for key, value in element.attrib.items()}
+        for key, value in attributes.items():
+            if key == "d":  # coordinates to a hundredth of a point, which no printer shows
+                attributes[key] = " ".join(_LONG_NUMBER.sub(lambda found: f"{float(found[0]):.2f}", value).split())
+            elif key in ("style", "href", "clip-path"):
+                attributes[key] = _REFERENCE.sub(rf"\1{name}-\2", value)
+        element.attrib = attributes | ({"id": f"{name}-{own}"} if own in used else {})
     width = float(root.attrib.pop("width").removesuffix("pt"))
     for key in ("height", "version"):
         root.attrib.pop(key, None)
     root.attrib |= {"role": "img", "aria-label": replace_unprintable(alt), "style": f"max-width:{width:.0f}pt"}
     return ET.tostring(root, encoding="unicode")
-
-
-def _mend_value(key: str, value: str, name: str) -> str:
-    """An attribute with its marks renamed, and coordinates to a hundredth of a point, which no printer shows."""
-    if key == "d":
-        return " ".join(_LONG_NUMBER.sub(lambda found: f"{float(found[0]):.2f}", value).split())
-    if key == "style" or key.endswith("href") or key == "clip-path":
-        return _REFERENCE.sub(rf"\1{name}-\2", value)
-    return value

@@ -98,7 +98,11 @@ def _draw_tracking(axes: "Axes", response: Response, band: Band) -> None:
         lw=0,
         label=f"± {describe_band(band, unit)}",
     )
-    axes.plot(*_reference_curve(reference, end), color=ORANGE, lw=1.0, label="reference")
+    t = np.array([0, reference.at, reference.at, end]) if isinstance(reference, Step) else np.linspace(0, end, 500)
+    # a step stands upright
+    upright = np.repeat([reference.initial, reference.final], 2)
+    values = upright if isinstance(reference, Step) else reference.values(t)
+    axes.plot(t, values, color=ORANGE, lw=1.0, label="reference")
     signal, before = run[response.measured], response.before
     if before is not None:
         axes.plot(*_dither_mean(before.t, before[response.measured], response), color=GREY, lw=1.0, label="before")
@@ -110,15 +114,6 @@ def _draw_tracking(axes: "Axes", response: Response, band: Band) -> None:
     axes.set_title(f"{reference.initial:g} to {reference.final:g} {unit}", fontsize=9)
     ends = [reference.initial, reference.final]
     _set_view_limits(axes, signal, ends, ends if before is None else before[response.measured])
-
-
-def _reference_curve(reference: Reference, end: float, points: int = 500) -> tuple[Array, Array]:
-    """Points of a reference up to the end of its record; a step stands upright."""
-    if isinstance(reference, Step):
-        values = [reference.initial, reference.initial, reference.final, reference.final]
-        return np.array([0, reference.at, reference.at, end]), np.array(values)
-    t = np.linspace(0, end, points)
-    return t, reference.values(t)
 
 
 def _draw_signal(axes: "Axes", response: Response, name: str, label: str, factor: float) -> None:

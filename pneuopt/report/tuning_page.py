@@ -228,7 +228,19 @@ def tuning_page(
     if dither:
         verdict += Report(tuple(p for p in dither.parts[:1] if isinstance(p, Line) and p.tone in DOUBTS))
     steps, bode = view.pictures() if view is not None else (None, None)
-    outcome = _design_sections(result, was, steps) if found else _refusal_sections(result, stands, steps)
+    outcome = (
+        Section("What was tried" if stands else "Figures", (report_refusal(result, stands),)),
+        Section("The gains that stand" if stands else "The response", _some(steps)),
+    )
+    if found:
+        beside = ("was", was) if result.on_rig is None else ("on rig", result.on_rig)
+        metrics = report_metrics(result.certified, result.units, beside=beside, limits=result.limits)
+        held = report_active(result.requirements, result.active, result.parameters)
+        notes = report_notes(certificate.notes) if certificate is not None else Report()
+        outcome = (
+            Section("Gains", (report_gains(result.given, result.parameters),)),
+            Section("Before and after", (metrics, held, notes, *_some(steps))),
+        )
     sections = (
         *outcome,
         _form_section(view),
@@ -269,26 +281,6 @@ def simulation_page(
     )
     script = None if view is None else partial(view.script, limits or {}, found.metrics)
     return Page(head.title, verdict, sections, head.warnings, script)
-
-
-def _design_sections(
-    result: TuningResult, was: "pd.DataFrame | None", steps: Picture | None
-) -> tuple[Section, Section]:
-    """Gains before and after; certified metrics beside those before, and what holds them back."""
-    beside = ("was", was) if result.on_rig is None else ("on rig", result.on_rig)
-    metrics = report_metrics(result.certified, result.units, beside=beside, limits=result.limits)
-    held = report_active(result.requirements, result.active, result.parameters)
-    notes = report_notes(result.certificate.notes) if result.certificate is not None else Report()
-    gains = Section("Gains", (report_gains(result.given, result.parameters),))
-    return gains, Section("Before and after", (metrics, held, notes, *_some(steps)))
-
-
-def _refusal_sections(result: TuningResult, stands: str, steps: Picture | None) -> tuple[Section, ...]:
-    """What was tried and refused; below it the response with the gains that stand."""
-    return (
-        Section("What was tried" if stands else "Figures", (report_refusal(result, stands),)),
-        Section("The gains that stand" if stands else "The response", _some(steps)),
-    )
 
 
 def _form_section(view: LoopView | None) -> Section:
@@ -416,7 +408,12 @@ class RestFinder:
         if not unknown:
             return False
         sizes = np.array([self.loop.states[k].nominal for k in unknown])
-        slopes = np.column_stack([self._slope(k, 1e-6 * size) for k, size in zip(unknown, sizes, strict=True)])
+        (rates, error), columns = self._residuals(self.start), []
+        for k, size in zip(unknown, sizes, strict=True):  # differences of the residuals that vanish, a column a state
+            moved, off = self._residuals(self.start + 1e-6 * size * (np.arange(len(self.start)) == k))
+            change = np.append((moved - rates)[self._vanishing], off - error if self._holds else 0.0)
+            columns.append(change / (1e-6 * size) * size)
+        slopes = np.column_stack(columns)
         weights = np.abs(slopes).max(axis=1)
         slopes = slopes[weights > 0] / weights[weights > 0, None]
         singular = np.linalg.svd(slopes, compute_uv=False) if len(slopes) >= len(unknown) else np.zeros(1)
@@ -450,13 +447,6 @@ class RestFinder:
         parts = [rates] if motion.update is None else [rates, motion.update(0, x, u, p).full().ravel() - x]
         place = [q.name for q in loop.outputs].index(loop.feedback.name)
         return np.concatenate(parts), float(y[place]) - self.reference.initial
-
-    def _slope(self, k: int, h: float) -> Array:
-        """Of the residuals that vanish, by a state [their units a nominal size]."""
-        moved = self.start + h * (np.arange(len(self.start)) == k)
-        now, then = (self._residuals(x) for x in (self.start, moved))
-        own = (then[0] - now[0])[self._vanishing]
-        return np.append(own, then[1] - now[1] if self._holds else 0.0) / h * self.loop.states[k].nominal
 
 
 def is_refused(finder: RestFinder, name: str, value: float) -> bool:
@@ -521,8 +511,8 @@ def live_script(
         "labels": [f"{q.name} [{q.unit}]" for q in (loop.feedback, loop.outputs[-1])],
         "controller": list(loop.controller.tunable_sections),
     }
-    rest, page = (resources.files(__package__).joinpath(n).read_text("utf-8") for n in ("live_rest.js", "live.js"))
-    return f"{code}\nconst DATA = {to_script(data)};\n{rest}{page}"
+    live, page = (resources.files(__package__).joinpath(n).read_text("utf-8") for n in ("live_rest.js", "live.js"))
+    return f"{code}\nconst DATA = {to_script(data)};\n{live}{page}"
 
 
 def to_script(value: Any) -> str:
@@ -568,13 +558,20 @@ def _sliders(finders: Sequence[RestFinder]) -> tuple[list[dict[str, Any]], list[
 
 
 def _slider(finders: Sequence[RestFinder], parameters: ParameterSet, name: str) -> dict[str, Any] | None:
-    """Of a parameter that may move; None where its ends cannot run."""
+    """Of a parameter that may move, within its bounds if it is tuned; None where its ends cannot run."""
     loop = finders[0].loop
     sections = (*PLANT_SECTIONS, *loop.controller.tunable_sections)
     if name in NOT_MOVED or name.partition(".")[0] not in sections:
         return None
     p = parameters[name]
-    low, high = (_runnable_end(finders, name, p.value, end) for end in _ends(parameters, name))
+    low, high = sorted((p.value / (ratio := RANGES.get(name, SLIDER_RANGE)), p.value * ratio))
+    if name == "load.force" and "load.mass" in parameters:
+        reach = INCLINE * GRAVITY * parameters.value("load.mass")
+        low, high = p.value - reach, p.value + reach
+    low, high = max(low, p.lower), min(high, p.upper)
+    if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
+        low, high = p.lower, p.upper
+    low, high = (_runnable_end(finders, name, p.value, end) for end in (low, high))
     if not low < high:
         return None
     is_log = low > 0 and high / low > LOG_RANGE
@@ -590,15 +587,3 @@ def _runnable_end(finders: Sequence[RestFinder], name: str, value: float, end: f
             return end
         end = (value + end) / 2
     return value
-
-
-def _ends(parameters: ParameterSet, name: str) -> tuple[float, float]:
-    """From where to where a slider goes: the bounds of what is tuned, else around its value."""
-    p = parameters[name]
-    if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
-        return p.lower, p.upper
-    ends = sorted((p.value / (ratio := RANGES.get(name, SLIDER_RANGE)), p.value * ratio))
-    if name == "load.force" and "load.mass" in parameters:
-        reach = INCLINE * GRAVITY * parameters.value("load.mass")
-        ends = [p.value - reach, p.value + reach]
-    return max(ends[0], p.lower), min(ends[1], p.upper)
