@@ -104,6 +104,13 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     return ExitStatus.SUCCESS
 
 
+def read_range(text: str, unit: str, where: str) -> tuple[float, float]:
+    """Read both ends of "20mm..180mm"."""
+    low, dots, high = text.partition("..")
+    require(bool(dots), f"{where}: give both ends, as in 20mm..180mm")
+    return read_value(low.strip(), unit, where=where), read_value(high.strip(), unit, where=where)
+
+
 def write_files(files: Mapping[Path, str | bytes], force: bool) -> None:
     """Write files, all or none: an old one with another text is refused, unless forced."""
     contents = {path: text.encode() if isinstance(text, str) else text for path, text in files.items()}
@@ -182,7 +189,15 @@ def _show_files(
             if column.channel in unused:
                 text = f"left out, column {column.column!r}: this kind of drive does not use it"
             say(f"{column.channel}: {text}", "  ")
-        _advise_command(guess, unused)
+        # how a voltage that was left out becomes the force or torque that the log lacks
+        found = {column.channel: column.column for column in guess.columns}
+        command, unit = ("force", "N") if "force" not in unused else ("torque", "N*m")
+        if "valve_voltage" in unused and "valve_voltage" in found and command not in found:
+            entry = f'{command} = {{ column = "{found["valve_voltage"]}", unit = "V", scale = "1 {unit}/V" }}'
+            held = f'[intersample] {command} = "held", for a controller holds it over a sample'
+            text = f"no column; where the voltage commands it, [columns] takes {entry} with its scale, and"
+            say(f"{command}: {text}", "  ")
+            say(held, "    ")
         if guess.unused:
             say(f"not read: {', '.join(guess.unused)}", "  ")
         say(f"a row every {write_value(guess.sample_time, 's')}", "  ")
@@ -194,17 +209,6 @@ def _show_files(
     typer.echo(f"  pneuopt identify drive.toml {place} -o fit.toml")
     typer.echo("  pneuopt tune fit.toml tuning.toml -o tuned.toml")
     typer.echo("What a key means: pneuopt keys KEY")
-
-
-def _advise_command(guess: LogGuess, unused: Container[str]) -> None:
-    """How a voltage that was left out becomes the force or torque that the log lacks."""
-    found = {column.channel: column.column for column in guess.columns}
-    command, unit = ("force", "N") if "force" not in unused else ("torque", "N*m")
-    if "valve_voltage" in unused and "valve_voltage" in found and command not in found:
-        entry = f'{command} = {{ column = "{found["valve_voltage"]}", unit = "V", scale = "1 {unit}/V" }}'
-        held = f'[intersample] {command} = "held", for a controller holds it over a sample'
-        say(f"{command}: no column; where the voltage commands it, [columns] takes {entry} with its scale, and", "  ")
-        say(held, "    ")
 
 
 def say(text: str, indent: str = "", width: int = 80) -> None:
@@ -231,9 +235,7 @@ def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, un
     require(sample_time > 0, f"--sample-time {options.sample_time}: give the controller's, such as 1ms")
     between = None
     if options.between:
-        low, dots, high = options.between.partition("..")
-        require(bool(dots), f"--between {options.between}: give both ends, as in 20mm..180mm")
-        between = read_value(low.strip(), "m", where="--between"), read_value(high.strip(), "m", where="--between")
+        between = read_range(options.between, "m", f"--between {options.between}")
         require(between[0] < between[1], f"--between {options.between}: the first end must be below the second")
     run = excitation_run(model.system(), parameters, sample_time=sample_time, between=between, speed=speed)
     write_files({folder / name: text for name, text in run_files(run, drive.name).items()}, force)

@@ -216,18 +216,16 @@ def _notice_lost(unraisable: "sys.UnraisableHookArgs") -> None:
     if _State.number is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
         return
-    _State.is_lost = True
-    threading.Thread(target=_send_again, args=(_State.number,), daemon=True).start()
+    _State.is_lost, number, main = True, _State.number, threading.main_thread().ident
 
+    def send_again() -> None:  # to the main thread, which is out of the destructor by then, or hears it again
+        time.sleep(RETURN)
+        if hasattr(signal, "pthread_kill") and main is not None:
+            signal.pthread_kill(main, number)
+        else:
+            signal.raise_signal(number)
 
-def _send_again(number: int) -> None:
-    """Send the signal to the main thread, which is out of the destructor by then, or hears it again."""
-    time.sleep(RETURN)
-    main = threading.main_thread().ident
-    if hasattr(signal, "pthread_kill") and main is not None:
-        signal.pthread_kill(main, number)
-    else:
-        signal.raise_signal(number)
+    threading.Thread(target=send_again, daemon=True).start()
 
 
 def _watch(heard: socket.socket, _wake: socket.socket) -> None:

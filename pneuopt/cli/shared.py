@@ -92,8 +92,9 @@ def finish(
     interrupted = interruption_status() is not None or (status is not None and status.code is Code.INTERRUPTED)
     written, failures = write_files(writers, beside=interrupted)
     if figures is not None and outputs.plot is not None and not interrupted:
-        drawn, missed = _draw(outputs.plot, figures)
-        written, failures = written + drawn, failures + missed
+        with suppress(KeyboardInterrupt):  # Ctrl-C leaves out those that are not drawn yet
+            drawn, missed = write_files(figure_writers(outputs.plot, figures()))
+            written, failures = written + drawn, failures + missed
     if page is not None and outputs.report is not None:
         writers = {outputs.report: lambda path: write_page(path, page(), draws=not interrupted)}
         paged, missed = write_files(writers, beside=interrupted)
@@ -121,14 +122,6 @@ def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], 
             except InputError as error:
                 failures.append(error)
     return written, failures
-
-
-def _draw(path: Path, figures: Figures) -> tuple[list[Path], list[InputError]]:
-    """Draw and write the figures; Ctrl-C leaves out those that are not drawn yet."""
-    try:
-        return write_files(figure_writers(path, figures()))
-    except KeyboardInterrupt:
-        return [], []
 
 
 def read_fit_and_tuning(path: Path, tuning: Path) -> tuple[StoredFit, Tuning, ParameterSet]:

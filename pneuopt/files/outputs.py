@@ -165,25 +165,23 @@ _HOLDS: Mapping[Any, Holds] = {
 def members_of(kind: type, only: Sequence[str] = (), *, are_optional: bool = False) -> dict[str, Member]:
     """The members that a dataclass or TypedDict declares: `only` these fields and properties, in this order."""
     meanings = argument_meanings(kind)
-    names = only or tuple(kind.__annotations__)
-    return {n: _member_of(kind, n, meanings.get(n, ""), are_optional) for n in names}
-
-
-def _member_of(kind: type, name: str, meaning: str, is_optional: bool) -> Member:
-    own = getattr(kind, name, None)
-    if isinstance(own, property):
-        annotation, meaning = own.fget.__annotations__["return"], first_sentence(own.fget)
-    else:
-        annotation = kind.__annotations__[name]
-    parts = [part for part in get_args(annotation) if part is not NoneType]
-    if NoneType in get_args(annotation):
-        annotation, is_optional = parts[0], True
-    is_word = isinstance(annotation, type) and issubclass(annotation, Enum)
-    if not is_word and annotation not in _HOLDS:
-        raise TypeError(f"{kind.__name__}.{name}: no output holds {annotation}")
-    words = f"one of {', '.join(str(word.value) for word in annotation)}" if is_word else ""
-    text = "; ".join(filter(None, [meaning or name.replace("_", " "), words]))
-    return Member(text, Holds.TEXT if is_word else _HOLDS[annotation], is_optional=is_optional)
+    found = {}
+    for name in only or tuple(kind.__annotations__):
+        own, is_optional, meaning = getattr(kind, name, None), are_optional, meanings.get(name, "")
+        if isinstance(own, property):
+            annotation, meaning = own.fget.__annotations__["return"], first_sentence(own.fget)
+        else:
+            annotation = kind.__annotations__[name]
+        parts = [part for part in get_args(annotation) if part is not NoneType]
+        if NoneType in get_args(annotation):
+            annotation, is_optional = parts[0], True
+        is_word = isinstance(annotation, type) and issubclass(annotation, Enum)
+        if not is_word and annotation not in _HOLDS:
+            raise TypeError(f"{kind.__name__}.{name}: no output holds {annotation}")
+        words = f"one of {', '.join(str(word.value) for word in annotation)}" if is_word else ""
+        text = "; ".join(filter(None, [meaning or name.replace("_", " "), words]))
+        found[name] = Member(text, Holds.TEXT if is_word else _HOLDS[annotation], is_optional=is_optional)
+    return found
 
 
 _STATUS = Member("how it ended", Holds.RECORD, members_of(Status, ("code", "message")))

@@ -22,7 +22,6 @@ from pneuopt.quantities.output import write_bytes
 from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Figure  # noqa: PLC0414 - cli and report name it from here
 
@@ -213,12 +212,19 @@ def to_svg(figure: "Figure", name: str, alt: str) -> str:
     str
     """
     from matplotlib import rc_context
+    from matplotlib.collections import PathCollection
+    from matplotlib.lines import Line2D
     from matplotlib.text import Text
 
     mend_texts(figure)
     texts = [artist for artist in figure.findobj(Text) if isinstance(artist, Text)]
-    for artist in figure.findobj(_is_large_cloud):
-        artist.set_rasterized(True)
+    for artist in figure.findobj(lambda a: isinstance(a, Line2D | PathCollection)):
+        if isinstance(artist, Line2D):
+            size = 0 if artist.get_marker() in ("", " ", "None", "none", None) else np.size(artist.get_xdata())
+        else:
+            size = len(np.asarray(artist.get_offsets()))
+        if size > MAX_VECTOR_MARKERS:
+            artist.set_rasterized(True)
     formulas = any(text.get_parse_math() and text.get_text().count("$") > 1 for text in texts)
     content = io.BytesIO()
     with rc_context({"svg.hashsalt": HASH_SALT, "svg.fonttype": "path" if formulas else "none"}):
@@ -226,16 +232,6 @@ def to_svg(figure: "Figure", name: str, alt: str) -> str:
             content, format="svg", transparent=True, dpi=STYLE.raster_dpi, metadata={"Date": None, "Creator": None}
         )
     return _as_element(content.getvalue(), name, alt)
-
-
-def _is_large_cloud(artist: "Artist") -> bool:
-    from matplotlib.collections import PathCollection
-    from matplotlib.lines import Line2D
-
-    if isinstance(artist, Line2D):
-        has_markers = artist.get_marker() not in ("", " ", "None", "none", None)
-        return has_markers and np.size(artist.get_xdata()) > MAX_VECTOR_MARKERS
-    return isinstance(artist, PathCollection) and len(np.asarray(artist.get_offsets())) > MAX_VECTOR_MARKERS
 
 
 def _as_element(document: bytes, name: str, alt: str) -> str:

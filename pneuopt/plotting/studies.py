@@ -194,31 +194,26 @@ def plot_distribution(table: "pd.DataFrame", metrics: Mapping[str, str]) -> "Fig
     shown = dict(list(metrics.items())[:MAX_PLOT_COLUMNS])
     figure, (row,) = axes_grid(1, len(shown), [3.2], width=min(10.0, 1.5 + 3.6 * len(shown)))
     for panel, (metric, unit) in zip(row, shown.items(), strict=True):
-        _draw_shares(panel, table, metric)
+        figures = table.loc[(table["error"] == "") & table[metric].notna(), metric].to_numpy(dtype=float)
+        values = np.sort(figures[np.isfinite(figures)])
+        at_least = metric in METRICS and larger_is_better(metric)
+        values = values[::-1] if at_least else values
+        shares = np.arange(1, len(values) + 1) / len(table)
+        without = len(table) - len(values)
+        panel.set_title(f"{without} without a figure" if without else "", fontsize=10)
         panel.set_xlabel(axis_label(metric, unit))
         panel.set_ylim(0.0, 1.02)
+        if len(values):
+            panel.step([values[0], *values], [0.0, *shares], where="post", color=BLUE)
+        k = int(np.searchsorted(shares, MARKED_SHARE - 1e-9))
+        if k < len(values):
+            panel.plot([values[k]] * 2, [0.0, shares[k]], color=GREY, linestyle="--")
+            label = f"{100 * MARKED_SHARE:g} % {'at least' if at_least else 'at most'} {values[k]:.4g}"
+            place = (values[k], 0.03)
+            panel.annotate(label, place, xytext=(-3, 0), textcoords="offset points", ha="right", fontsize=8)
     row[0].set_ylabel(f"share of the {len(table)} cases [1]")
     note_omissions(figure, len(shown), len(metrics), "metrics")
     return figure
-
-
-def _draw_shares(panel: "Axes", table: "pd.DataFrame", metric: str) -> None:
-    figures = table.loc[(table["error"] == "") & table[metric].notna(), metric].to_numpy(dtype=float)
-    values = np.sort(figures[np.isfinite(figures)])
-    at_least = metric in METRICS and larger_is_better(metric)
-    values = values[::-1] if at_least else values
-    shares = np.arange(1, len(values) + 1) / len(table)
-    without = len(table) - len(values)
-    panel.set_title(f"{without} without a figure" if without else "", fontsize=10)
-    if not len(values):
-        return
-    panel.step([values[0], *values], [0.0, *shares], where="post", color=BLUE)
-    k = int(np.searchsorted(shares, MARKED_SHARE - 1e-9))
-    if k < len(values):
-        panel.plot([values[k]] * 2, [0.0, shares[k]], color=GREY, linestyle="--")
-        side = "at least" if at_least else "at most"
-        label = f"{100 * MARKED_SHARE:g} % {side} {values[k]:.4g}"
-        panel.annotate(label, (values[k], 0.03), xytext=(-3, 0), textcoords="offset points", ha="right", fontsize=8)
 
 
 def plot_sensitivity(indices: Sensitivity, local: LocalSensitivity | None = None) -> "Figure":

@@ -7,10 +7,11 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import resources
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -268,7 +269,16 @@ def simulation_page(
     count, cases = len(found.findings), len(found.metrics.columns)
     word = f"{count} defect{'s' if count > 1 else ''}" if count else "no defect"
     lead = Line(f"simulated: {word} in {cases} case{'s' if cases > 1 else ''}", Tone.BAD if count else Tone.GOOD)
-    broken = tuple(Line(text, Tone.BAD, 2) for text in _broken_limits(found.metrics, limits or {}))
+    broken = []
+    for name, limit in (n for n in (limits or {}).items() if n[0] in found.metrics.index):  # by the worst case
+        least = larger_is_better(name)
+        nothing = -math.inf if least else math.inf  # a case without a figure keeps no limit
+        row = found.metrics.T[name].astype(float).to_dict()
+        values = {str(case): nothing if math.isnan(v) else v for case, v in row.items()}
+        case = (min if least else max)(values, key=lambda c: values[c])
+        if values[case] < limit if least else values[case] > limit:
+            text = f"{name} {metric_cell(name, row[case])} breaks its limit of {limit:.4g} at {case}"
+            broken.append(Line(text, Tone.BAD, 2))
     verdict = (standing or Report()) + Report((lead, *(Line(f.sentence, indent=2) for f in found.findings), *broken))
     steps, bode = view.pictures() if view is not None else (None, None)
     figures = report_metrics(found.metrics, found.units, title="simulated", limits=limits)
@@ -305,21 +315,6 @@ def _loop_section(view: LoopView | None) -> Section:
     if view is None:
         return Section("The loop", ())
     return Section("The loop", (diagram_picture(view.loop), report_settings(view.loop.controller, view.parameters)))
-
-
-def _broken_limits(metrics: "pd.DataFrame", limits: Mapping[str, float]) -> Iterator[str]:
-    """A sentence a limit that the worst case breaks."""
-    for name, limit in limits.items():
-        if name not in metrics.index:
-            continue
-        least = larger_is_better(name)
-        nothing = -math.inf if least else math.inf  # a case without a figure keeps no limit
-        row = metrics.T[name].astype(float).to_dict()
-        values = {str(case): nothing if math.isnan(v) else v for case, v in row.items()}
-        case = (min if least else max)(values, key=lambda c: values[c])
-        if values[case] < limit if least else values[case] > limit:
-            shown = metric_cell(name, row[case])
-            yield f"{name} {shown} breaks its limit of {limit:.4g} at {case}"
 
 
 def _some(picture: Picture | None) -> tuple[Picture, ...]:
@@ -496,12 +491,15 @@ def live_script(
     units = relevant_units(loop)
     sliders, rests = _sliders(finders)
     places = {q.name: k for k, q in enumerate(loop.inputs)}
+    columns = [] if certified is None else [own.astype(float).to_dict() for _, own in certified.items()]
+    # the metrics that the script reads, too; a settling time of NaN is none
+    shown = [{n: own[n] for n in LIVE_METRICS if not math.isnan(own.get(n, math.nan))} for own in columns]
     data = {
         "values": loop.parameter_vector(parameters).tolist(),
         "sliders": sliders,
         "references": [
             _reference(r, places, loop.feedback.unit)
-            | {"x0": x0, "rest": rest, "band": band_share(band, r), "certified": _figures(certified, k)}
+            | {"x0": x0, "rest": rest, "band": band_share(band, r), "certified": shown[k] if k < len(shown) else {}}
             for (k, r), x0, rest in zip(steps.items(), starts, rests, strict=True)
         ],
         "limits": {n: limit for n, limit in (limits or {}).items() if n in LIVE_METRICS},
@@ -518,14 +516,6 @@ def live_script(
 def to_script(value: Any) -> str:
     """A value as JavaScript that no page can take for markup: ASCII without "<", infinities by their name."""
     return json.dumps(value, ensure_ascii=True).replace("<", "\\u003c")
-
-
-def _figures(certified: "pd.DataFrame | None", column: int) -> dict[str, float]:
-    """The metrics of a reference that the script reads, too; a settling time of NaN is none."""
-    if certified is None or column >= len(certified.columns):
-        return {}
-    own = certified.iloc[:, column].astype(float).to_dict()
-    return {n: own[n] for n in LIVE_METRICS if n in own and not math.isnan(own[n])}
 
 
 def _reference(reference: Step, places: Mapping[str, int], unit: str) -> dict[str, Any]:
@@ -571,19 +561,14 @@ def _slider(finders: Sequence[RestFinder], parameters: ParameterSet, name: str) 
     low, high = max(low, p.lower), min(high, p.upper)
     if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
         low, high = p.lower, p.upper
-    low, high = (_runnable_end(finders, name, p.value, end) for end in (low, high))
+    ends = []
+    for end in (low, high):  # or one nearer to the value, where the loop cannot rest at it
+        nearer = accumulate(range(SHRINKAGES - 1), lambda last, _: (p.value + last) / 2, initial=end)
+        ends.append(next((e for e in nearer if not any(is_refused(f, name, e) for f in finders)), p.value))
+    low, high = ends
     if not low < high:
         return None
     is_log = low > 0 and high / low > LOG_RANGE
     place = list(loop.parameters).index(name)
     scale, unit = PLOT_UNITS.get(p.unit, (1.0, p.unit))  # a pressure in bar, as everywhere on the page
     return {"name": name, "place": place, "scale": scale, "unit": unit, "low": low, "high": high, "isLog": is_log}
-
-
-def _runnable_end(finders: Sequence[RestFinder], name: str, value: float, end: float) -> float:
-    """The end, or one nearer to the value where the loop cannot rest at it."""
-    for _ in range(SHRINKAGES):
-        if not any(is_refused(finder, name, end) for finder in finders):
-            return end
-        end = (value + end) / 2
-    return value
