@@ -92,10 +92,10 @@ def run_identify(
             system, experiments, parameters, method=method, window=window, cpu_seconds=budget, throw=False
         )
     trial, tables = _try_bootstrap(model, experiments, result, draws, quiet)
-    verdict, window = result.verdict, result.window
+    verdict, cut = result.verdict, result.window
     tables |= {"estimates": records(result.estimates), "fit": records(result.fit)}
     tables["verdict"] = {**verdict.to_dict(), "table": records(verdict.table)} if verdict is not None else {}
-    tables |= {"widths": [asdict(width) for width in result.widths], "window": asdict(window) if window else None}
+    tables |= {"widths": [asdict(width) for width in result.widths], "window": asdict(cut) if cut else None}
     kept = "with -o fit.toml: keeps the fit, for pneuopt tune"
     hints = [kept if outputs.output is None else f"pneuopt tune {outputs.output} tuning.toml -o tuned.toml"]
     hints += ["with --report FILE.html: a page to hand on"] if outputs.report is None else []

@@ -11,7 +11,6 @@ from pathlib import Path
 import typer
 
 from pneuopt.cli.run import ExitStatus
-from pneuopt.cli.tolerances import SAMPLE_TIMES
 from pneuopt.evaluation.moves import excitation_run
 from pneuopt.files.drive import read_drive
 from pneuopt.files.first_files import (
@@ -61,7 +60,15 @@ class Asker:
             typer.echo(f"answer one of {', '.join(question.options)}")
 
 
-def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], log: Path | None, force: bool) -> int:
+def run_init(
+    kind: str | None,
+    folder: Path,
+    parts: Mapping[str, str | None],
+    log: Path | None,
+    force: bool,
+    *,
+    sample_times: tuple[float, float] = (1e-4, 0.02),  # a controller's [s]: none wrote a log with another step
+) -> int:
     """Write the files of a kind of drive, by default the one that the log's channels show; returns the exit status."""
     table = None if log is None else parse_log(log, read_bytes(log))
     guessed = None if table is None or kind is not None else _guess_kind(table)
@@ -78,7 +85,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
         guess = guess_log(table, first_channels(name), ask, has_centre=name == _PNEUMATIC)
     unused = unused_channels(name)
     columns = {c.channel: "false" if c.channel in unused else c.entry for c in guess.columns}
-    least, most = SAMPLE_TIMES
+    least, most = sample_times
     sample_time = guess.sample_time if least <= guess.sample_time <= most else SAMPLE_TIME
     files = first_files(
         name,

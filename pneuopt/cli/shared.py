@@ -20,7 +20,6 @@ from rich.table import Column
 from rich.text import Text
 
 from pneuopt.cli.run import ExitStatus, interruption_status, without_interruption
-from pneuopt.cli.tolerances import SECONDS_A_LINE
 from pneuopt.files.drive import StoredFit, read_fit, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -202,6 +201,14 @@ def expand_patterns(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
+@dataclass(frozen=True)
+class ScreenStyle:
+    """How progress is shown."""
+
+    seconds_a_line: float = 5.0  # where there is no terminal: less fills a record, more looks like a hang
+
+
+SCREEN = ScreenStyle()
 _TONE_STYLES = {
     Tone.PLAIN: "",
     Tone.HEADING: "bold",
@@ -237,11 +244,11 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
 
 @contextmanager
 def _print_lines(label: str) -> Iterator[ProgressCallback]:
-    """Print the latest report on standard error every `SECONDS_A_LINE`, by a thread: a step may take longer."""
+    """Print the latest report on standard error every `seconds_a_line`, by a thread: a step may take longer."""
     begun, ended, latest, stream = time.monotonic(), threading.Event(), [""], sys.stderr
 
     def print_latest() -> None:
-        while not ended.wait(SECONDS_A_LINE):
+        while not ended.wait(SCREEN.seconds_a_line):
             news = f": {latest[0]}" if latest[0] else ""
             with suppress(OSError, ValueError):  # whoever read it has closed the pipe; the work goes on
                 print(f"{label}, {time.monotonic() - begun:.0f} s{news}", file=stream, flush=True)
@@ -252,7 +259,7 @@ def _print_lines(label: str) -> Iterator[ProgressCallback]:
         yield lambda text: latest.__setitem__(0, text)
     finally:
         ended.set()
-        thread.join(SECONDS_A_LINE)
+        thread.join(SCREEN.seconds_a_line)
 
 
 def show_report(console: Console, report: Report) -> None:

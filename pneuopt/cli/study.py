@@ -25,7 +25,6 @@ from pneuopt.cli.shared import (
     warn,
     warn_of_status,
 )
-from pneuopt.cli.tolerances import MAX_MAP_AXES
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate, metric_cell, metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
@@ -58,6 +57,7 @@ from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.models.declaration import Drive
 from pneuopt.plotting import plot_distribution, plot_front, plot_map, plot_sensitivity
+from pneuopt.plotting.canvas import STYLE
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import format_table, read_once, records, write_bytes, write_text
 from pneuopt.quantities.parameters import ParameterSet
@@ -181,7 +181,7 @@ def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -
     outputs.check([file, study.drive, study.tuning])
     count = len(study.axes)
     many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
-    require(outputs.plot is None or count <= MAX_MAP_AXES, many)
+    require(outputs.plot is None or count <= STYLE.map_axes, many)
     plain = study.pareto is None or computing == Computing()
     require(plain, f"{file}: a front is one search after another: it takes no option of cases")
     job = _Job(study, *read_fit_and_tuning(study.drive, study.tuning), outputs, quiet)
@@ -250,7 +250,7 @@ def run_cases(job: _Job, computing: Computing) -> int:
         (table, {str(c): column_units(str(c)) for c in table}),
         partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics),
         ("Cases", alt),
-        is_drawn=bool(study.cases) or len(axes) <= MAX_MAP_AXES,
+        is_drawn=bool(study.cases) or len(axes) <= STYLE.map_axes,
         has_design=not study.tune,
     )
     if journal is not None and status != ExitStatus.INTERRUPTED:

@@ -88,13 +88,13 @@ def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
     needed = {option: tuple(k.choices or ()) for option, k in known.items() if k.required}
     bases = [dict(zip(needed, words, strict=True)) for words in product(*needed.values())]
     changes: list[tuple[Option | None, Any]] = [(None, None)]
-    for option, key in known.items():
+    for spot, key in known.items():
         if key.choices is not None and not key.required:
-            changes += [(option, word) for word in key.choices if word != key.usual]
+            changes += [(spot, word) for word in key.choices if word != key.usual]
         elif key.takes in (Takes.FLAG, Takes.FLAG_OR_LIST):
-            changes.append((option, not key.usual))
+            changes.append((spot, not key.usual))
         elif key.takes is Takes.COUNT:
-            changes.append((option, 1))
+            changes.append((spot, 1))
     for option, value in changes:
         own_laws = option is None or option[0] in (section for section, _ in needed)
         for base in bases if own_laws else bases[:1]:

@@ -17,7 +17,7 @@ from pneuopt.files.loop import signal_units_of, tuning_keys
 from pneuopt.files.outputs import output_schema
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
-from pneuopt.files.tolerances import LEAST_DITHER_SAMPLES, SAMPLE_TIME
+from pneuopt.files.tolerances import SAMPLE_TIME
 from pneuopt.files.tuning import TUNED_SECTIONS
 from pneuopt.logs.columns import CHANNELS, plant_channels
 from pneuopt.logs.read_log import SIDECAR_KEYS
@@ -129,7 +129,14 @@ def _drive_template(kind: DriveKind, first: FirstFiles, values: ParameterSet, so
     return Template(title, sections, stated, schema=_schema_path("drive"))
 
 
-def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, counts_from_zero: bool) -> Template:
+def _tuning_template(
+    loop: ClosedLoop,
+    first: FirstFiles,
+    values: ParameterSet,
+    counts_from_zero: bool,
+    *,
+    dither_samples: int = 5,  # least a period: fewer bend its wave; more slow it down for a slow controller
+) -> Template:
     command, measured = loop.command.unit, loop.feedback.unit
     given = loop.parameters.with_values({f"pid.{n}": value for n, (value, _, _) in first.gains.items()})
     given = given.with_bounds({f"pid.{n}": (low, high) for n, (_, low, high) in first.gains.items()})
@@ -140,7 +147,7 @@ def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, 
     stated["pid.limits"] = "[" + ", ".join(_quote(write_value(end, command)) for end in ends) + "]"
     if first.dither is not None:
         frequency, most = first.dither
-        frequency = min(frequency, 1.0 / (LEAST_DITHER_SAMPLES * (loop.pid.sample_time or SAMPLE_TIME)))
+        frequency = min(frequency, 1.0 / (dither_samples * (loop.pid.sample_time or SAMPLE_TIME)))
         stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz"))}
         least = {"amplitude": 0.0, "offset": -most}
         free = {n: Parameter(0.0, command, lower, most) for n, lower in least.items()}

@@ -32,7 +32,7 @@ from pneuopt.evaluation.metric import Band, Requirement, Tolerance
 from pneuopt.evaluation.requirements import REQUIREMENT_KINDS, SettlingTime, StepEnvelope
 from pneuopt.evaluation.scenarios import DISTRIBUTIONS, TOGETHER, Distribution, Sampling, Spread
 from pneuopt.files.drive import ambient_pressure
-from pneuopt.files.tolerances import MAX_CASES, MAX_OPTION, SAMPLE_TIME
+from pneuopt.files.tolerances import MAX_CASES, SAMPLE_TIME
 from pneuopt.files.toml import construct_at, read_parameter
 from pneuopt.quantities.errors import InputError, UnitError, check_names, require
 from pneuopt.quantities.keys import (
@@ -269,12 +269,13 @@ REPLACED_METHODS = {
 }  # in files of older versions
 
 
-def _option_key(usual: Any, meaning: str = "", condition: str = "") -> Key:
+def _option_key(usual: Any, meaning: str = "", condition: str = "", most: int = 1_000_000) -> Key:
+    """The key of an option; more than `most` would fill the memory."""
     if isinstance(usual, tuple):
         return Key(meaning, Takes.LIST, usual=usual, condition=condition, of=_option_key(usual[0]))
     if isinstance(usual, float):
         return Key(meaning, usual=usual, condition=condition)
-    return Key(meaning, Takes.COUNT, usual=usual, condition=condition, least=-MAX_OPTION, most=MAX_OPTION)
+    return Key(meaning, Takes.COUNT, usual=usual, condition=condition, least=-most, most=most)
 
 
 METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {

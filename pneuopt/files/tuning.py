@@ -121,7 +121,8 @@ def read_tuning_table(
     where, limits = f"{path}: [limits]", list[Requirement | NoHunting]()
     check_names("requirement", table.get("limits", {}), LIMIT_KEYS, where)
     for key, entry in table.get("limits", {}).items():
-        spot, kind = f"{where} {key}", REQUIREMENTS_BY_KEY.get(key, NoHunting)
+        spot = f"{where} {key}"
+        kind: Callable[..., Requirement | NoHunting] = REQUIREMENTS_BY_KEY.get(key, NoHunting)
         values = read_entry(LIMIT_KEYS[key], entry, spot, units)
         limits.append(construct_at(partial(kind, **{n: v for n, v in values.items() if v is not None}), spot))
     spec = construct_at(lambda: specify_limits(limits, weights), f"{path}: [minimise] and [limits]")

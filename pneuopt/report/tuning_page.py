@@ -54,16 +54,6 @@ from pneuopt.report.page import (
     report_settings,
     write_page,
 )
-from pneuopt.report.tolerances import (
-    INCLINE,
-    INDEPENDENT,
-    LOG_RANGE,
-    RESIDUAL,
-    SHRINKAGES,
-    SLIDER_RANGE,
-    UNCHANGED_LEAST,
-    UNCHANGED_RATIO,
-)
 from pneuopt.studies.sensitivity import Sensitivity
 from pneuopt.tuning.result import TuningResult, report_active, report_certificate_status, report_gains, report_refusal
 from pneuopt.tuning.validation import report_validation, report_validation_verdict
@@ -380,6 +370,12 @@ class RestFinder:
     loop: ClosedLoop
     reference: Step
     parameters: ParameterSet  # every parameter of the loop, as designed
+    # share of a state's nominal size, a second, that counts as zero: what a rest's own root searches leave is below
+    residual: float = 1e-6
+    # when two rests are one, as a share and in SI: below these a response cannot be told from the other
+    unchanged: tuple[float, float] = (1e-9, 1e-12)
+    # least share of the largest singular value of the residuals' slopes: below it a direction is undetermined
+    independent: float = 1e-9
 
     @cached_property
     def start(self) -> Array:
@@ -395,7 +391,7 @@ class RestFinder:
         moved: set[int] = set()
         for name, value in values:
             found = self.rest(self.parameters.with_values({name: value}))
-            moved |= set(np.flatnonzero(~np.isclose(found, self.start, UNCHANGED_RATIO, UNCHANGED_LEAST)).tolist())
+            moved |= set(np.flatnonzero(~np.isclose(found, self.start, *self.unchanged)).tolist())
         return moved
 
     def is_singular(self, unknown: Sequence[int]) -> bool:
@@ -412,7 +408,7 @@ class RestFinder:
         weights = np.abs(slopes).max(axis=1)
         slopes = slopes[weights > 0] / weights[weights > 0, None]
         singular = np.linalg.svd(slopes, compute_uv=False) if len(slopes) >= len(unknown) else np.zeros(1)
-        return bool(singular[-1] <= INDEPENDENT * singular[0])
+        return bool(singular[-1] <= self.independent * singular[0])
 
     def data(self, unknown: Sequence[int], places: Sequence[int]) -> dict[str, Any]:
         """What the page's `findRest` reads: the residuals and states, and the parameters that move the rest."""
@@ -424,12 +420,12 @@ class RestFinder:
         nominal = np.array([q.nominal for q in self.loop.states])
         found, count = self._residuals(self.start)[0], len(nominal)
         sizes = np.tile(nominal, len(found) // count)
-        return np.flatnonzero(np.abs(found) <= RESIDUAL * sizes).tolist()
+        return np.flatnonzero(np.abs(found) <= self.residual * sizes).tolist()
 
     @cached_property
     def _holds(self) -> bool:
         """Whether the measured signal is the reference there; a controller without an integral leaves an error."""
-        return abs(self._residuals(self.start)[1]) <= RESIDUAL * self.loop.feedback.nominal
+        return abs(self._residuals(self.start)[1]) <= self.residual * self.loop.feedback.nominal
 
     def _residuals(self, x: Array) -> tuple[Array, float]:
         """Rates and what a sample changes, one after the other; the error of the measured signal."""
@@ -460,7 +456,7 @@ PLANT_SECTIONS = ("load", "supply", "friction")
 NOT_MOVED = ("pid.Tt", "pid.lower", "pid.upper", "pid.fault_samples", "pid.fault_output", "friction.smoothing")
 """Parameters without a slider: limits of hardware, what only a fault shows, and what makes a loop too stiff here."""
 RANGES = {"supply.pressure": 1.5}
-"""`SLIDER_RANGE` where hardware varies less: no shop's air has three times its pressure."""
+"""Ratio of a slider's ends to its value where hardware varies less: no shop's air has three times its pressure."""
 
 
 def live_script(
@@ -547,28 +543,37 @@ def _sliders(finders: Sequence[RestFinder]) -> tuple[list[dict[str, Any]], list[
     return list(every.values()), [f.data(states, own) if states else None for f, states, own in found]
 
 
-def _slider(finders: Sequence[RestFinder], parameters: ParameterSet, name: str) -> dict[str, Any] | None:
+def _slider(
+    finders: Sequence[RestFinder],
+    parameters: ParameterSet,
+    name: str,
+    *,
+    ratio: float = 3.0,  # of the ends to the value where no bounds say more: less hides what changes
+    incline: float = 0.5,  # share of its weight that a load's force is moved by: an axis tilted by 30 degrees
+    halvings: int = 4,  # of the way to an end where the loop cannot rest; beyond it is hardly a way
+    log_ratio: float = 20.0,  # of the ends from which it is logarithmic: else most of its way is one value
+) -> dict[str, Any] | None:
     """Of a parameter that may move, within its bounds if it is tuned; None where its ends cannot run."""
     loop = finders[0].loop
     sections = (*PLANT_SECTIONS, *loop.controller.tunable_sections)
     if name in NOT_MOVED or name.partition(".")[0] not in sections:
         return None
     p = parameters[name]
-    low, high = sorted((p.value / (ratio := RANGES.get(name, SLIDER_RANGE)), p.value * ratio))
+    low, high = sorted((p.value / (ratio := RANGES.get(name, ratio)), p.value * ratio))
     if name == "load.force" and "load.mass" in parameters:
-        reach = INCLINE * GRAVITY * parameters.value("load.mass")
+        reach = incline * GRAVITY * parameters.value("load.mass")
         low, high = p.value - reach, p.value + reach
     low, high = max(low, p.lower), min(high, p.upper)
     if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
         low, high = p.lower, p.upper
     ends = []
     for end in (low, high):  # or one nearer to the value, where the loop cannot rest at it
-        nearer = accumulate(range(SHRINKAGES - 1), lambda last, _: (p.value + last) / 2, initial=end)
+        nearer = accumulate(range(halvings - 1), lambda last, _: (p.value + last) / 2, initial=end)
         ends.append(next((e for e in nearer if not any(is_refused(f, name, e) for f in finders)), p.value))
     low, high = ends
     if not low < high:
         return None
-    is_log = low > 0 and high / low > LOG_RANGE
+    is_log = low > 0 and high / low > log_ratio
     place = list(loop.parameters).index(name)
     scale, unit = PLOT_UNITS.get(p.unit, (1.0, p.unit))  # a pressure in bar, as everywhere on the page
     return {"name": name, "place": place, "scale": scale, "unit": unit, "low": low, "high": high, "isLog": is_log}
