@@ -11,7 +11,7 @@ from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import Outputs, file_hashes, finish, make_console, show_output_files, show_report, show_sentence
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_fit
-from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check, finding_line
+from pneuopt.identification.checkup import OTHER_CHECKS, check, finding_line
 from pneuopt.identification.identifiability import mend_findings
 from pneuopt.identification.problem import as_estimation_model, check_logs
 from pneuopt.logs.doctor import CHECKS
@@ -35,7 +35,15 @@ def run_check(
 ) -> int:
     """Check a drive's file and its logs, and mend the logs if there is a folder for it; returns the exit status."""
     outputs.check([drive, *logs, *(log.with_suffix(".toml") for log in logs)], *CHECKS, *OTHER_CHECKS)
-    places = {} if fix is None else _new_places(fix, logs)
+    places: dict[Path, Path] = {}  # where each mended log goes
+    if fix is not None:
+        for log in logs:
+            place = fix / f"{log.stem}.csv"
+            twice = f"{log}: another log has its name, too; mend one after the other, into two folders"
+            require(place not in places.values(), twice)
+            for path in (place, place.with_suffix(".toml")):
+                require(not path.exists(), f"{path}: is there already, and stays as it is; --fix names another folder")
+            places[log] = place
     stored = read_fit(drive)
     system, parameters = stored.drive.system(), stored.parameters
     experiments, errors = _read_all(logs, system, parameters, accept)
@@ -46,23 +54,23 @@ def run_check(
         found = check(system, experiments, parameters)
         found = replace(found, assumptions=(*found.assumptions, *stored.assumed_options))
         show_report(make_console(), found.summary())
-        page = partial(_page, drive, logs, found, errors)
-        finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found), page=page)
+        shown = [f for f in found.findings if f.evidence is not None]
+
+        def figures() -> dict[str, "Figure"]:
+            others = {f.check: plot_finding(f) for f in reversed(shown[1:]) if f.check != shown[0].check}
+            return {"": plot_finding(shown[0]) if shown else plot_logs(found.logs), **others}
+
+        def page() -> Page:
+            pictures = [Picture(partial(plot_finding, f), f"What shows it: {f.message}", f.message) for f in shown]
+            alt = "Every channel that was read, over time."
+            pictures += [Picture(partial(plot_logs, found.logs), alt, "The logs as they were read.")]
+            unread = tuple(f"not read: {text}" for text in errors)
+            head = PageHead(title_of("Check", drive, logs), file_hashes(drive), unread)
+            return summary_page(head, found.summary(), pictures, found.logs)
+
+        finish(outputs, {}, found.to_dict(), None, figures=figures, page=page)
         status = status or (ExitStatus.FAILURE if found.is_refused else ExitStatus.SUCCESS)
     return _fix(places, system, parameters, accept) if places else status
-
-
-def _new_places(folder: Path, logs: Sequence[Path]) -> dict[Path, Path]:
-    """Where each mended log goes; no file that is there already is written over."""
-    places: dict[Path, Path] = {}
-    for log in logs:
-        place = folder / f"{log.stem}.csv"
-        twice = f"{log}: another log has its name, too; mend one after the other, into two folders"
-        require(place not in places.values(), twice)
-        for path in (place, place.with_suffix(".toml")):
-            require(not path.exists(), f"{path}: is there already, and stays as it is; --fix names another folder")
-        places[log] = place
-    return places
 
 
 def _fix(places: Mapping[Path, Path], system: System, parameters: ParameterSet, accept: Sequence[str]) -> int:
@@ -117,22 +125,3 @@ def _read_all(
             message = f"; columns that are not read: {unread}; a sidecar's [columns] says which channel a column is"
             errors.append(f"{error}{message if unread else ''}")
     return found, errors
-
-
-def _page(drive: Path, logs: Sequence[Path], found: Checkup, errors: Sequence[str]) -> Page:
-    """The page of --report: verdict, findings with the rows that show them, and the logs as they were read."""
-    shown = [f for f in found.findings if f.evidence is not None]
-    pictures = [Picture(partial(plot_finding, f), f"What shows it: {f.message}", f.message) for f in shown]
-    alt = "Every channel that was read, over time."
-    pictures += [Picture(partial(plot_logs, found.logs), alt, "The logs as they were read.")]
-    head = PageHead(title_of("Check", drive, logs), file_hashes(drive), tuple(f"not read: {text}" for text in errors))
-    return summary_page(head, found.summary(), pictures, found.logs)
-
-
-def _figures(found: Checkup) -> dict[str, "Figure"]:
-    """The first finding, and each other check's; the logs where nothing is found."""
-    drawn = [f for f in found.findings if f.evidence is not None]
-    if not drawn:
-        return {"": plot_logs(found.logs)}
-    first, *others = drawn
-    return {"": plot_finding(first)} | {f.check: plot_finding(f) for f in reversed(others) if f.check != first.check}

@@ -1,9 +1,8 @@
 """`pneuopt export`: a tuned controller in the form that another machine takes."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -34,7 +33,13 @@ def run_export(
 ) -> int:
     """Export as a `Language`, as a `Block`, which is also shown, or the plant, "fmu"; returns the exit status."""
     languages, blocks = {kind.value: kind for kind in Language}, {kind.value: kind for kind in Block}
-    _check_form(to, [*languages, *blocks, FMU])
+    forms, word = [*languages, *blocks, FMU], to.casefold()
+    if to not in forms:  # what is meant by what it is called elsewhere
+        remedy = f"the controller as structured text, --to st; settings for its own PID block: {', '.join(blocks)}"
+        require(word not in PLC_WORDS, f"export --to: unknown form {to!r}; a PLC runs {remedy}")
+        meant = word if word in forms else MAKERS.get(word, to)
+        require(meant == to, f"export --to: unknown form {to!r}; it is called {meant!r} here")
+    check_names("form", [to], forms, "export --to")
     scaled = Block.ROCKWELL.value
     require(not span or to == scaled, f"--pv-span: of --to {scaled} only, whose gains are for errors in percent of it")
     stored, task, parameters = read_fit_and_tuning(fit, tuned)
@@ -65,37 +70,18 @@ def run_export(
     return ExitStatus.SUCCESS
 
 
-def _check_form(to: str, forms: Sequence[str]) -> None:
-    """Refuse an unknown form, with the one that is meant by what it is called elsewhere."""
-    word = to.casefold()
-    lead = f"export --to: unknown form {to!r}"
-    blocks = ", ".join(kind.value for kind in Block)
-    message = f"a PLC runs the controller as structured text, --to st; settings for its own PID block: {blocks}"
-    require(to in forms or word not in PLC_WORDS, f"{lead}; {message}")
-    meant = word if word in forms else MAKERS.get(word, to)
-    require(to in forms or meant == to, f"{lead}; it is called {meant!r} here")
-    check_names("form", [to], forms, "export --to")
-
-
 def _certificate_lines(fit: StoredFit, tuned: Path, uncertified: bool) -> list[str]:
     """What a file says of its certificate; refused where none holds, unless that is accepted."""
     found = check_certificate(fit, tuned) or NO_CERTIFICATE
     if found.holds:
-        return [f"Certified: {line}" for line in _metric_lines(read_toml(tuned).unwrap().get("certified", {}))]
+        certified, lines = read_toml(tuned).unwrap().get("certified", {}), list[str]()
+        for step, row in certified.items() if isinstance(certified, Mapping) else ():
+            known = row if isinstance(row, Mapping) else {}
+            shown = [f"{n} {known[n]:.4g}" for n in SHOWN_METRICS if isinstance(known.get(n), int | float)]
+            lines += [f"Certified: {step}: {', '.join(shown)}"] if shown else []
+        return lines
     message = "pneuopt certify gives gains a certificate, or says what breaks; --uncertified exports them all the same"
     require(uncertified, f"{tuned}: NOT CERTIFIED: {'; '.join(found.reasons)}. {message}")
     for reason in found.reasons:
         warn(f"{tuned}: {reason}; what is written says NOT CERTIFIED")
     return list(found.lines)
-
-
-def _metric_lines(metrics: Any) -> list[str]:
-    """Of a tuned.toml: its references, and the certified settling time and overshoot of each."""
-    if not isinstance(metrics, Mapping):
-        return []
-    lines = []
-    for step, row in metrics.items():
-        known = row if isinstance(row, Mapping) else {}
-        shown = [f"{n} {known[n]:.4g}" for n in SHOWN_METRICS if isinstance(known.get(n), int | float)]
-        lines += [f"{step}: {', '.join(shown)}"] if shown else []
-    return lines

@@ -83,59 +83,46 @@ def run_identify(
     for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
     warnings.filterwarnings("ignore", message="before the search")  # the check has said it
-    head = _page_head(drive, logs, found.warnings)
+    names = ", ".join(log.name for log in logs[:3]) + (f" and {len(logs) - 3} more" if len(logs) > 3 else "")
+    warned = tuple(f"before the fit: {sentence}" for sentence in found.warnings)
+    head = PageHead(f"Identification of {drive.name} from {names}", file_hashes(drive), warned)
     with _report_refusal(outputs, head, experiments), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
         result = identify(
             system, experiments, parameters, method=method, window=window, cpu_seconds=budget, throw=False
         )
-    tables = _fit_tables(result)
-    report, trial = result.summary(), None
-    if draws and result.status.converged:
-        # a log that the smooth model explains to its noise is of an axis that creeps, and not one that sticks
-        rig = stick_slip_drive(model) if (result.estimates["mark"] == Mark.BIAS_POSSIBLE).any() else model
-        what = "the drive as fitted" if rig == model else "a drive that truly sticks, as the fit misses the logs"
-        with progress("simulating and identifying", quiet=quiet) as report_progress:
-            tried = bootstrap(system, experiments, result, rig=rig, count=draws, progress=report_progress)
-        trial = Report((Line(f"simulated with {what}"),)) + tried.summary()
-        report += trial
-        tables["bootstrap"] = records(tried.table)
+    trial, tables = _try_bootstrap(model, experiments, result, draws, quiet)
+    verdict, cut = result.verdict, result.window
+    tables |= {"estimates": records(result.estimates), "fit": records(result.fit)}
+    tables["verdict"] = {**verdict.to_dict(), "table": records(verdict.table)} if verdict is not None else {}
+    tables |= {"widths": [asdict(width) for width in result.widths], "window": asdict(cut) if cut else None}
+    kept = "with -o fit.toml: keeps the fit, for pneuopt tune"
+    hints = [kept if outputs.output is None else f"pneuopt tune {outputs.output} tuning.toml -o tuned.toml"]
+    hints += ["with --report FILE.html: a page to hand on"] if outputs.report is None else []
     return finish(
         outputs,
         {} if outputs.output is None else {outputs.output: partial(write_fit, source=drive, result=result)},
         tables | stats_and_provenance(result),
         result.status,
         figures=partial(_fit_figures, system, result, experiments, found.findings),
-        report=report,
+        report=result.summary() + (trial or Report()),
         page=lambda: fit_page(head, result, experiments, system, held_out=others, findings=found.findings, trial=trial),
-        hints=_hints(outputs),
+        hints=hints,
     )
 
 
-def _hints(outputs: Outputs) -> list[str]:
-    """What to do with a fit: tune its drive, and show it."""
-    kept = "with -o fit.toml: keeps the fit, for pneuopt tune"
-    hints = [kept if outputs.output is None else f"pneuopt tune {outputs.output} tuning.toml -o tuned.toml"]
-    return hints if outputs.report is not None else [*hints, "with --report FILE.html: a page to hand on"]
-
-
-def _fit_tables(result: IdentificationResult) -> dict[str, Any]:
-    """What a JSON file holds of a fit."""
-    verdict = result.verdict
-    return {
-        "estimates": records(result.estimates),
-        "fit": records(result.fit),
-        "verdict": {**verdict.to_dict(), "table": records(verdict.table)} if verdict is not None else {},
-        "widths": [asdict(width) for width in result.widths],
-        "window": asdict(result.window) if result.window else None,
-    }
-
-
-def _page_head(drive: Path, logs: Sequence[Path], warned: Sequence[str]) -> PageHead:
-    """The title of a fit's page, the drive's hash, and what was said before the fit."""
-    names = ", ".join(log.name for log in logs[:3]) + (f" and {len(logs) - 3} more" if len(logs) > 3 else "")
-    title = f"Identification of {drive.name} from {names}"
-    return PageHead(title, file_hashes(drive), tuple(f"before the fit: {sentence}" for sentence in warned))
+def _try_bootstrap(
+    model: Drive, experiments: Sequence[Experiment], result: IdentificationResult, draws: int, quiet: bool
+) -> tuple[Report | None, dict[str, Any]]:
+    """What fits of simulated logs show, and their table; nothing without draws, or of a fit that did not converge."""
+    if not draws or not result.status.converged:
+        return None, {}
+    # a log that the smooth model explains to its noise is of an axis that creeps, and not one that sticks
+    rig = stick_slip_drive(model) if (result.estimates["mark"] == Mark.BIAS_POSSIBLE).any() else model
+    what = "the drive as fitted" if rig == model else "a drive that truly sticks, as the fit misses the logs"
+    with progress("simulating and identifying", quiet=quiet) as report_progress:
+        tried = bootstrap(model.system(), experiments, result, rig=rig, count=draws, progress=report_progress)
+    return Report((Line(f"simulated with {what}"),)) + tried.summary(), {"bootstrap": records(tried.table)}
 
 
 def run_select(

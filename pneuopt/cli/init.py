@@ -11,7 +11,6 @@ from pathlib import Path
 import typer
 
 from pneuopt.cli.run import ExitStatus
-from pneuopt.cli.tolerances import SAMPLE_TIMES
 from pneuopt.evaluation.moves import excitation_run
 from pneuopt.files.drive import read_drive
 from pneuopt.files.first_files import (
@@ -61,7 +60,15 @@ class Asker:
             typer.echo(f"answer one of {', '.join(question.options)}")
 
 
-def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], log: Path | None, force: bool) -> int:
+def run_init(
+    kind: str | None,
+    folder: Path,
+    parts: Mapping[str, str | None],
+    log: Path | None,
+    force: bool,
+    *,
+    sample_times: tuple[float, float] = (1e-4, 0.02),  # a controller's [s]: none wrote a log with another step
+) -> int:
     """Write the files of a kind of drive, by default the one that the log's channels show; returns the exit status."""
     table = None if log is None else parse_log(log, read_bytes(log))
     guessed = None if table is None or kind is not None else _guess_kind(table)
@@ -78,7 +85,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
         guess = guess_log(table, first_channels(name), ask, has_centre=name == _PNEUMATIC)
     unused = unused_channels(name)
     columns = {c.channel: "false" if c.channel in unused else c.entry for c in guess.columns}
-    least, most = SAMPLE_TIMES
+    least, most = sample_times
     sample_time = guess.sample_time if least <= guess.sample_time <= most else SAMPLE_TIME
     files = first_files(
         name,
@@ -102,6 +109,13 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     written = [n for n in files if folder / n not in kept]
     _show_files(folder, written, guess, unused, ask.assumed, log)
     return ExitStatus.SUCCESS
+
+
+def read_range(text: str, unit: str, where: str) -> tuple[float, float]:
+    """Read both ends of "20mm..180mm"."""
+    low, dots, high = text.partition("..")
+    require(bool(dots), f"{where}: give both ends, as in 20mm..180mm")
+    return read_value(low.strip(), unit, where=where), read_value(high.strip(), unit, where=where)
 
 
 def write_files(files: Mapping[Path, str | bytes], force: bool) -> None:
@@ -182,7 +196,15 @@ def _show_files(
             if column.channel in unused:
                 text = f"left out, column {column.column!r}: this kind of drive does not use it"
             say(f"{column.channel}: {text}", "  ")
-        _advise_command(guess, unused)
+        # how a voltage that was left out becomes the force or torque that the log lacks
+        found = {column.channel: column.column for column in guess.columns}
+        command, unit = ("force", "N") if "force" not in unused else ("torque", "N*m")
+        if "valve_voltage" in unused and "valve_voltage" in found and command not in found:
+            entry = f'{command} = {{ column = "{found["valve_voltage"]}", unit = "V", scale = "1 {unit}/V" }}'
+            held = f'[intersample] {command} = "held", for a controller holds it over a sample'
+            text = f"no column; where the voltage commands it, [columns] takes {entry} with its scale, and"
+            say(f"{command}: {text}", "  ")
+            say(held, "    ")
         if guess.unused:
             say(f"not read: {', '.join(guess.unused)}", "  ")
         say(f"a row every {write_value(guess.sample_time, 's')}", "  ")
@@ -194,17 +216,6 @@ def _show_files(
     typer.echo(f"  pneuopt identify drive.toml {place} -o fit.toml")
     typer.echo("  pneuopt tune fit.toml tuning.toml -o tuned.toml")
     typer.echo("What a key means: pneuopt keys KEY")
-
-
-def _advise_command(guess: LogGuess, unused: Container[str]) -> None:
-    """How a voltage that was left out becomes the force or torque that the log lacks."""
-    found = {column.channel: column.column for column in guess.columns}
-    command, unit = ("force", "N") if "force" not in unused else ("torque", "N*m")
-    if "valve_voltage" in unused and "valve_voltage" in found and command not in found:
-        entry = f'{command} = {{ column = "{found["valve_voltage"]}", unit = "V", scale = "1 {unit}/V" }}'
-        held = f'[intersample] {command} = "held", for a controller holds it over a sample'
-        say(f"{command}: no column; where the voltage commands it, [columns] takes {entry} with its scale, and", "  ")
-        say(held, "    ")
 
 
 def say(text: str, indent: str = "", width: int = 80) -> None:
@@ -231,9 +242,7 @@ def run_init_run(drive: Path, folder: Path, options: RunOptions, force: bool, un
     require(sample_time > 0, f"--sample-time {options.sample_time}: give the controller's, such as 1ms")
     between = None
     if options.between:
-        low, dots, high = options.between.partition("..")
-        require(bool(dots), f"--between {options.between}: give both ends, as in 20mm..180mm")
-        between = read_value(low.strip(), "m", where="--between"), read_value(high.strip(), "m", where="--between")
+        between = read_range(options.between, "m", f"--between {options.between}")
         require(between[0] < between[1], f"--between {options.between}: the first end must be below the second")
     run = excitation_run(model.system(), parameters, sample_time=sample_time, between=between, speed=speed)
     write_files({folder / name: text for name, text in run_files(run, drive.name).items()}, force)

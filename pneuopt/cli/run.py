@@ -2,9 +2,9 @@
 
 It imports nothing but the standard library, so that it listens from the first moment on. By Ctrl-C, SIGTERM or the
 closing of the terminal a command ends soon, with the best so far, and its files whole: the first signal raises
-KeyboardInterrupt, after which a command only writes what it has. A second one within `PATIENCE` changes nothing, for
-many press twice; a later one ends the process at once. Where the main thread is in foreign code that hears no signal,
-another thread ends the process after `PATIENCE`.
+KeyboardInterrupt, after which a command only writes what it has. A second one within `_State.patience` changes
+nothing, for many press twice; a later one ends the process at once. Where the main thread is in foreign code that
+hears no signal, another thread ends the process after that time.
 """
 
 import errno
@@ -24,8 +24,6 @@ from enum import IntEnum
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
-
-from pneuopt.cli.tolerances import PATIENCE, RETURN
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -145,6 +143,8 @@ def _say(sentence: str) -> None:
 class _State:
     """What a process knows of its interruption: the signal, when it came, and whether it has to wait for a file."""
 
+    # time that a command may take to end [s]: more looks like a hang; less throws away what it was about to write
+    patience = 1.7
     number: int | None = None
     since: float = 0.0
     is_lost = False
@@ -199,7 +199,7 @@ def _interrupt(number: int, _frame: FrameType | None) -> None:
     if _State.is_over:
         os._exit(128 + number)
     if _State.number is not None and not _State.is_lost:
-        if time.monotonic() - _State.since > PATIENCE:
+        if time.monotonic() - _State.since > _State.patience:
             end_at_once(128 + number)
         return
     if not _State.is_lost:
@@ -216,24 +216,22 @@ def _notice_lost(unraisable: "sys.UnraisableHookArgs") -> None:
     if _State.number is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
         return
-    _State.is_lost = True
-    threading.Thread(target=_send_again, args=(_State.number,), daemon=True).start()
+    _State.is_lost, number, main = True, _State.number, threading.main_thread().ident
 
+    def send_again(after: float = 0.02) -> None:  # [s]: less may meet the same destructor; more delays the end
+        time.sleep(after)
+        if hasattr(signal, "pthread_kill") and main is not None:
+            signal.pthread_kill(main, number)
+        else:
+            signal.raise_signal(number)
 
-def _send_again(number: int) -> None:
-    """Send the signal to the main thread, which is out of the destructor by then, or hears it again."""
-    time.sleep(RETURN)
-    main = threading.main_thread().ident
-    if hasattr(signal, "pthread_kill") and main is not None:
-        signal.pthread_kill(main, number)
-    else:
-        signal.raise_signal(number)
+    threading.Thread(target=send_again, daemon=True).start()
 
 
 def _watch(heard: socket.socket, _wake: socket.socket) -> None:
     """Wait for a signal; end the process if its main thread has not heard it in time."""
     while (received := heard.recv(1)) and not sys.is_finalizing():
-        time.sleep(PATIENCE)
+        time.sleep(_State.patience)
         ends = {number for number in signal.Signals if signal.getsignal(number) is _interrupt}
         if _State.number is None and received[0] in ends:
             end_at_once(128 + received[0])

@@ -20,7 +20,6 @@ from rich.table import Column
 from rich.text import Text
 
 from pneuopt.cli.run import ExitStatus, interruption_status, without_interruption
-from pneuopt.cli.tolerances import SECONDS_A_LINE
 from pneuopt.files.drive import StoredFit, read_fit, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -92,8 +91,9 @@ def finish(
     interrupted = interruption_status() is not None or (status is not None and status.code is Code.INTERRUPTED)
     written, failures = write_files(writers, beside=interrupted)
     if figures is not None and outputs.plot is not None and not interrupted:
-        drawn, missed = _draw(outputs.plot, figures)
-        written, failures = written + drawn, failures + missed
+        with suppress(KeyboardInterrupt):  # Ctrl-C leaves out those that are not drawn yet
+            drawn, missed = write_files(figure_writers(outputs.plot, figures()))
+            written, failures = written + drawn, failures + missed
     if page is not None and outputs.report is not None:
         writers = {outputs.report: lambda path: write_page(path, page(), draws=not interrupted)}
         paged, missed = write_files(writers, beside=interrupted)
@@ -121,14 +121,6 @@ def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], 
             except InputError as error:
                 failures.append(error)
     return written, failures
-
-
-def _draw(path: Path, figures: Figures) -> tuple[list[Path], list[InputError]]:
-    """Draw and write the figures; Ctrl-C leaves out those that are not drawn yet."""
-    try:
-        return write_files(figure_writers(path, figures()))
-    except KeyboardInterrupt:
-        return [], []
 
 
 def read_fit_and_tuning(path: Path, tuning: Path) -> tuple[StoredFit, Tuning, ParameterSet]:
@@ -209,6 +201,14 @@ def expand_patterns(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
+@dataclass(frozen=True)
+class ScreenStyle:
+    """How progress is shown."""
+
+    seconds_a_line: float = 5.0  # where there is no terminal: less fills a record, more looks like a hang
+
+
+SCREEN = ScreenStyle()
 _TONE_STYLES = {
     Tone.PLAIN: "",
     Tone.HEADING: "bold",
@@ -244,11 +244,11 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
 
 @contextmanager
 def _print_lines(label: str) -> Iterator[ProgressCallback]:
-    """Print the latest report on standard error every `SECONDS_A_LINE`, by a thread: a step may take longer."""
+    """Print the latest report on standard error every `seconds_a_line`, by a thread: a step may take longer."""
     begun, ended, latest, stream = time.monotonic(), threading.Event(), [""], sys.stderr
 
     def print_latest() -> None:
-        while not ended.wait(SECONDS_A_LINE):
+        while not ended.wait(SCREEN.seconds_a_line):
             news = f": {latest[0]}" if latest[0] else ""
             with suppress(OSError, ValueError):  # whoever read it has closed the pipe; the work goes on
                 print(f"{label}, {time.monotonic() - begun:.0f} s{news}", file=stream, flush=True)
@@ -259,7 +259,7 @@ def _print_lines(label: str) -> Iterator[ProgressCallback]:
         yield lambda text: latest.__setitem__(0, text)
     finally:
         ended.set()
-        thread.join(SECONDS_A_LINE)
+        thread.join(SCREEN.seconds_a_line)
 
 
 def show_report(console: Console, report: Report) -> None:

@@ -16,11 +16,11 @@ from pneuopt.cli.shared import (
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.evaluate import evaluate, metric_limits, relevant_units, report_metrics
 from pneuopt.files.drive import StoredFit
-from pneuopt.files.tuned import CertificateCheck, check_certificate
+from pneuopt.files.tuned import check_certificate
 from pneuopt.files.tuning import Tuning
 from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.report import Report
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Page, simulate_responses
@@ -32,7 +32,7 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     outputs.check([fit, tuning], "bode")
     stored, task, parameters = read_fit_and_tuning(fit, tuning)
     found = check_certificate(stored, tuning)
-    standing = Report() if found is None else _report_standing(found, tuning)
+    standing = Report() if found is None else found.report(tuning)
     scenarios = task.scenarios(parameters)
     metrics = evaluate(
         task.loop,
@@ -62,15 +62,6 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     report = standing + report_metrics(metrics, relevant_units(task.loop), title="simulated", limits=limits)
     page = partial(_simulation_page, stored, tuning, task, view, parameters, standing)
     return finish(outputs, writers, tables, None, figures=view.figures, report=report, page=page)
-
-
-def _report_standing(found: CertificateCheck, tuning: Path) -> Report:
-    """Whether the certificate in a tuned.toml holds for the gains and the plant that are simulated."""
-    if found.holds:
-        return Report(
-            (Line(f"certified: the certificate in {tuning} holds for these gains and this plant", Tone.GOOD),)
-        )
-    return Report(tuple(Line(line, Tone.BAD) for line in found.lines))
 
 
 def loop_view(task: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> LoopView:

@@ -25,7 +25,6 @@ from pneuopt.cli.shared import (
     warn,
     warn_of_status,
 )
-from pneuopt.cli.tolerances import MAX_MAP_AXES
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate, metric_cell, metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
@@ -58,6 +57,7 @@ from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.models.declaration import Drive
 from pneuopt.plotting import plot_distribution, plot_front, plot_map, plot_sensitivity
+from pneuopt.plotting.canvas import STYLE
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import format_table, read_once, records, write_bytes, write_text
 from pneuopt.quantities.parameters import ParameterSet
@@ -181,7 +181,7 @@ def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -
     outputs.check([file, study.drive, study.tuning])
     count = len(study.axes)
     many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
-    require(outputs.plot is None or count <= MAX_MAP_AXES, many)
+    require(outputs.plot is None or count <= STYLE.map_axes, many)
     plain = study.pareto is None or computing == Computing()
     require(plain, f"{file}: a front is one search after another: it takes no option of cases")
     job = _Job(study, *read_fit_and_tuning(study.drive, study.tuning), outputs, quiet)
@@ -224,12 +224,14 @@ def run_cases(job: _Job, computing: Computing) -> int:
         job = replace(job, parameters=parameters)
     check_names("metric", study.show, units, f"{study.path}: [metrics] show")
     column_units = partial(_column_unit, {axis.name: parameters[axis.name].unit for axis in axes}, task.loop)
-    heads = partial(_cell_heading, column_units)
+
+    def heads(column: str) -> str:  # a gain that was found has its own name in the table
+        name = column.removeprefix(f"{FOUND} ")
+        return heading(name, column_units(name))
+
     with keep_cases(study, job.outputs, len(cases), computing.resume, heads) as journal, computing.open() as executor:
         table, checks = _compute_cases(job, (cases, axes), journal, executor)
-    verdict, status = _grid_verdict(table, len(task.references))
-    if checks is not None:
-        verdict, status = _batch_verdict(checks, verdict, status)
+    verdict, status = _grid_verdict(table, len(task.references), checks)
     seen = _worst_of_references(table, axes, study.show, parameters)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
     breaks = table["case"][table["breaks"]] if study.tune else ()
@@ -248,7 +250,7 @@ def run_cases(job: _Job, computing: Computing) -> int:
         (table, {str(c): column_units(str(c)) for c in table}),
         partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics),
         ("Cases", alt),
-        is_drawn=bool(study.cases) or len(axes) <= MAX_MAP_AXES,
+        is_drawn=bool(study.cases) or len(axes) <= STYLE.map_axes,
         has_design=not study.tune,
     )
     if journal is not None and status != ExitStatus.INTERRUPTED:
@@ -352,8 +354,11 @@ def tune_cell(sources: Mapping[str, bytes], drive: Drive, tuning: Path, paramete
     return metrics | {OBJECTIVE: certified_objective(task.specification, result)} | found
 
 
-def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
-    """How many cases are certified, fail, never settle or break with their neighbours, and the exit status."""
+def _grid_verdict(table: "pd.DataFrame", references: int, checks: "pd.DataFrame | None") -> tuple[str, int]:
+    """How many cases fail, never settle or break with their neighbours, and the exit status.
+
+    Of a batch also how many of its cases are certified; where lanes are refuted, that is a failure.
+    """
     settling = table[[c for c in table if _metric_name(c) == "SettlingTime"]]
     good = table["error"] == ""
     parts, status = _count_failures(
@@ -363,11 +368,9 @@ def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
         break_with_their_neighbours=int((good & table["breaks"]).sum()) if "breaks" in table else 0,
     )
     each = f", each the worst of {references} references" if references > 1 else ""
-    return f"{len(table)} cases{each}: {', '.join(parts) or 'all settle'}", status
-
-
-def _batch_verdict(checks: "pd.DataFrame", verdict: str, status: int) -> tuple[str, int]:
-    """The verdict on a grid with how many of its cases are certified; where lanes are refuted, that is a failure."""
+    verdict = f"{len(table)} cases{each}: {', '.join(parts) or 'all settle'}"
+    if checks is None:
+        return verdict, status
     differ, certified = checks["case"][~checks["agrees"]].nunique(), checks["case"].nunique()
     lanes = (
         f"{differ} of {certified} certified differ from the lanes" if differ else f"{certified} certified, all agree"
@@ -399,12 +402,6 @@ def _column_unit(axes: Mapping[str, str], loop: ClosedLoop, column: str) -> str:
     own = (loop.command.unit, loop.feedback.unit)
     known = {**axes, **{n: metric.shown_unit(*own) for n, metric in METRICS.items()}, "seconds": "s"}
     return known.get(_metric_name(column), "")
-
-
-def _cell_heading(unit: Callable[[str], str], column: str) -> str:
-    """A column of the rows that are written as they come; a gain that was found has its own name in the table."""
-    name = column.removeprefix(f"{FOUND} ")
-    return heading(name, unit(name))
 
 
 def run_sensitivity(job: _Job, computing: Computing) -> int:
@@ -499,7 +496,14 @@ def _front_requirements(
     """The two requirements, the second one bounded where the front begins, and its bound where the front ends."""
     where = f"{study.path}: [pareto]"
     given = {metric_name(q): q for q in (*task.specification.weights, *task.specification.limits)}
-    first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
+    pair = list[Requirement]()
+    for key in front_spec.between:  # the tuning's requirement, with its bound; else one without a bound
+        kind: Any = REQUIREMENTS_BY_KEY[key]
+        message = f"{where} between: the tuning has no bounds for step_envelope; add them under [limits]"
+        require(kind is not StepEnvelope or kind.__name__ in given, message)
+        plain = partial(kind, task.specification.band) if kind is SettlingTime else kind
+        pair.append(given[kind.__name__] if kind.__name__ in given else plain())
+    first, second = pair
     ends = {"lower": front_spec.lower, "upper": front_spec.upper}
     begin, end = ("lower", "upper") if second.metric.sense is Sense.AT_LEAST else ("upper", "lower")
     start, until = ends[begin], ends[end]
@@ -511,16 +515,6 @@ def _front_requirements(
         message = f"{where} {end}, {ends_at}, is not {side} the {begins_at} that {study.tuning} allows under [limits]"
         require(upper_limit(tightest) < upper_limit(loosest), message)
     return first, loosest, until
-
-
-def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, where: str) -> Requirement:
-    """The requirement of the tuning, with its bound; else one without a bound."""
-    kind: Any = REQUIREMENTS_BY_KEY[key]
-    if kind.__name__ in given:
-        return given[kind.__name__]
-    require(kind is not StepEnvelope, f"{where}: the tuning has no bounds for step_envelope; add them under [limits]")
-    plain: Requirement = SettlingTime(task.specification.band) if kind is SettlingTime else kind()
-    return plain
 
 
 def _count_failures(errors: "pd.Series", word: str, **others: int) -> tuple[list[str], int]:
@@ -584,7 +578,10 @@ def report_front(
         if row["error"]:
             word = INTERRUPTED_CASE if row["error"] == INTERRUPTED_CASE else "failed"
             figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {format_number(row['limit'], 4)}"]
-        rows.append((*figures, *(_format_gain(row[n]) for n in shown)))
+        for gain in (row[n] for n in shown):  # four digits, as gains are rounded, no exponent where it is longer: 68130
+            text = format_number(gain, 4)
+            figures.append(f"{float(text):.0f}" if 1e4 <= abs(gain) < 1e7 else text)
+        rows.append(tuple(figures))
     names = {n: re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", n) for n in (*requirements, *shown)}  # narrow lines
     units = {**requirements, **shown}
     heads = [name if units[n] in ("", "1") else f"{name}\n[{units[n]}]" for n, name in names.items()]
@@ -606,8 +603,3 @@ def table_writer(path: Path, table: "pd.DataFrame", units: Mapping[str, str]) ->
 def heading(name: str, unit: str) -> str:
     """A column's name with its unit, "SettlingTime [s]"."""
     return f"{name} [{unit}]" if unit else name
-
-
-def _format_gain(value: float) -> str:
-    """Four digits, as gains are rounded, and no exponent where it is the longer one: 68130."""
-    return f"{float(format_number(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else format_number(value, 4)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pneuopt.cli.identify import read_experiments, read_free_drive
+from pneuopt.cli.init import read_range
 from pneuopt.cli.run import ExitStatus
 from pneuopt.cli.shared import (
     Outputs,
@@ -22,7 +23,7 @@ from pneuopt.cli.shared import (
 )
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
-from pneuopt.experiments.design import AOptimal, DOptimal, ExperimentDesign
+from pneuopt.experiments.design import AOptimal, DOptimal
 from pneuopt.experiments.next_experiment import DesignOutlook, next_experiment, predict_loss
 from pneuopt.files.drive import read_fit
 from pneuopt.files.tuning import read_tuning
@@ -30,13 +31,10 @@ from pneuopt.identification.identify import identify
 from pneuopt.identification.logged_loop import REFERENCE_CHANNELS
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.tracking import track
-from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import find_date
 from pneuopt.plotting import plot_experiment, plot_tracking
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import format_table, records, write_text
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import ProgressCallback
 from pneuopt.quantities.units import read_value
 from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Picture
@@ -73,7 +71,12 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     task = read_tuning(options.tuned, system, parameters) if options.tuned else None
     warnings.filterwarnings("ignore", message="before the search")  # each log would say it again
     with progress("identifying", quiet=quiet) as report:
-        fits = [_identify_alone(system, log, parameters, report) for log in experiments]
+        method, fits = LeastSquares(progress=report), list[IdentificationResult]()
+        for log in experiments:
+            own = parameters.fixed(*(n for n in log.conditions if n in parameters))
+            fits.append(identify(system, [log], own, method=method, throw=False))
+            if not fits[-1].status.converged:  # it has no interval
+                warn(f"{log.name}: {fits[-1].status.verdict}; it does not count")
     found = track(fits, dates, parameters=options.parameters, drift=options.drift, horizon=options.horizon)
     outlook: DesignOutlook | None = None
     if task is not None:
@@ -92,17 +95,6 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     page = partial(summary_page, head, shown, [tracking_picture(found)], experiments)
     finish(outputs, writers, tables, None, figures=lambda: {"": plot_tracking(found)}, report=shown, page=page)
     return ExitStatus.FAILURE if found.drifting or (outlook is not None and outlook.fails is not None) else 0
-
-
-def _identify_alone(
-    system: System, log: Experiment, parameters: ParameterSet, report: ProgressCallback
-) -> IdentificationResult:
-    """The fit of one log; one that does not converge has no interval, and does not count."""
-    own = parameters.fixed(*(n for n in log.conditions if n in parameters))
-    fit = identify(system, [log], own, method=LeastSquares(progress=report), throw=False)
-    if not fit.status.converged:
-        warn(f"{log.name}: {fit.status.verdict}; it does not count")
-    return fit
 
 
 _ALT = "What is played, the signals with limits as predicted, and each parameter's interval now and afterwards."
@@ -139,18 +131,20 @@ def run_next_experiment(
         system = task.loop
         parameters = parameters | task.parameters.fixed(*task.parameters.free_names)
     warn_of_status(stored)
-    units = _signal_units(plant, system if isinstance(system, ClosedLoop) else None)
-    stated = _read_pairs("--noise", options.noise, units)
+    seen = [system.feedback] if isinstance(system, ClosedLoop) else []
+    units = {q.name: q.unit for q in (*plant.inputs, *plant.states, *plant.outputs)}
+    units |= {REFERENCE_CHANNELS.get(q.name, f"{q.name}_reference"): q.unit for q in seen}
+    limits = _split("--limit", options.limits, units, "position=20mm..180mm")
     with progress("planning", quiet=quiet) as report_progress:
         design = next_experiment(
             system,
             parameters,
             duration=read_value(options.duration, "s", where="--duration"),
             sample_time=read_value(options.sample_time, "s", where="--sample-time") if options.sample_time else None,
-            limits=_read_limits(options.limits, units),
+            limits={n: read_range(text, units[n], f"--limit {n}={text}") for n, text in limits},
             criterion=(AOptimal if options.mean else DOptimal)(*options.targets),
             covariance=stored.covariance,
-            noise=stated or stored.noise,
+            noise=_read_pairs("--noise", options.noise, units) or stored.noise,
             start=_read_pairs("--start", options.start, units),
             runs=options.runs,
             cpu_seconds=options.budget,
@@ -159,38 +153,12 @@ def run_next_experiment(
     tables = {"design": records(design.table), "provenance": file_hashes(*files), "stats": dict(design.stats)}
     draw, head = partial(plot_experiment, design), PageHead(title_of("Next experiment", fit, ()), file_hashes(*files))
     page = partial(summary_page, head, design.summary(), (Picture(draw, _ALT, _ALT),))
-    writers = _writers(design, outputs.output)
+    places = [] if outputs.output is None else number_paths(outputs.output, len(design.runs))
+    columns = {design.channel: (design.channel, design.units[design.channel])}  # as `ExperimentDesign.write_csv`
+    writers: Writers = {
+        p: partial(write_csv, run=r, columns=columns) for p, r in zip(places, design.runs, strict=False)
+    }
     return finish(outputs, writers, tables, None, figures=lambda: {"": draw()}, report=design.summary(), page=page)
-
-
-def _writers(design: ExperimentDesign, output: Path | None) -> Writers:
-    """A file a run, as `ExperimentDesign.write_csv` names them."""
-    if output is None:
-        return {}
-    places = number_paths(output, len(design.runs))
-    columns = {design.channel: (design.channel, design.units[design.channel])}
-    return {place: partial(write_csv, run=run, columns=columns) for place, run in zip(places, design.runs, strict=True)}
-
-
-def _signal_units(plant: System, loop: ClosedLoop | None) -> dict[str, str]:
-    """The unit of each signal that a limit may name."""
-    units = {q.name: q.unit for q in (*plant.inputs, *plant.states, *plant.outputs)}
-    if loop is not None:
-        seen = loop.feedback
-        units[REFERENCE_CHANNELS.get(seen.name, f"{seen.name}_reference")] = seen.unit
-    return units
-
-
-def _read_limits(given: Sequence[str], units: dict[str, str]) -> dict[str, tuple[float, float]]:
-    """Limits from "position=20 mm..180 mm"."""
-    out = {}
-    for name, text in _split("--limit", given, units, "position=20mm..180mm"):
-        low, dots, high = text.partition("..")
-        require(bool(dots), f"--limit {name}={text}: give both ends, as in position=20mm..180mm")
-        low, high = (end.strip() for end in (low, high))
-        unit, where = units[name], f"--limit {name}"
-        out[name] = (read_value(low, unit, where=where), read_value(high, unit, where=where))
-    return out
 
 
 def _read_pairs(option: str, given: Sequence[str], units: dict[str, str]) -> dict[str, float]:

@@ -61,7 +61,10 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
             task.loop, task.references, parameters, method=task.method, progress=report_progress, **job.proof_options()
         )
     saved = job.save(result)  # before the search without dither, which takes as long
-    was = _initial_metrics(task, parameters) if result.status.converged and result.on_rig is None else None
+    was = None
+    if result.status.converged and result.on_rig is None and interruption_status() is None:
+        with suppress(ConvergenceError, InputError, KeyboardInterrupt):  # the loop as given may not be simulated
+            was = job.evaluate()
     console = make_console()
     show_report(console, report_tuning(result, was=was, source=f"the gains of {tuning}"))
     dither, compared = Report(), dict[str, Any]()
@@ -121,6 +124,19 @@ class _Job:
             "throw": False,
         }
 
+    def evaluate(self) -> "pd.DataFrame":
+        """The metrics with the gains as given."""
+        task, parameters = self.task, self.parameters
+        return evaluate(
+            task.loop,
+            task.references,
+            parameters,
+            scenarios=task.scenarios(parameters),
+            band=task.specification.band,
+            envelope=task.specification.envelope,
+            max_steps=task.max_steps,
+        )
+
     def place(self, result: TuningResult) -> Path | None:
         """Where a certified design is written; the best candidate beside it, which is no input; else nowhere."""
         place = self.outputs.output
@@ -159,11 +175,18 @@ class _Job:
         elif self.task.loop.pid.sample_time is not None:
             hints = [f"pneuopt export {self.fit} {output} --to st    (for a PLC; or --help)", *hints]
         result = self._with_files(result)
-        tables = _tables(result) | dict(compared or {}) | stats_and_provenance(result)
+        gains = result.parameters.select(result.parameters.free_names).to_frame()
+        tables = {"gains": gains, "claimed": result.claimed.T, "certified": result.certified.T}
+        tables |= {"requirements": result.requirements, "relaxations": result.relaxations}
+        document: dict[str, Any] = {name: records(table) for name, table in tables.items()} | {"active": result.active}
+        document |= {"best": dict(result.best)} if result.best else {}
+        if result.status.converged:  # also the certificate's notes and the plants that the design was tried on
+            document |= {} if result.certificate is None else {"notes": list(result.certificate.notes)}
+            document |= {} if result.validation is None else {"validation": records(result.validation.figures)}
         status = finish(
             self.outputs,
             {},
-            tables,
+            document | dict(compared or {}) | stats_and_provenance(result),
             result.status,
             figures=self.view(result).figures,
             page=page,
@@ -256,34 +279,3 @@ def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet
         refused = rival.status.sentences[0]
     show_sentence(console, f"no gains were certified without dither: {refused}")
     return None
-
-
-def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
-    """The metrics with the gains as given; None where that loop cannot be simulated, or no time is left for it."""
-    if interruption_status() is not None:
-        return None
-    try:
-        return evaluate(
-            task.loop,
-            task.references,
-            parameters,
-            scenarios=task.scenarios(parameters),
-            band=task.specification.band,
-            envelope=task.specification.envelope,
-            max_steps=task.max_steps,
-        )
-    except (ConvergenceError, InputError, KeyboardInterrupt):
-        return None
-
-
-def _tables(result: TuningResult) -> dict[str, Any]:
-    """What a JSON file holds of a tuning; of a design also its certificate's notes and the plants it was tried on."""
-    gains = result.parameters.select(result.parameters.free_names).to_frame()
-    tables = {"gains": gains, "claimed": result.claimed.T, "certified": result.certified.T}
-    tables |= {"requirements": result.requirements, "relaxations": result.relaxations}
-    document: dict[str, Any] = {name: records(table) for name, table in tables.items()} | {"active": result.active}
-    document |= {"best": dict(result.best)} if result.best else {}
-    if result.status.converged:
-        document |= {} if result.certificate is None else {"notes": list(result.certificate.notes)}
-        document |= {} if result.validation is None else {"validation": records(result.validation.figures)}
-    return document

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import tomlkit
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import System
 from pneuopt.files.tolerances import COVARIANCE_ROUNDING, FILE_DIGITS
@@ -89,7 +88,13 @@ def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
     needed = {option: tuple(k.choices or ()) for option, k in known.items() if k.required}
     bases = [dict(zip(needed, words, strict=True)) for words in product(*needed.values())]
     changes: list[tuple[Option | None, Any]] = [(None, None)]
-    changes += [(option, value) for option, key in known.items() for value in _other_values(key)]
+    for spot, key in known.items():
+        if key.choices is not None and not key.required:
+            changes += [(spot, word) for word in key.choices if word != key.usual]
+        elif key.takes in (Takes.FLAG, Takes.FLAG_OR_LIST):
+            changes.append((spot, not key.usual))
+        elif key.takes is Takes.COUNT:
+            changes.append((spot, 1))
     for option, value in changes:
         own_laws = option is None or option[0] in (section for section, _ in needed)
         for base in bases if own_laws else bases[:1]:
@@ -101,25 +106,26 @@ def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
                 continue
 
 
-def _other_values(key: Key) -> Sequence[Any]:
-    if key.required or key.takes in (Takes.TABLE, Takes.TABLES):
-        return ()
-    if key.choices is not None:
-        return [word for word in key.choices if word != key.usual]
-    if key.takes in (Takes.FLAG, Takes.FLAG_OR_LIST):
-        return [not key.usual]
-    return [1] if key.takes is Takes.COUNT else ()
-
-
 def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOptions]) -> str:
     """The options under which a drive has a parameter: 'model = "stribeck" or "lugre"'."""
     parts = []
     for section, keys in kind.sections.items():
         for key, known in keys.items():
             option = (section, key)
-            has = (
-                _has_by_word(name, option, variants) if known.required else _has_by_value(name, option, known, variants)
-            )
+            has: dict[Any, bool] = {}  # for each value of the option whether there is the parameter
+            if known.required:  # the others as the parameter needs them
+                needs = {(v.changed, v.value) for v in variants if name in v.parameters}
+                for variant in (v for v in variants if (v.changed, v.value) in needs):
+                    word = variant.words[option]
+                    has[word] = has.get(word, False) or name in variant.parameters
+            elif known.takes is not Takes.COUNT:
+                usual = {tuple(v.words.items()): name in v.parameters for v in variants if v.changed is None}
+                changed = [(v, usual.get(tuple(v.words.items()), False)) for v in variants if v.changed == option]
+                if all((name in v.parameters) == before for v, before in changed):
+                    continue  # the option makes no difference
+                has[known.usual] = any(before for _, before in changed)
+                for variant, _ in changed:
+                    has[variant.value] = has.get(variant.value, False) or name in variant.parameters
             if not all(has.values()):
                 own = "" if name.startswith(f"{section}.") else f"[{section}] "
                 words = (f'"{v}"' if isinstance(v, str) else str(v).lower() for v, there in has.items() if there)
@@ -127,31 +133,10 @@ def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOpt
     return " and ".join(parts)
 
 
-def _has_by_word(name: str, option: Option, variants: Sequence[_DriveOptions]) -> dict[Any, bool]:
-    """For each word of a required option whether there is the parameter, the others as it needs them."""
-    needs = {(v.changed, v.value) for v in variants if name in v.parameters}
-    has: dict[Any, bool] = {}
-    for variant in (v for v in variants if (v.changed, v.value) in needs):
-        word = variant.words[option]
-        has[word] = has.get(word, False) or name in variant.parameters
-    return has
-
-
-def _has_by_value(name: str, option: Option, key: Key, variants: Sequence[_DriveOptions]) -> dict[Any, bool]:
-    """For each value of an option whether there is the parameter; nothing where the option makes no difference."""
-    usual = {tuple(v.words.items()): name in v.parameters for v in variants if v.changed is None}
-    changed = [(v, usual.get(tuple(v.words.items()), False)) for v in variants if v.changed == option]
-    if key.takes is Takes.COUNT or all((name in v.parameters) == before for v, before in changed):
-        return {}
-    has = {key.usual: any(before for _, before in changed)}
-    for variant, _ in changed:
-        has[variant.value] = has.get(variant.value, False) or name in variant.parameters
-    return has
-
-
 FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
+_AGREEMENT = ["rmse", "nrmse", "free_run_rmse", "free_run_nrmse", "unit"]
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
 _DRIVE_SECTION = {"drive": {"kind": KIND_KEY}}
 
@@ -222,7 +207,11 @@ class StoredFit:
             matrix = np.array(list(rows.values()), dtype=float).reshape(len(rows), len(rows))
         except ValueError:
             raise InputError(message) from None
-        require(_is_covariance(matrix), message)
+        variances = np.diag(matrix)
+        require(bool(np.isfinite(matrix).all() and (variances >= 0).all()), message)
+        scale = np.sqrt(np.outer(variances, variances))  # symmetric, with no correlation beyond 1
+        require(bool((abs(matrix - matrix.T) <= COVARIANCE_ROUNDING * scale).all()), message)
+        require(bool((abs(matrix) <= (1 + COVARIANCE_ROUNDING) * scale).all()), message)
         return pd.DataFrame(matrix, list(rows), list(rows))
 
     @property
@@ -284,18 +273,6 @@ def read_fit(path: str | Path) -> StoredFit:
     return StoredFit(Path(path), drive, _read_parameters(system, kind, sections, places), document.unwrap())
 
 
-def _is_covariance(matrix: NDArray[np.float64]) -> bool:
-    """Whether a matrix is finite and symmetric, with no negative variance and no correlation beyond 1."""
-    variances = np.diag(matrix)
-    if not np.isfinite(matrix).all() or (variances < 0).any():
-        return False
-    scale = np.sqrt(np.outer(variances, variances))
-    return bool(
-        (abs(matrix - matrix.T) <= COVARIANCE_ROUNDING * scale).all()
-        and (abs(matrix) <= (1 + COVARIANCE_ROUNDING) * scale).all()
-    )
-
-
 def ambient_pressure(parameters: ParameterSet) -> float:
     """What gauge pressures of a drive and its logs count from [Pa]: its ambient, or the standard atmosphere."""
     return parameters.value(AMBIENT_PRESSURE) if AMBIENT_PRESSURE in parameters else ATMOSPHERE
@@ -352,7 +329,11 @@ def write_fit(path: str | Path, source: str | Path, result: IdentificationResult
     covariance = result.covariance
     known = [n for n in covariance.index if np.isfinite(covariance.to_dict()[n][n])]  # the others have none
     document["covariance"] = toml_table({str(n): covariance.loc[n, known].to_list() for n in known})
-    document["agreement"] = toml_table(_agreement_rows(result.fit))
+    logs = result.fit[_AGREEMENT].groupby(level="log", sort=False) if len(result.fit) else ()
+    agreement = {str(log): rows.droplevel("log").to_dict(orient="index") for log, rows in logs}
+    document["agreement"] = toml_table(
+        {log: toml_table({str(c): inline_table(row) for c, row in own.items()}) for log, own in agreement.items()}
+    )
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
     if result.verdict is not None:
         document["verdict"] = toml_table(result.verdict.to_dict())
@@ -374,21 +355,17 @@ def _write_absolute(document: tomlkit.TOMLDocument, given: ParameterSet) -> None
             entries[key] = write_value(p.value, p.unit, FILE_DIGITS)
 
 
-def _agreement_rows(fit: "pd.DataFrame") -> dict[str, Any]:
-    """A table a log with a row a channel: how far the fit, and a simulation from end to end, are from it."""
-    if fit.empty:  # no channel was compared
-        return {}
-    figures = fit[["rmse", "nrmse", "free_run_rmse", "free_run_nrmse", "unit"]]
-    logs = {str(log): rows.droplevel("log") for log, rows in figures.groupby(level="log", sort=False)}
-    return {
-        log: toml_table({str(c): inline_table(row) for c, row in rows.to_dict(orient="index").items()})
-        for log, rows in logs.items()
-    }
-
-
 def _read_parameters(system: System, kind: DriveKind, sections: Sections, places: FileLocations) -> ParameterSet:
     defaults = system.parameters
-    _check_keys(defaults, kind, sections, places)
+    known = {"drive", *(name.partition(".")[0] for name in defaults)}
+    for section, stated in sections.items():
+        if section not in known:
+            raise UnknownNameError("section", section, known, f"{places.location(section)}: kind {kind.name!r}")
+        structure = {**_DRIVE_SECTION, **kind.sections}.get(section, {})
+        keys = [name.partition(".")[2] for name in defaults if name.startswith(f"{section}.")]
+        others = [alias.key for alias in kind.aliases if alias.section == section]
+        for key in stated:
+            check_names("key", [key], [*structure, *keys, *others], f"{places.location(section, key)}: [{section}]")
     entries = {f"{s}.{k}": v for s, stated in sections.items() for k, v in stated.items() if f"{s}.{k}" in defaults}
 
     def read(name: str) -> Parameter:
@@ -401,20 +378,6 @@ def _read_parameters(system: System, kind: DriveKind, sections: Sections, places
             entries |= _read_alias(alias, sections, entries, defaults, places)
         edits = {name: read(name) for name in entries}
     return defaults | ParameterSet({name: edits[name] for name in defaults if name in edits})
-
-
-def _check_keys(defaults: ParameterSet, kind: DriveKind, sections: Sections, places: FileLocations) -> None:
-    """Refuse sections and keys that this drive has not."""
-    known = {"drive", *(name.partition(".")[0] for name in defaults)}
-    aliases = [(alias.section, alias.key) for alias in kind.aliases]
-    for section, entries in sections.items():
-        if section not in known:
-            raise UnknownNameError("section", section, known, f"{places.location(section)}: kind {kind.name!r}")
-        structure = {**_DRIVE_SECTION, **kind.sections}.get(section, {})
-        keys = [name.partition(".")[2] for name in defaults if name.startswith(f"{section}.")]
-        others = [key for where, key in aliases if where == section]
-        for key in entries:
-            check_names("key", [key], [*structure, *keys, *others], f"{places.location(section, key)}: [{section}]")
 
 
 def _check_hardware(system: System, entries: Mapping[str, Any], places: FileLocations) -> None:

@@ -17,7 +17,7 @@ from pneuopt.files.loop import signal_units_of, tuning_keys
 from pneuopt.files.outputs import output_schema
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.study import STUDY_KEYS
-from pneuopt.files.tolerances import LEAST_DITHER_SAMPLES, SAMPLE_TIME
+from pneuopt.files.tolerances import SAMPLE_TIME
 from pneuopt.files.tuning import TUNED_SECTIONS
 from pneuopt.logs.columns import CHANNELS, plant_channels
 from pneuopt.logs.read_log import SIDECAR_KEYS
@@ -30,6 +30,11 @@ from pneuopt.quantities.units import write_value
 
 BAND, OVERSHOOT, SENSITIVITY = "2 %", "5 %", 1.6  # what a first tuning asks for: usual, and within reach of most drives
 _EXAMPLE_SPREAD = 'distribution = "normal", spread = "5 %"'
+_RIG_TITLE = (
+    "What the hardware has and its model has not; a design is certified on it, too:",
+    "    pneuopt tune fit.toml tuning.toml --rig rig.toml",
+    "All of it is optional: without any, the drive sticks and slips, and no more.",
+)
 _OTHER_FILES = ("drive", "tuning", "study", "rig")
 
 
@@ -61,12 +66,14 @@ def first_files(
     defaults = default_parameters(kind, first.options)
     values = defaults | defaults.with_values(first.values) | known.select(n for n in known if n in defaults)
     plant = kind.build(DriveSections(first.options, kind.sections, lambda *_: "")).system()
-    loop = ClosedLoop(plant, PID(sample_time))
+    loop, output = ClosedLoop(plant, PID(sample_time)), plant.outputs[0]
+    sensor = f'{output.name} = {{ lag = "0 s", noise = "0 {output.unit}", resolution = "0 {output.unit}" }}'
+    rig = Template(_RIG_TITLE, RIG_KEYS, names={"sensors": sensor}, schema=_schema_path("rig"))
     templates = {
         "drive": _drive_template(kind, first, values, source),
         "tuning": _tuning_template(loop, first, values, counts_from_zero),
         "study": _study_template(loop, first, values),
-        "rig": _rig_template(loop),
+        "rig": rig,
         "sidecar": _sidecar_template(loop, first, values, columns, log, doubts),
     }
     results = {"drive": FIT_SECTIONS, "tuning": TUNED_SECTIONS}
@@ -122,7 +129,14 @@ def _drive_template(kind: DriveKind, first: FirstFiles, values: ParameterSet, so
     return Template(title, sections, stated, schema=_schema_path("drive"))
 
 
-def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, counts_from_zero: bool) -> Template:
+def _tuning_template(
+    loop: ClosedLoop,
+    first: FirstFiles,
+    values: ParameterSet,
+    counts_from_zero: bool,
+    *,
+    dither_samples: int = 5,  # least a period: fewer bend its wave; more slow it down for a slow controller
+) -> Template:
     command, measured = loop.command.unit, loop.feedback.unit
     given = loop.parameters.with_values({f"pid.{n}": value for n, (value, _, _) in first.gains.items()})
     given = given.with_bounds({f"pid.{n}": (low, high) for n, (_, low, high) in first.gains.items()})
@@ -133,7 +147,7 @@ def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, 
     stated["pid.limits"] = "[" + ", ".join(_quote(write_value(end, command)) for end in ends) + "]"
     if first.dither is not None:
         frequency, most = first.dither
-        frequency = min(frequency, 1.0 / (LEAST_DITHER_SAMPLES * (loop.pid.sample_time or SAMPLE_TIME)))
+        frequency = min(frequency, 1.0 / (dither_samples * (loop.pid.sample_time or SAMPLE_TIME)))
         stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz"))}
         least = {"amplitude": 0.0, "offset": -most}
         free = {n: Parameter(0.0, command, lower, most) for n, lower in least.items()}
@@ -194,18 +208,6 @@ def _study_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -
     return Template(title, STUDY_KEYS, stated, examples=ends, names=names, schema=_schema_path("study"))
 
 
-def _rig_template(loop: ClosedLoop) -> Template:
-    output = loop.plant.outputs[0]
-    title = (
-        "What the hardware has and its model has not; a design is certified on it, too:",
-        "    pneuopt tune fit.toml tuning.toml --rig rig.toml",
-        "All of it is optional: without any, the drive sticks and slips, and no more.",
-    )
-    zero = f'"0 {output.unit}"'
-    sensor = f'{output.name} = {{ lag = "0 s", noise = {zero}, resolution = {zero} }}'
-    return Template(title, RIG_KEYS, names={"sensors": sensor}, schema=_schema_path("rig"))
-
-
 def _sidecar_template(
     loop: ClosedLoop,
     first: FirstFiles,
@@ -260,18 +262,6 @@ def run_files(run: ExcitationRun, drive: str = "drive.toml") -> dict[str, str]:
     rows = zip(columns.t.tolist(), columns["reference"].tolist(), columns["reference_speed"].tolist(), strict=True)
     header = "time [s],position_reference [mm],speed_reference [m/s]"
     played = "\n".join([header, *(f"{t:.9g},{1e3 * r:.9g},{v:.6g}" for t, r, v in rows)]) + "\n"
-    return {PLAYED_FILE: played, RUN_FILE: "\n".join([*_run_head(run, drive), *_run_sections(run)]) + "\n"}
-
-
-def logged_channels(run: ExcitationRun) -> tuple[str, ...]:
-    """What the run's log has to hold: the command, the position, and what pushes."""
-    axis = run.loop.plant.axis
-    assert axis is not None
-    assert axis.final_element is not None
-    return run.loop.command.name, run.loop.feedback.name, *axis.final_element.pushing
-
-
-def _run_head(run: ExcitationRun, drive: str) -> list[str]:
     low, high = (write_value(x, "m", 3) for x in run.between)
     fast = write_value(run.fastest, "m/s", 3)
     trail = write_value(run.following_error, "m", 2)
@@ -286,7 +276,16 @@ def _run_head(run: ExcitationRun, drive: str) -> list[str]:
         f"Then: pneuopt identify {drive} LOG -o fit.toml",
         f"Simulated on the drive as guessed: pneuopt simulate {drive} {RUN_FILE} -o predicted.csv",
     )
-    return [line for part in text for line in comment_lines(part)]
+    head = [line for part in text for line in comment_lines(part)]
+    return {PLAYED_FILE: played, RUN_FILE: "\n".join([*head, *_run_sections(run)]) + "\n"}
+
+
+def logged_channels(run: ExcitationRun) -> tuple[str, ...]:
+    """What the run's log has to hold: the command, the position, and what pushes."""
+    axis = run.loop.plant.axis
+    assert axis is not None
+    assert axis.final_element is not None
+    return run.loop.command.name, run.loop.feedback.name, *axis.final_element.pushing
 
 
 def _run_sections(run: ExcitationRun) -> Iterator[str]:

@@ -74,7 +74,16 @@ class KeyRow:
 def list_keys() -> tuple[KeyRow, ...]:
     """Every key of every file."""
     others = {"tuning.toml": tuning_keys(), "study.toml": STUDY_KEYS, "rig.toml": RIG_KEYS, "log.toml": SIDECAR_KEYS}
-    rows = list(_drive_rows())
+    rows, kinds = list[KeyRow](), {kind: dict(table("", drive_keys(kind)).walk()) for kind in DRIVE_KINDS}
+    for name in dict.fromkeys(n for keys in kinds.values() for n in keys):  # a row, which says where kinds differ
+        of_kind = {kind: keys[name] for kind, keys in kinds.items() if name in keys}
+        section, _, own = name.partition(".")
+        known = {kind for kind, keys in kinds.items() if section in keys}
+        units, usual = ({kind: text(key) for kind, key in of_kind.items()} for text in (describe_unit, describe_usual))
+        condition = _join({kind: key.condition for kind, key in of_kind.items()})
+        only = tuple(of_kind) if set(of_kind) != known or (not own and set(of_kind) != set(kinds)) else ()
+        key = replace(next(iter(of_kind.values())), condition=condition)
+        rows.append(KeyRow("drive.toml", section, own, key, _join(units), _join(usual), only))
     for file, sections in others.items():
         for name, key in _merge_shared(sections):
             section, _, own = name.partition(".")
@@ -130,20 +139,6 @@ def _merge_shared(sections: Mapping[str, Key], least: int = 3) -> Iterable[tuple
 def _shape(name: str, key: Key) -> tuple[str, str, str]:
     section, _, own = name.split(".")
     return section, own, key.meaning
-
-
-def _drive_rows() -> Iterable[KeyRow]:
-    """Keys of all kinds of drive; kinds that share a key have one row, which says where they differ."""
-    kinds = {kind: dict(table("", drive_keys(kind)).walk()) for kind in DRIVE_KINDS}
-    for name in dict.fromkeys(n for keys in kinds.values() for n in keys):
-        own = {kind: keys[name] for kind, keys in kinds.items() if name in keys}
-        section, _, rest = name.partition(".")
-        known = {kind for kind, keys in kinds.items() if section in keys}
-        units, usual = ({kind: text(key) for kind, key in own.items()} for text in (describe_unit, describe_usual))
-        condition = _join({kind: key.condition for kind, key in own.items()})
-        only = tuple(own) if set(own) != known or (not rest and set(own) != set(kinds)) else ()
-        key = replace(next(iter(own.values())), condition=condition)
-        yield KeyRow("drive.toml", section, rest, key, _join(units), _join(usual), only)
 
 
 def _join(texts: Mapping[str, str]) -> str:

@@ -5,6 +5,7 @@ Words in braces in a unit stand for the units of the loop's signals (`signal_uni
 """
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from enum import Enum
@@ -31,7 +32,7 @@ from pneuopt.evaluation.metric import Band, Requirement, Tolerance
 from pneuopt.evaluation.requirements import REQUIREMENT_KINDS, SettlingTime, StepEnvelope
 from pneuopt.evaluation.scenarios import DISTRIBUTIONS, TOGETHER, Distribution, Sampling, Spread
 from pneuopt.files.drive import ambient_pressure
-from pneuopt.files.tolerances import MAX_CASES, MAX_OPTION, SAMPLE_TIME
+from pneuopt.files.tolerances import MAX_CASES, SAMPLE_TIME
 from pneuopt.files.toml import construct_at, read_parameter
 from pneuopt.quantities.errors import InputError, UnitError, check_names, require
 from pneuopt.quantities.keys import (
@@ -228,6 +229,13 @@ def read_sample_spreads(
     return found
 
 
+def read_corner_spreads(entries: Mapping[str, Any], where: str, parameters: ParameterSet) -> dict[str, Spread]:
+    """Read spreads as `read_spreads` does, of which the corners are not too many."""
+    many = len(entries) >= MAX_CASES.bit_length()
+    require(not many, f"{where}: {len(entries)} parameters have too many corners; take samples")
+    return read_spreads(entries, where, parameters)
+
+
 def _read_spread(given: Any, pattern: str, where: str, parameters: ParameterSet, word: str = "") -> Spread:
     spot = f"{where} {pattern}"
     if not isinstance(given, list):
@@ -261,12 +269,13 @@ REPLACED_METHODS = {
 }  # in files of older versions
 
 
-def _option_key(usual: Any, meaning: str = "", condition: str = "") -> Key:
+def _option_key(usual: Any, meaning: str = "", condition: str = "", most: int = 1_000_000) -> Key:
+    """The key of an option; more than `most` would fill the memory."""
     if isinstance(usual, tuple):
         return Key(meaning, Takes.LIST, usual=usual, condition=condition, of=_option_key(usual[0]))
     if isinstance(usual, float):
         return Key(meaning, usual=usual, condition=condition)
-    return Key(meaning, Takes.COUNT, usual=usual, condition=condition, least=-MAX_OPTION, most=MAX_OPTION)
+    return Key(meaning, Takes.COUNT, usual=usual, condition=condition, least=-most, most=most)
 
 
 METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {
@@ -280,16 +289,17 @@ METHOD_KEYS: Mapping[str, Mapping[str, Key]] = {
 """The options of each method that a file can state: numbers, and lists of them."""
 
 
-def _join_options() -> dict[str, Key]:
-    """The options of all methods; one that several have says of which its usual value is."""
-    found: dict[str, Key] = {}
-    for keys in METHOD_KEYS.values():
-        found |= {n: replace(key, condition=f"usual {key.condition}") if n in found else key for n, key in keys.items()}
-    return found
-
-
+_METHODS_BY_OPTION = Counter(n for keys in METHOD_KEYS.values() for n in keys)
 METHOD_SECTION = table(
-    "how the search goes; by default the loop decides", {"kind": choice("method", METHODS), **_join_options()}
+    "how the search goes; by default the loop decides",
+    {
+        "kind": choice("method", METHODS),
+        **{  # an option that several methods have says of which its usual value is
+            n: replace(key, condition=f"usual {key.condition}" if _METHODS_BY_OPTION[n] > 1 else key.condition)
+            for keys in METHOD_KEYS.values()
+            for n, key in keys.items()
+        },
+    },
 )
 
 
@@ -533,8 +543,18 @@ FIRST_PARAMETERS: Mapping[str, str] = {
 def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping[str, Key]:
     """All sections of a tuning.toml with all their keys, for signals of these units."""
     signal = SensedSignal(Quantity("measured", measured), {}, SAMPLE_TIME)
+    gains: dict[str, Key] = {}  # those of every form, and what is shared; those of some forms say which
+    for form in Form:
+        pid = PID(SAMPLE_TIME, form=form, dead_band=True, reset=True).parameters(measured, command)
+        for name in (n for n in pid if n not in _LIMITS and n not in gains):
+            forms = [f'"{f.value}"' for f in Form if name in f.gains]
+            own = f"form = {' or '.join(forms)}" if 0 < len(forms) < len(Form) else ""
+            gains[name] = parameter_key(pid[name], own or _CONDITIONS.get(name, ""))
+    gains |= {n: replace(gains[n], takes=Takes.NUMBER, condition=_SAMPLED) for n in ("fault_samples", "fault_output")}
+    centre = "safe output after that many, on the wire as limits are; default: where the valve is closed, its centre"
+    gains["fault_output"] = replace(gains["fault_output"], meaning=centre, usual=None, example='"0 V"')
     parts = {
-        "pid": _pid_keys(command, measured),
+        "pid": gains,
         PositionLoop.section: _parameter_keys(PositionLoop().parameters(measured, f"{measured}/s")),
         "dither": _parameter_keys(Dither().parameters(command)),
         "feedforward": _parameter_keys(Feedforward().parameters(measured, command)),
@@ -546,21 +566,6 @@ def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping
     for section, condition in _SECTION_CONDITIONS.items():
         parts[section] = {n: replace(key, condition=condition) for n, key in parts[section].items()}
     return {n: replace(key, keys={**key.keys, **parts.get(n, {})}) for n, key in TUNING_KEYS.items()}
-
-
-def _pid_keys(command: str, measured: str) -> dict[str, Key]:
-    """The gains of every form, and what is shared; those of some forms say which."""
-    found: dict[str, Key] = {}
-    for form in Form:
-        pid = PID(SAMPLE_TIME, form=form, dead_band=True, reset=True).parameters(measured, command)
-        for name in (n for n in pid if n not in _LIMITS and n not in found):
-            forms = [f'"{f.value}"' for f in Form if name in f.gains]
-            own = f"form = {' or '.join(forms)}" if 0 < len(forms) < len(Form) else ""
-            found[name] = parameter_key(pid[name], own or _CONDITIONS.get(name, ""))
-    fixed = {n: replace(found[n], takes=Takes.NUMBER, condition=_SAMPLED) for n in ("fault_samples", "fault_output")}
-    centre = "safe output after that many, on the wire as limits are; default: where the valve is closed, its centre"
-    fixed["fault_output"] = replace(fixed["fault_output"], meaning=centre, usual=None, example='"0 V"')
-    return found | fixed
 
 
 def _parameter_keys(parameters: ParameterSet) -> dict[str, Key]:
@@ -590,9 +595,17 @@ def read_loop_sections(
         message = f"{path}: [{section}] has no {first}, without which it does nothing; write {first}"
         require(section not in table or first in table[section], message)
     pid = _pid(table["pid"], f"{path}: [pid]")
-    dither = _dither(table["dither"], f"{path}: [dither]") if "dither" in table else None
+    dither, lead = None, None
+    if "dither" in table:
+        given, where = table["dither"], f"{path}: [dither]"
+        read = read_table(LOOP_KEYS["dither"], given, where, partial=True)
+        frequency = read_parameter(given["frequency"], Parameter(1.0, "Hz"), f"{where} frequency").value
+        dither = construct_at(partial(Dither, frequency, read["analogue"], read["waveform"]), where)
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
-    lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
+    if "feedforward" in table:
+        given, where, usual = table["feedforward"], f"{path}: [feedforward]", Parameter(1.0, "s")
+        stated = (read_parameter(given["time"], usual, f"{where} time").value,) if "time" in given else ()
+        lead = construct_at(partial(Feedforward, *stated), where)
     parts = list[Compensator]()
     for section in (n for n in COMPENSATORS if n in table):
         where = f"{path}: [{section}]"
@@ -627,12 +640,6 @@ def _pid(table: Mapping[str, Any], where: str) -> PID:
     return construct_at(made, where)
 
 
-def _dither(table: Mapping[str, Any], where: str) -> Dither:
-    read = read_table(LOOP_KEYS["dither"], table, where, partial=True)
-    given = read_parameter(table["frequency"], Parameter(1.0, "Hz"), f"{where} frequency")
-    return construct_at(lambda: Dither(given.value, read["analogue"], read["waveform"]), where)
-
-
 def _sensor(table: Mapping[str, Any], plant: System, where: str) -> SensorLag | Encoder:
     usual = Encoder() if plant.axis is None else Encoder(position=plant.axis.position)
     units = {"position": {q.name: q.unit for q in plant.outputs}.get(usual.position, "m")}
@@ -643,13 +650,6 @@ def _sensor(table: Mapping[str, Any], plant: System, where: str) -> SensorLag | 
     if "lag" in table:
         return construct_at(lambda: SensorLag(read["lag"]), where)
     return construct_at(lambda: replace(usual, **{key: read[key] for key in table}), where)
-
-
-def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
-    if "time" not in table:
-        return Feedforward()
-    time = read_parameter(table["time"], Parameter(1.0, "s"), f"{where} time").value
-    return construct_at(lambda: Feedforward(time), where)
 
 
 def _schedule(table: Mapping[str, Any], plant: System, where: str) -> GainSchedule:
@@ -678,7 +678,16 @@ def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centr
         check_names("key", entries, (*LOOP_KEYS[section], *keys), where)
         names = {k: f"{section}.{k}" for k in keys if k in entries}
         read |= {name: read_parameter(entries[k], own[name], f"{where} {k}") for k, name in names.items()}
-    read = _fault_values(read, loop, centre, f"{path}: [pid]")
+    for key in loop.pid.fixed_parameters:
+        given = read.get(f"pid.{key}")
+        message = f"{key} says what the machine does in a fault, which no search decides; take free = true out"
+        require(given is None or not given.free, f"{path}: [pid] {message}")
+    count, safe = read.get("pid.fault_samples"), read.get("pid.fault_output")
+    whole = count is None or (count.value >= 1 and count.value == round(count.value))
+    message = f"fault_samples is a whole number of samples, 1 at least; the default is {FAULT_SAMPLES:g}"
+    require(whole, f"{path}: [pid] {message}")
+    if safe is not None:  # about the valve's centre, from that on the wire
+        read["pid.fault_output"] = replace(safe, value=safe.value - centre)
     for name in (n for n, p in read.items() if p.free):
         section, _, key = name.partition(".")
         finite = abs(read[name].lower) < float("inf") and abs(read[name].upper) < float("inf")
@@ -686,19 +695,6 @@ def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centr
     parameters = own | ParameterSet(read)
     construct_at(lambda: loop.check(parameters), str(path))
     return parameters
-
-
-def _fault_values(read: dict[str, Parameter], loop: ClosedLoop, centre: float, where: str) -> dict[str, Parameter]:
-    """The parameters with the safe output about the valve's centre, from that on the wire; none of a fault is free."""
-    for key in loop.pid.fixed_parameters:
-        given = read.get(f"pid.{key}")
-        message = f"{where} {key} says what the machine does in a fault, which no search decides; take free = true out"
-        require(given is None or not given.free, message)
-    count = read.get("pid.fault_samples")
-    whole = count is None or (count.value >= 1 and count.value == round(count.value))
-    require(whole, f"{where} fault_samples is a whole number of samples, 1 at least; the default is {FAULT_SAMPLES:g}")
-    safe = read.get("pid.fault_output")
-    return read | ({"pid.fault_output": replace(safe, value=safe.value - centre)} if safe else {})
 
 
 def _read_limits(entries: Mapping[str, Any], own: ParameterSet, centre: float, where: str) -> dict[str, Parameter]:

@@ -18,7 +18,7 @@ from pneuopt.evaluation.dither import CompensatorVerdict, DitherVerdict
 from pneuopt.evaluation.limit_cycle import RestCheck
 from pneuopt.experiments.design import ExperimentDesign
 from pneuopt.files.tuned import CertificateCheck
-from pneuopt.identification.checkup import Assumption
+from pneuopt.identification.checkup import Assumption, LogRow
 from pneuopt.identification.result import (
     AgreementRow,
     ChosenWidth,
@@ -35,6 +35,7 @@ from pneuopt.quantities.keys import argument_meanings, first_sentence
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.quantities.results import read_result
 from pneuopt.quantities.status import Status
+from pneuopt.studies.sensitivity import ShareRow, SlopeRow, SpreadRow
 from pneuopt.tuning.result import RequirementRow, TuningResult
 from pneuopt.tuning.validation import DesignValidation
 
@@ -145,10 +146,6 @@ def _optional(member: Member) -> Member:
     return replace(member, is_optional=True)
 
 
-def _numbers(**meanings: str) -> dict[str, Member]:
-    return {name: Member(meaning) for name, meaning in meanings.items()}
-
-
 _HOLDS: Mapping[Any, Holds] = {
     str: Holds.TEXT,
     float: Holds.NUMBER,
@@ -156,34 +153,34 @@ _HOLDS: Mapping[Any, Holds] = {
     bool: Holds.FLAG,
     float | str | bool: Holds.VALUE,
     tuple[str, ...]: Holds.TEXTS,
+    list[str]: Holds.TEXTS,
     tuple[int, int]: Holds.COUNTS,
     tuple[tuple[str, ...], ...]: Holds.GROUPS,
     Mapping[str, str]: Holds.WORDS,
+    Mapping[str, Mapping[str, str]]: Holds.RECORDS,
 }
 
 
 def members_of(kind: type, only: Sequence[str] = (), *, are_optional: bool = False) -> dict[str, Member]:
     """The members that a dataclass or TypedDict declares: `only` these fields and properties, in this order."""
     meanings = argument_meanings(kind)
-    names = only or tuple(kind.__annotations__)
-    return {n: _member_of(kind, n, meanings.get(n, ""), are_optional) for n in names}
-
-
-def _member_of(kind: type, name: str, meaning: str, is_optional: bool) -> Member:
-    own = getattr(kind, name, None)
-    if isinstance(own, property):
-        annotation, meaning = own.fget.__annotations__["return"], first_sentence(own.fget)
-    else:
-        annotation = kind.__annotations__[name]
-    parts = [part for part in get_args(annotation) if part is not NoneType]
-    if NoneType in get_args(annotation):
-        annotation, is_optional = parts[0], True
-    is_word = isinstance(annotation, type) and issubclass(annotation, Enum)
-    if not is_word and annotation not in _HOLDS:
-        raise TypeError(f"{kind.__name__}.{name}: no output holds {annotation}")
-    words = f"one of {', '.join(str(word.value) for word in annotation)}" if is_word else ""
-    text = "; ".join(filter(None, [meaning or name.replace("_", " "), words]))
-    return Member(text, Holds.TEXT if is_word else _HOLDS[annotation], is_optional=is_optional)
+    found = {}
+    for name in only or tuple(kind.__annotations__):
+        own, is_optional, meaning = getattr(kind, name, None), are_optional, meanings.get(name, "")
+        if isinstance(own, property):
+            annotation, meaning = own.fget.__annotations__["return"], first_sentence(own.fget)
+        else:
+            annotation = kind.__annotations__[name]
+        parts = [part for part in get_args(annotation) if part is not NoneType]
+        if NoneType in get_args(annotation):
+            annotation, is_optional = parts[0], True
+        is_word = isinstance(annotation, type) and issubclass(annotation, Enum)
+        if not is_word and annotation not in _HOLDS:
+            raise TypeError(f"{kind.__name__}.{name}: no output holds {annotation}")
+        words = f"one of {', '.join(str(word.value) for word in annotation)}" if is_word else ""
+        text = "; ".join(filter(None, [meaning or name.replace("_", " "), words]))
+        found[name] = Member(text, Holds.TEXT if is_word else _HOLDS[annotation], is_optional=is_optional)
+    return found
 
 
 _STATUS = Member("how it ended", Holds.RECORD, members_of(Status, ("code", "message")))
@@ -219,23 +216,7 @@ _DITHER = {
     **members_of(DitherVerdict, ("usefulness", "reasons")),
     "rival": Member("gains tuned without it", Holds.NUMBERS, is_optional=True),
 }
-_READ = {
-    **{n: _text(m) for n, m in {"log": "name", "file": "path", "sidecar": "path, or empty"}.items()},
-    **{n: Member(n.replace("_", " "), Holds.COUNT) for n in ("rows", "first_row")},
-    **_numbers(begin="[s]", end="[s]", sample_time="[s]"),
-    "channels": Member("by channel: column, unit and what says so", Holds.RECORDS),
-    **{n: Member(m, Holds.TEXTS) for n, m in {"unread": "columns", "remarks": "what was mended or skipped"}.items()},
-}
 _OF_AN_AXIS = {"figure": _text("metric"), "axis": _text("parameter or pattern")}
-_SHARES = _OF_AN_AXIS | _numbers(
-    first="of the variance, by itself [1]",
-    first_low="[1]",
-    first_high="[1]",
-    total="with what it does by way of others [1]",
-    total_low="[1]",
-    total_high="[1]",
-)
-_SLOPES = _OF_AN_AXIS | _numbers(change="a standard deviation [unit]", relative="[1]", share="of the variance [1]")
 
 
 def _output(meaning: str, **members: Member) -> Member:
@@ -247,7 +228,7 @@ OUTPUTS: Mapping[str, Member] = {
     "check": _output(
         "`pneuopt check`",
         verdict=_text("whether a fit takes the logs"),
-        read=_rows("a row a log", _READ),
+        read=_rows("a row a log", members_of(LogRow)),
         assumed=_rows("values that stand in no file", members_of(Assumption, ("name", "value", "unit", "key"))),
         found=_rows("what is wrong", members_of(LogFinding, ("severity", "log", "rows", "check", "message"))),
         identifiable=_rows("a row a free parameter", _IDENTIFIABLE),
@@ -310,9 +291,11 @@ OUTPUTS: Mapping[str, Member] = {
         "`pneuopt study` of a [sensitivity]",
         status=_STOPPED,
         verdict=_text("how many points hold"),
-        shares=_rows("a row a metric and axis, with 95 % intervals", _SHARES),
-        figures=_rows("a row a metric over the box", _NAMED | _numbers(mean="[unit]", std="[unit]", lost="points [1]")),
-        slopes=_optional(_rows("with local, a row a metric and axis at the design", _SLOPES)),
+        shares=_rows("a row a metric and axis, with 95 % intervals", _OF_AN_AXIS | members_of(ShareRow)),
+        figures=_rows("a row a metric over the box", _NAMED | members_of(SpreadRow)),
+        slopes=_optional(
+            _rows("with local, a row a metric and axis at the design", _OF_AN_AXIS | members_of(SlopeRow))
+        ),
         cases=_rows("a row a point: parameters, metrics, seconds, error", {"case": _text("name")}, is_open=True),
         provenance=_PROVENANCE,
     ),

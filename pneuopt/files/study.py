@@ -18,8 +18,8 @@ from pneuopt.files.loop import (
     SAMPLED_KEY,
     SAMPLES_KEY,
     read_bound,
+    read_corner_spreads,
     read_sample_spreads,
-    read_spreads,
 )
 from pneuopt.files.tolerances import MAX_CASES
 from pneuopt.files.toml import read_toml
@@ -126,21 +126,14 @@ def _read_samples(given: Mapping[str, Any], source: CaseSource) -> Cases:
     )
 
 
-def _read_corners(given: Mapping[str, Any], source: CaseSource) -> Cases:
-    many = len(given) >= MAX_CASES.bit_length()
-    require(not many, f"{source.where}: {len(given)} parameters have too many corners; take [samples]")
-    return corners(source.parameters, read_spreads(given, source.where, source.parameters))
-
-
-def _read_table(given: Mapping[str, Any], source: CaseSource) -> Cases:
-    file = read_table(CASE_KEYS["table"].keys, given, source.where)["file"]
-    return read_cases(source.parameters, source.folder / file)
-
-
 _READERS: Mapping[str, Callable[[Mapping[str, Any], CaseSource], Cases]] = {
     "samples": _read_samples,
-    "corners": _read_corners,
-    "table": _read_table,
+    "corners": lambda given, source: corners(
+        source.parameters, read_corner_spreads(given, source.where, source.parameters)
+    ),
+    "table": lambda given, source: read_cases(
+        source.parameters, source.folder / read_table(CASE_KEYS["table"].keys, given, source.where)["file"]
+    ),
 }
 
 
@@ -298,14 +291,22 @@ def read_study(path: str | Path) -> Study:
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
     """Read a study's axes in the units of the parameters."""
     check_names("parameter", study.axes, parameters, f"{study.path}: [axes]")
-    with count_gauge_from(ambient_pressure(parameters)):
-        axes = tuple(
-            _read_axis(name, entry, parameters[name].unit, f"{study.path}: [axes] {name}")
-            for name, entry in study.axes.items()
-        )
+    axes = list[SweptAxis]()
+    for name, entry in study.axes.items():
+        where, unit = f"{study.path}: [axes] {name}", parameters[name].unit
+        good = isinstance(entry, list | dict) and len(entry) > 0
+        require(good, f"{where}: write a list or a range, {_AXIS_EXAMPLE}")
+        with count_gauge_from(ambient_pressure(parameters)):
+            if isinstance(entry, list):
+                first, values = entry[0], [read_value(e, unit, where=where) for e in entry]
+            else:
+                ends = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
+                first, values = entry.get("from"), np.linspace(ends["from"], ends["to"], ends["steps"]).tolist()
+            written = read_unit(first, unit)
+            axes.append(SweptAxis(name, tuple(values), written, *si_conversion(written, unit, where=where)))
     cells = math.prod(len(axis.points) for axis in axes)
     require(cells <= MAX_CASES, f"{study.path}: [axes] make {cells} cells, {MAX_CASES} are allowed; take fewer values")
-    return axes
+    return tuple(axes)
 
 
 def swept_axes(parameters: ParameterSet, cases: Mapping[str, Mapping[str, float]]) -> tuple[SweptAxis, ...]:
@@ -343,16 +344,3 @@ def _flatten_axes(entries: Mapping[str, Any], prefix: str = "") -> dict[str, Any
         nested = isinstance(entry, dict) and not _RANGE_KEYS.keys() & entry.keys()
         found |= _flatten_axes(entry, f"{prefix}{key}.") if nested else {f"{prefix}{key}": entry}
     return found
-
-
-def _read_axis(name: str, entry: Any, unit: str, where: str) -> SweptAxis:
-    good = isinstance(entry, list | dict) and len(entry) > 0
-    require(good, f"{where}: write a list or a range, {_AXIS_EXAMPLE}")
-    if isinstance(entry, list):
-        first, values = entry[0], [read_value(e, unit, where=where) for e in entry]
-    else:
-        ends = read_table(_RANGE_KEYS, entry, where, units={"own": unit})
-        first, values = entry.get("from"), np.linspace(ends["from"], ends["to"], ends["steps"]).tolist()
-    written = read_unit(first, unit)
-    factor, offset = si_conversion(written, unit, where=where)
-    return SweptAxis(name, tuple(values), written, factor, offset)

@@ -7,11 +7,7 @@ COVARIANCE_ROUNDING = 1e-8
 is another matrix."""
 FILE_DIGITS = 9
 """Significant digits of a value in fit.toml and tuned.toml: fewer change what was certified, more hide the figure."""
-LEAST_DITHER_SAMPLES = 5
-"""Samples a period of the first tuning's dither [1]: fewer bend its wave; more slow it down for a slow controller."""
 MAX_CASES = 20_000
 """Plants or cells that a file may ask for [1]: more take days and gigabytes; fewer refuse a map of 100 by 100."""
-MAX_OPTION = 1_000_000
-"""A whole number among a method's options [1]: a thousand times more fill the memory; fewer refuse a long search."""
 SAMPLE_TIME = 1e-3
 """Of a first controller, and of usual values that count in samples [s]: a common one; longer ones slow a loop down."""

@@ -14,15 +14,15 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Table
 
 from pneuopt.files.tolerances import FILE_DIGITS
-from pneuopt.quantities.errors import InputError, check_names, require
-from pneuopt.quantities.keys import PARAMETER_KEYS, Takes
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.keys import PARAMETER_KEYS, Takes, read_table
 from pneuopt.quantities.output import MAX_REASON, plain_value, read_toml_source
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.quantities.units import read_value, write_value
 
 Made = TypeVar("Made")
 
-_PARAMETER_FLAGS = tuple(name for name, key in PARAMETER_KEYS.items() if key.takes is Takes.FLAG)
+_PARAMETER_WORDS = tuple(name for name, key in PARAMETER_KEYS.items() if key.takes is not Takes.NUMBER)
 _PARAMETER_NUMBERS = tuple(name for name, key in PARAMETER_KEYS.items() if key.takes is Takes.NUMBER)
 _SECTION_HEAD = re.compile(r"\s*\[+([^\[\]]+)\]")
 _KEY_LINE = re.compile(r"\s*([\w\"'. -]+?)\s*=")
@@ -71,19 +71,14 @@ class FileLocations:
 def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
     """Read a value, or a table with bounds and flags, in the unit of `default`, which says what it leaves out."""
     fields = entry if isinstance(entry, dict) else {"value": entry}
-    check_names("key", fields, PARAMETER_KEYS, where)
-    numbers: dict[str, Any] = {
-        f: read_value(fields[f], default.unit, where=where) for f in _PARAMETER_NUMBERS if f in fields
-    }
-    for flag in _PARAMETER_FLAGS:
-        require(isinstance(fields.get(flag, False), bool), f"{where}: {flag} must be true or false")
-    others = {f: fields[f] for f in (*_PARAMETER_FLAGS, "source") if f in fields}
-    if "value" in fields:
-        others = {"source": "", "stated": True, **others}
-    try:
-        return replace(default, **numbers, **others)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+
+    def place(key: str) -> str:
+        return f"{where}: {key}" if key in _PARAMETER_WORDS else where
+
+    read = read_table(PARAMETER_KEYS, fields, place, units={"own": default.unit})
+    changed: dict[str, Any] = {"source": "", "stated": True} if "value" in fields else {}
+    changed |= {name: read[name] for name in fields}
+    return construct_at(lambda: replace(default, **changed), where)
 
 
 def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter, given: Parameter) -> None:
@@ -95,7 +90,7 @@ def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter,
     fields: dict[str, Any] = {
         f: _format_value(getattr(found, f), found) for f in _PARAMETER_NUMBERS if _field_differs(f, found, given)
     }
-    fields |= {f: getattr(found, f) for f in (*_PARAMETER_FLAGS, "source") if _field_differs(f, found, given)}
+    fields |= {f: getattr(found, f) for f in _PARAMETER_WORDS if _field_differs(f, found, given)}
     entry = entries.get(key)
     if isinstance(entry, InlineTable | Table):
         entry.update(fields)

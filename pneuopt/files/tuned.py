@@ -42,6 +42,7 @@ from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, move_paths, read_tuning
 from pneuopt.quantities.errors import InputError, UnitError, require
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.units import difference_unit, is_unit, read_unit, read_value, si_conversion, write_value
 
@@ -153,6 +154,11 @@ class CertificateCheck:
         """What a file or a screen says of gains that no certificate holds, a line a reason."""
         return tuple(f"NOT CERTIFIED: {reason}" for reason in self.reasons)
 
+    def report(self, tuned: str | Path) -> Report:
+        """Whether the certificate in a tuned.toml holds for the gains and the plant that are simulated."""
+        good = f"certified: the certificate in {tuned} holds for these gains and this plant"
+        return Report((Line(good, Tone.GOOD),) if self.holds else tuple(Line(line, Tone.BAD) for line in self.lines))
+
 
 def check_certificate(fit: StoredFit, tuned: str | Path, most: int = 8) -> CertificateCheck | None:
     """Whether the certificate in a tuned.toml holds, and if not, what was changed; None for a file without one."""
@@ -195,13 +201,28 @@ def _describe(table: Mapping[str, Any], path: str | Path, fit: StoredFit) -> Par
     status = table["status"] if isinstance(table.get("status"), dict) else {}
     code, message = str(status.get("code", "")), " ".join(str(status.get("message", "")).split())
     codes = {code.value: code.name for code in Code}
+    # the drive's structure, and what its fit leaves uncertain, of which the plants were drawn
+    structure, uncertain = _digest(dict(_flatten(fit.drive, fit.drive.kind, {})))[:16], Entries()
+    for name, frame in (("covariance", fit.covariance), ("table of estimates", fit.estimates)):
+        if frame is not None:
+            rows = {str(k): {str(n): _number(v) for n, v in row.items()} for k, row in frame.to_dict("index").items()}
+            uncertain[name] = _digest(rows)[:16]
+    # a digest of each case's figures, and what a controller adds to the command
+    certified, wire, unit = table.get("certified", {}), table.get("wire", {}), task.loop.command.unit
+    rows = certified if isinstance(certified, dict) else {"": certified}
+    figures = {f"the row of '{case}' in [certified]": _digest(_plain(row))[:16] for case, row in rows.items()}
+    for n, value in (wire if isinstance(wire, dict) else {}).items():
+        try:
+            figures[f"wire.{n}"] = _number(read_value(value, unit), unit)
+        except UnitError:
+            figures[f"wire.{n}"] = str(value)
     return {
         "loop": _describe_loop(task),
-        "plant": _describe_plant(fit),
+        "plant": {"structure": structure, **uncertain, **{n: _number(p.value, p.unit) for n, p in plant.items()}},
         "references": _describe_references(task),
         "limits": _describe_limits(task),
         "scenarios": dict(_describe_scenarios(table.get("scenarios", {}), str(path), plant | task.parameters)),
-        "figures": _describe_figures(table, task),
+        "figures": figures,
         "status": {"the status": codes.get(code, code), "the message of the status": _digest(message)[:16]},
     }
 
@@ -221,16 +242,6 @@ def _describe_loop(task: Tuning) -> Entries:
         shown = {"pid.lower": "pid.limits, the lower one", "pid.upper": "pid.limits, the upper one"}
         found[shown.get(n, n)] = _number(p.value + own.get(n, 0.0), p.unit)
     return found
-
-
-def _describe_plant(fit: StoredFit) -> Entries:
-    """The drive's structure and values, and what its fit leaves uncertain, of which the plants were drawn."""
-    found = {"structure": _digest(dict(_flatten(fit.drive, fit.drive.kind, {})))[:16]}
-    for name, frame in (("covariance", fit.covariance), ("table of estimates", fit.estimates)):
-        if frame is not None:
-            rows = {str(k): {str(n): _number(v) for n, v in row.items()} for k, row in frame.to_dict("index").items()}
-            found[name] = _digest(rows)[:16]
-    return found | {n: _number(p.value, p.unit) for n, p in fit.parameters.items()}
 
 
 def _describe_references(task: Tuning) -> Entries:
@@ -278,20 +289,6 @@ def _describe_scenarios(table: Mapping[str, Any], where: str, parameters: Parame
             yield from _flatten(spread, f"{lead} {axis}", {})
         if own:
             yield from _flatten(read_draw({n: given[n] for n in own if n in given}, spot), lead, {})
-
-
-def _describe_figures(table: Mapping[str, Any], task: Tuning) -> Entries:
-    """A digest of each case's figures, and what a controller adds to the command."""
-    certified, wire = table.get("certified", {}), table.get("wire", {})
-    rows = certified if isinstance(certified, dict) else {"": certified}
-    found = {f"the row of '{case}' in [certified]": _digest(_plain(row))[:16] for case, row in rows.items()}
-    unit = task.loop.command.unit
-    for n, value in (wire if isinstance(wire, dict) else {}).items():
-        try:
-            found[f"wire.{n}"] = _number(read_value(value, unit), unit)
-        except UnitError:
-            found[f"wire.{n}"] = str(value)
-    return found
 
 
 def _find_changes(stored: Mapping[str, Any], parts: Parts, writer: "_Writer") -> Iterator[str]:

@@ -30,8 +30,8 @@ from pneuopt.files.loop import (
     SCENARIO_KEYS,
     STEP_KEYS,
     TUNING_KEYS,
-    TuningSections,
     objective_key,
+    read_corner_spreads,
     read_draw,
     read_loop_sections,
     read_method,
@@ -39,7 +39,6 @@ from pneuopt.files.loop import (
     read_spreads,
     signal_units,
 )
-from pneuopt.files.tolerances import MAX_CASES
 from pneuopt.files.toml import construct_at, read_toml
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.errors import InputError, check_names, require
@@ -109,7 +108,23 @@ def read_tuning_table(
     check_sections(TUNING_KEYS, table, path)
     centre = command_centre(plant, parameters or plant.parameters)
     loop, own = read_loop_sections(table, plant, path, centre)
-    weights, limits = _read_objective(table, loop, path), _read_requirements(table, loop, path)
+    # units without (a) or (g): those of bounds and bands, which are differences
+    units = signal_units(loop.command.unit, loop.feedback.unit.partition("(")[0])
+    where, weights = f"{path}: [minimise]", dict[Requirement, float]()
+    check_names("requirement", table.get("minimise", {}), REQUIREMENTS_BY_KEY, where)
+    for key, entry in table.get("minimise", {}).items():
+        spot = f"{where} {key}"
+        require(isinstance(entry, dict), f"{spot}: write {key} = {{ weight = 1.0 }}; a limit belongs under [limits]")
+        stated = read_table(objective_key(key).keys, entry, spot, units=units)
+        weight, limit = stated.pop("weight"), {"max": None} if key == "step_envelope" else {}
+        weights[construct_at(partial(REQUIREMENTS_BY_KEY[key], **limit, **stated), spot)] = weight
+    where, limits = f"{path}: [limits]", list[Requirement | NoHunting]()
+    check_names("requirement", table.get("limits", {}), LIMIT_KEYS, where)
+    for key, entry in table.get("limits", {}).items():
+        spot = f"{where} {key}"
+        kind: Callable[..., Requirement | NoHunting] = REQUIREMENTS_BY_KEY.get(key, NoHunting)
+        values = read_entry(LIMIT_KEYS[key], entry, spot, units)
+        limits.append(construct_at(partial(kind, **{n: v for n, v in values.items() if v is not None}), spot))
     spec = construct_at(lambda: specify_limits(limits, weights), f"{path}: [minimise] and [limits]")
     section = table.get("scenarios", {}), str(path)
     scenarios, validation = (partial(read, *section) for read in (read_scenarios, read_validation_scenarios))
@@ -134,41 +149,6 @@ def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: 
     }
 
 
-def _read_objective(table: TuningSections, loop: ClosedLoop, path: str | Path) -> dict[Requirement, float]:
-    """Read [minimise]: requirements and their weights."""
-    where = f"{path}: [minimise]"
-    check_names("requirement", table.get("minimise", {}), REQUIREMENTS_BY_KEY, where)
-    weights, units = {}, _bare_units(loop)
-    for key, entry in table.get("minimise", {}).items():
-        spot = f"{where} {key}"
-        require(isinstance(entry, dict), f"{spot}: write {key} = {{ weight = 1.0 }}; a limit belongs under [limits]")
-        own = read_table(objective_key(key).keys, entry, spot, units=units)
-        weight, limit = own.pop("weight"), {"max": None} if key == "step_envelope" else {}
-        weights[construct_at(partial(REQUIREMENTS_BY_KEY[key], **limit, **own), spot)] = weight
-    return weights
-
-
-def _read_requirements(
-    table: TuningSections, loop: ClosedLoop, path: str | Path
-) -> tuple[Requirement | NoHunting, ...]:
-    """Read [limits]: requirements with their bounds."""
-    where = f"{path}: [limits]"
-    check_names("requirement", table.get("limits", {}), LIMIT_KEYS, where)
-    units, found = _bare_units(loop), list[Requirement | NoHunting]()
-    for key, given in table.get("limits", {}).items():
-        spot = f"{where} {key}"
-        known = LIMIT_KEYS[key]
-        kind: Callable[..., Requirement | NoHunting] = REQUIREMENTS_BY_KEY.get(key, NoHunting)
-        stated = {n: value for n, value in read_entry(known, given, spot, units).items() if value is not None}
-        found.append(construct_at(partial(kind, **stated), spot))
-    return tuple(found)
-
-
-def _bare_units(loop: ClosedLoop) -> dict[str, str]:
-    """The units of the loop's signals without (a) or (g): those of bounds and bands, which are differences."""
-    return signal_units(loop.command.unit, loop.feedback.unit.partition("(")[0])
-
-
 def _read_kinds(
     table: Mapping[str, Any], where: str, parameters: ParameterSet, new_count: int | None
 ) -> Iterator[Scenarios]:
@@ -185,19 +165,14 @@ def _read_kind(
     entries = dict(given)
     draw = read_draw({key: entries.pop(key) for key in SCENARIO_KEYS[kind].keys if key in entries}, where)
     seed = draw.seed if new_count is None else further(draw.seed, "validation", kind)
-    many = kind == "corners" and len(entries) >= MAX_CASES.bit_length()
-    require(not many, f"{where}: {len(entries)} parameters have too many corners; take [scenarios.samples]")
     try:
         if kind == "samples":
             own = read_sample_spreads(entries, where, parameters)
             return samples(parameters, own, new_count or draw.count, seed=seed, sampling=draw.sampling)
-        spreads = read_spreads(entries, where, parameters)
         if kind == "corners":
-            return (
-                corners(parameters, spreads)
-                if new_count is None
-                else samples(parameters, spreads, new_count, seed=seed)
-            )
+            box = read_corner_spreads(entries, where, parameters)
+            return corners(parameters, box) if new_count is None else samples(parameters, box, new_count, seed=seed)
+        spreads = read_spreads(entries, where, parameters)
         pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
         require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
         shares = {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)}
@@ -259,9 +234,21 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: i
         require(key in kind.keys, message)
     for key in ("horizon",) if "disturbance" in entry and kind is _STEP else kind.needed:
         require(key in entry, f"{where} has no {key}")
-    known, outputs = _read_stated(kind.keys, entry, loop, where), {q.name: q.unit for q in loop.plant.outputs}
+    units, outputs = signal_units(loop.command.unit, loop.feedback.unit), {q.name: q.unit for q in loop.plant.outputs}
+    plain = {n: key for n, key in kind.keys.items() if key.takes is not Takes.TABLE}
+    values = read_table(plain, entry, where, units=units, partial=True)
+    if "moves" in entry:  # of each only what it states, for the rest is shared
+        own = [move if isinstance(move, dict) else {"distance": move} for move in entry["moves"]]
+        values["moves"] = [{n: all_[n] for n in stated} for all_, stated in zip(values["moves"], own, strict=True)]
+    known = {n: values[n] for n in plain if n in entry}
     known["start"] = read_named(REFERENCE_KEYS["start"], entry.get("start", {}), outputs, f"{where} start")
-    known["disturbance"] = _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")
+    changes = entry.get("disturbance", {})
+    if isinstance(changes, dict):  # of parameters and inputs; "load.force" without quotes is a table in a table
+        parts = {n: v if isinstance(v, dict) else {"": v} for n, v in changes.items()}
+        changes = {f"{n}.{m}".removesuffix("."): v for n, part in parts.items() for m, v in part.items()}
+    moved = {q.name: q.unit for q in loop.plant.inputs} | {n: p.unit for n, p in loop.plant.parameters.items()}
+    moved = {n: unit.partition("(")[0] for n, unit in moved.items()}
+    known["disturbance"] = read_named(REFERENCE_KEYS["disturbance"], changes, moved, f"{where} disturbance")
     if kind is _PATH:
         table = file.parent / known.pop("path")
         known = {"dwell": Move.dwell, **known}
@@ -270,17 +257,6 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: i
         each = known.pop("moves", None) or [{"distance": known.pop("move")}]
         return construct_at(lambda: _chain_moves(each, known), where)
     return construct_at(lambda: Step(known.pop("step", 0.0), **known), where)
-
-
-def _read_stated(keys: Mapping[str, Key], entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Any]:
-    """What a reference states; of each of several moves, too, only what it states, for the rest is shared."""
-    units = signal_units(loop.command.unit, loop.feedback.unit)
-    plain = {n: key for n, key in keys.items() if key.takes is not Takes.TABLE}
-    values = read_table(plain, entry, where, units=units, partial=True)
-    if "moves" in entry:
-        own = [move if isinstance(move, dict) else {"distance": move} for move in entry["moves"]]
-        values["moves"] = [{n: all_[n] for n in stated} for all_, stated in zip(values["moves"], own, strict=True)]
-    return {n: values[n] for n in plain if n in entry}
 
 
 def _chain_moves(each: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) -> Reference:
@@ -293,17 +269,6 @@ def _chain_moves(each: Sequence[Mapping[str, Any]], settings: Mapping[str, Any])
     last = {"disturbance": settings.get("disturbance", {})}
     moves = [Move(**{**shared, **own, **(last if k == len(others) else {})}) for k, own in enumerate(others, 1)]
     return MoveSequence([Move(**{**begins, **shared, **first}), *moves])
-
-
-def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
-    """Read a disturbance: the changes of parameters and inputs of the plant."""
-    if not isinstance(table, dict):
-        return read_named(REFERENCE_KEYS["disturbance"], table, {}, where)
-    flat = {f"{n}.{m}": v for n, e in table.items() if isinstance(e, dict) for m, v in e.items()}
-    flat |= {n: v for n, v in table.items() if not isinstance(v, dict)}
-    units = {q.name: q.unit for q in loop.plant.inputs} | {n: p.unit for n, p in loop.plant.parameters.items()}
-    changes = {n: unit.partition("(")[0] for n, unit in units.items()}
-    return read_named(REFERENCE_KEYS["disturbance"], flat, changes, where)
 
 
 PATH_CHANNELS = ("position_reference", "position", "speed_reference", "speed")

@@ -9,7 +9,7 @@ import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -85,6 +85,48 @@ class Assumption:
         if isinstance(self.value, bool):
             return str(self.value).lower()
         return f'"{self.value if isinstance(self.value, str) else write_value(self.value, self.unit, 6)}"'
+
+
+class LogRow(TypedDict):
+    """What was read of a log, an entry of "read" in `Checkup.to_dict`.
+
+    Attributes
+    ----------
+    log : str
+        Name of the log.
+    file : str
+        Path of its file; empty where the log was made in Python.
+    rows : int
+        Number of samples.
+    first_row : int
+        Row of the first sample in the file.
+    begin : float
+        Time of the first sample, in seconds.
+    end : float
+        Time of the last sample, in seconds.
+    sample_time : float
+        Median time between samples, in seconds.
+    channels : mapping of str to mapping
+        By channel the column, its unit and what says so.
+    unread : list of str
+        Columns that are no channel.
+    sidecar : str
+        Path of its sidecar, or empty.
+    remarks : list of str
+        What was mended or skipped.
+    """
+
+    log: str
+    file: str
+    rows: int
+    first_row: int
+    begin: float
+    end: float
+    sample_time: float
+    channels: Mapping[str, Mapping[str, str]]
+    unread: list[str]
+    sidecar: str
+    remarks: list[str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -368,7 +410,7 @@ def _line(text: str, indent: int) -> Line:
     return Line(_NUMBER_AND_UNIT.sub(TIED, text), indent=indent)
 
 
-def _log_record(log: Experiment) -> dict[str, Any]:
+def _log_record(log: Experiment) -> LogRow:
     source, t = log.source, log.trajectory.t
     columns = (
         {n: {"column": c.name, "unit": c.unit, "said_by": c.said_by} for n, c in source.columns.items()}

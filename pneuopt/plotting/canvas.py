@@ -16,13 +16,11 @@ import numpy as np
 
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiment import Experiment
-from pneuopt.plotting.tolerances import MAX_VECTOR_MARKERS
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.output import write_bytes
 from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Figure  # noqa: PLC0414 - cli and report name it from here
 
@@ -35,8 +33,22 @@ PLOT_UNITS = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}
 
 @dataclass(frozen=True)
 class Style:
-    """Sizes in figures: lengths in inches on paper, texts in points."""
+    """What figures show, and sizes in them: lengths in inches on paper, texts in points."""
 
+    columns: int = 3  # of axes beside each other: more cannot be read at 1000 pixels, fewer leave logs out
+    channels: int = 4  # below each other: more cannot be read, fewer leave channels out
+    panels: int = 6  # parameters that are drawn: more do not fit a page, and those with an alarm come first
+    map_axes: int = 2  # axes up to which a study has a map: of more no figure can be read
+    numbered_cells: int = 12  # along an axis up to which each has room for its number; with more, numbers overlap
+    points: int = 4000  # of a measured line or cloud: more make a vector figure slow to open, fewer hide short events
+    vector_markers: int = 400  # of a cloud drawn as vectors: more would fill megabytes, so that an image is made
+    correlation_lag: int = 40  # largest lag of a correlation [samples]: more crowd the axis, fewer hide slow dynamics
+    deviations_of_95_percent: float = 1.96  # half width of a band that holds 95 % of a normal distribution
+    slope_samples: int = 20  # of a local derivative: fewer leave noise, more round off fast motion
+    zoom_share: float = 0.6  # of a log [1] from which it is drawn once, not whole and enlarged
+    least_sensitivity: float = 0.03  # that is drawn [1]: lower flattens the peak, higher cuts the slope off
+    limit_share: float = 0.35  # of a panel's range [1] within which a limit is drawn: a farther one squeezes the signal
+    marked_share: float = 0.95  # of the cases, whose bound is marked: a larger one hangs on the last few of 100
     raster_dpi: int = 200  # of clouds that become an image [1/inch]: lower blurs in print, higher makes the page large
     title_letters: int = 118  # a line of a title at 10 inches
     label_letters: int = 24  # a line of a label beside an axis
@@ -213,12 +225,20 @@ def to_svg(figure: "Figure", name: str, alt: str) -> str:
     str
     """
     from matplotlib import rc_context
+    from matplotlib.collections import PathCollection
+    from matplotlib.lines import Line2D
     from matplotlib.text import Text
 
     mend_texts(figure)
     texts = [artist for artist in figure.findobj(Text) if isinstance(artist, Text)]
-    for artist in figure.findobj(_is_large_cloud):
-        artist.set_rasterized(True)
+    for artist in figure.findobj():
+        size = 0
+        if isinstance(artist, Line2D) and artist.get_marker() not in ("", " ", "None", "none", None):
+            size = np.size(artist.get_xdata())
+        elif isinstance(artist, PathCollection):
+            size = len(np.asarray(artist.get_offsets()))
+        if size > STYLE.vector_markers:
+            artist.set_rasterized(True)
     formulas = any(text.get_parse_math() and text.get_text().count("$") > 1 for text in texts)
     content = io.BytesIO()
     with rc_context({"svg.hashsalt": HASH_SALT, "svg.fonttype": "path" if formulas else "none"}):
@@ -226,16 +246,6 @@ def to_svg(figure: "Figure", name: str, alt: str) -> str:
             content, format="svg", transparent=True, dpi=STYLE.raster_dpi, metadata={"Date": None, "Creator": None}
         )
     return _as_element(content.getvalue(), name, alt)
-
-
-def _is_large_cloud(artist: "Artist") -> bool:
-    from matplotlib.collections import PathCollection
-    from matplotlib.lines import Line2D
-
-    if isinstance(artist, Line2D):
-        has_markers = artist.get_marker() not in ("", " ", "None", "none", None)
-        return has_markers and np.size(artist.get_xdata()) > MAX_VECTOR_MARKERS
-    return isinstance(artist, PathCollection) and len(np.asarray(artist.get_offsets())) > MAX_VECTOR_MARKERS
 
 
 def _as_element(document: bytes, name: str, alt: str) -> str:
@@ -252,19 +262,15 @@ def _as_element(document: bytes, name: str, alt: str) -> str:
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
         own = element.attrib.pop("id", "")
-        element.attrib = {key.rpartition("}")[2]: _mend_value(key, v, name) for key, v in element.attrib.items()}
-        element.attrib |= {"id": f"{name}-{own}"} if own in used else {}
+        attributes = {key.rpartition("}")[2]: value for key, value in element.attrib.items()}
+        for key, value in attributes.items():
+            if key == "d":  # coordinates to a hundredth of a point, which no printer shows
+                attributes[key] = " ".join(_LONG_NUMBER.sub(lambda found: f"{float(found[0]):.2f}", value).split())
+            elif key in ("style", "href", "clip-path"):
+                attributes[key] = _REFERENCE.sub(rf"\1{name}-\2", value)
+        element.attrib = attributes | ({"id": f"{name}-{own}"} if own in used else {})
     width = float(root.attrib.pop("width").removesuffix("pt"))
     for key in ("height", "version"):
         root.attrib.pop(key, None)
     root.attrib |= {"role": "img", "aria-label": replace_unprintable(alt), "style": f"max-width:{width:.0f}pt"}
     return ET.tostring(root, encoding="unicode")
-
-
-def _mend_value(key: str, value: str, name: str) -> str:
-    """An attribute with its marks renamed, and coordinates to a hundredth of a point, which no printer shows."""
-    if key == "d":
-        return " ".join(_LONG_NUMBER.sub(lambda found: f"{float(found[0]):.2f}", value).split())
-    if key == "style" or key.endswith("href") or key == "clip-path":
-        return _REFERENCE.sub(rf"\1{name}-\2", value)
-    return value

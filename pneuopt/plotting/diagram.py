@@ -165,7 +165,16 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
     sheet.draw_arrow("control", loop.command.unit, least=sheet.above + 0.15 - sheet.x)
     outlet = _draw_plant(sheet, loop)
     _draw_feedback(sheet, loop, outlet, error)
-    _list_states(sheet, loop)
+    # all states in small print below, and what else the controller gets
+    outputs = {q.name: q for q in loop.plant.outputs}
+    seen = [*loop.motion_inputs, *(outputs[n] for n in loop.readings)]
+    listed = {"States": loop.states, "The controller also gets": seen}
+    letters = max(40, int(sheet.right / STYLE.legend_letter_width))
+    lines = []
+    for title, own in ((title, own) for title, own in listed.items() if own):
+        signals = ", ".join(" ".join(signal_lines(q)).replace(" [", "\u00a0[") for q in own)
+        lines.append(fill(f"{title}: {signals}", letters, break_on_hyphens=False))
+    sheet.write(0.0, sheet.low - 0.12, "\n".join(lines), ha="left", va="top", color="0.35")
     sheet.fit(figure)
     return figure
 
@@ -281,19 +290,6 @@ def _draw_feedback(sheet: Sheet, loop: ClosedLoop, outlet: float, error: float) 
         sheet.write(
             place - width / 2 - 0.1, STYLE.sensor_height + 0.04, " ".join(signal_lines(q)), ha="right", va="bottom"
         )
-
-
-def _list_states(sheet: Sheet, loop: ClosedLoop) -> None:
-    """All states in small print below, and what else the controller gets."""
-    outputs = {q.name: q for q in loop.plant.outputs}
-    seen = [*loop.motion_inputs, *(outputs[n] for n in loop.readings)]
-    listed = {"States": loop.states, "The controller also gets": seen}
-    letters = max(40, int(sheet.right / STYLE.legend_letter_width))
-    lines = []
-    for title, own in ((title, own) for title, own in listed.items() if own):
-        signals = ", ".join(" ".join(signal_lines(q)).replace(" [", "\u00a0[") for q in own)
-        lines.append(fill(f"{title}: {signals}", letters, break_on_hyphens=False))
-    sheet.write(0.0, sheet.low - 0.12, "\n".join(lines), ha="left", va="top", color="0.35")
 
 
 def _has_generator(loop: ClosedLoop) -> bool:

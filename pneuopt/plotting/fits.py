@@ -19,21 +19,13 @@ from pneuopt.plotting.canvas import (
     GREY,
     ORANGE,
     RED,
+    STYLE,
     axes_grid,
     common_channels,
     finish_columns,
     legend_above,
     note_omissions,
     plot_unit,
-)
-from pneuopt.plotting.tolerances import (
-    MAX_CORRELATION_LAG,
-    MAX_NUMBERED_CELLS,
-    MAX_PLOT_CHANNELS,
-    MAX_PLOT_COLUMNS,
-    MAX_PLOT_POINTS,
-    NORMAL_QUANTILE_95,
-    SLOPE_SAMPLES,
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -83,7 +75,7 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
     for number, (run, experiment) in enumerate(zip(runs, experiments, strict=True), 1):
         log = experiment.name.partition("@")[0] or f"log {number}"
         logs.setdefault(log, []).append((experiment.trajectory, run))
-    shown = [list(logs)[k] for k in sorted({round(k) for k in np.linspace(0, len(logs) - 1, MAX_PLOT_COLUMNS)})]
+    shown = [list(logs)[k] for k in sorted({round(k) for k in np.linspace(0, len(logs) - 1, STYLE.columns)})]
     channels = common_channels(runs, experiments)
     require(bool(channels), "the runs and the logs have no channel in common")
     figure, grid = axes_grid(2 * len(channels), len(shown), [2.2, 1.0] * len(channels), sharex="col")
@@ -95,7 +87,7 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
                 if channel not in measured or channel not in run:
                     continue
                 first = number == 0
-                every = max(1, len(measured) * len(pairs) // MAX_PLOT_POINTS)
+                every = max(1, len(measured) * len(pairs) // STYLE.points)
                 t, y = measured.t[::every], factor * measured[channel][::every]
                 top.plot(t, y, ".", color=GREY, ms=3, label="measured" if first else None)
                 top.plot(run.t, factor * run[channel], color=BLUE, lw=1.2, label=label if first else None)
@@ -126,12 +118,12 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
     pairs = list(zip(runs, experiments, strict=True))
     channels = common_channels(runs, experiments)
     require(bool(channels), "the runs and the logs have no channel in common")
-    shown = channels[:MAX_PLOT_CHANNELS]
+    shown = channels[: STYLE.channels]
     figure, grid = axes_grid(len(shown), 4, [2.4] * len(shown), width=13.0)
     for (over_time, auto, crossed, spread), channel in zip(grid, shown, strict=True):
         factor, unit = plot_unit([e for _, e in pairs], channel)
         residuals = _channel_residuals(pairs, channel)
-        every = max(1, sum(len(log) for log, _ in residuals) // MAX_PLOT_POINTS)
+        every = max(1, sum(len(log) for log, _ in residuals) // STYLE.points)
         for number, (log, e) in enumerate(residuals):
             colour = (BLUE, ORANGE)[number % 2] if len(residuals) <= 4 else BLUE
             over_time.plot(log.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
@@ -170,7 +162,7 @@ def plot_correlation(result: IdentificationResult) -> "Figure":
     axes.grid(False)
     axes.set_xticks(range(count), names, rotation=40, ha="right", fontsize=8)
     axes.set_yticks(range(count), names, fontsize=8)
-    if count <= MAX_NUMBERED_CELLS:
+    if count <= STYLE.numbered_cells:
         for (row, column), value in np.ndenumerate(values):
             colour = "white" if abs(value) > 0.6 else "black"
             # two digits, but never a 1.00 that is none
@@ -247,11 +239,11 @@ def _draw_distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experimen
 
 
 def _correlogram(e: Array, other: Array) -> Array:
-    """Correlation of residuals with another column 0 to `MAX_CORRELATION_LAG` samples before; NaN if constant."""
+    """Correlation of residuals with another column 0 to `STYLE.correlation_lag` samples before; NaN if constant."""
     finite = np.isfinite(e) & np.isfinite(other)
     a, b = (np.where(finite, v - np.mean(v[finite]), 0.0) if finite.any() else np.zeros(len(v)) for v in (e, other))
     size = math.sqrt(float(a @ a) * float(b @ b))
-    lags = min(MAX_CORRELATION_LAG, len(e) - 2) + 1
+    lags = min(STYLE.correlation_lag, len(e) - 2) + 1
     return np.array([a[k:] @ b[: len(b) - k] for k in range(lags)]) / size if size > 0 else np.full(lags, np.nan)
 
 
@@ -262,7 +254,7 @@ def _mean_correlogram(rows: Sequence[Array]) -> Array:
 
 
 def _draw_band(axes: "Axes", residuals: Sequence[Array]) -> None:
-    width = NORMAL_QUANTILE_95 / math.sqrt(sum(int(np.isfinite(e).sum()) for e in residuals))
+    width = STYLE.deviations_of_95_percent / math.sqrt(sum(int(np.isfinite(e).sum()) for e in residuals))
     axes.axhspan(-width, width, color=GREY, alpha=0.25, lw=0)
     axes.axhline(0, color=GREY, lw=0.8)
 
@@ -308,7 +300,7 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
         for name, e in zip(result.trajectories, experiments, strict=True)
     ]
     speed, force = (np.concatenate(part) for part in zip(*clouds, strict=True))
-    every = max(1, len(speed) // MAX_PLOT_POINTS)
+    every = max(1, len(speed) // STYLE.points)
     axes.plot(speed[::every], force[::every], ".", color=GREY, ms=2.5, alpha=0.6, label="from the logs")
     if imposed:
         fitted = np.concatenate([run["force"] for run in result.trajectories.values()])
@@ -377,7 +369,9 @@ def _drive_points(
         _state_rates(system, parameters, x, inputs)[axis.speed] for x in ({**seen, **idle}, {n: run[n] for n in states})
     )
     force = parameters.value(axis.inertia) * (pushed - moves - _smooth_derivative(log.t, deviation[axis.speed]))
-    reverses = np.convolve(np.abs(np.diff(np.sign(speed), prepend=np.nan)) > 0, np.ones(2 * SLOPE_SAMPLES), "same")
+    reverses = np.convolve(
+        np.abs(np.diff(np.sign(speed), prepend=np.nan)) > 0, np.ones(2 * STYLE.slope_samples), "same"
+    )
     return speed, np.where(reverses > 0, np.nan, force)
 
 
@@ -434,5 +428,5 @@ def _state_rates(
 
 
 def _smooth_derivative(t: Array, y: Array) -> Array:
-    window = SLOPE_SAMPLES * float(np.median(np.diff(t)))
+    window = STYLE.slope_samples * float(np.median(np.diff(t)))
     return differentiate(Experiment(Trajectory(t, {"position": y})), window=window).trajectory["speed"]

@@ -21,7 +21,6 @@ from pneuopt.plotting.canvas import (
     note_omissions,
     plot_unit,
 )
-from pneuopt.plotting.tolerances import MAX_PLOT_COLUMNS, MAX_PLOT_POINTS, MAX_ZOOM_SHARE
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 
@@ -39,7 +38,7 @@ def plot_logs(experiments: Sequence[Experiment]) -> "Figure":
     Figure
         Of the first three logs.
     """
-    shown = experiments[:MAX_PLOT_COLUMNS]
+    shown = experiments[: STYLE.columns]
     every = dict.fromkeys(n for e in shown for n in e.trajectory)
     channels = [*(n for n in CHANNELS if n in every), *(n for n in every if n not in CHANNELS)]
     figure, grid = axes_grid(len(channels), len(shown), [1.5] * len(channels), sharex="col")
@@ -62,8 +61,8 @@ def plot_logs(experiments: Sequence[Experiment]) -> "Figure":
 
 def _envelope(t: Array, y: Array) -> tuple[Array, Array]:
     """The curve with the least and the largest sample of each stretch, so that no short event is lost."""
-    stretch = -(-2 * t.size // MAX_PLOT_POINTS)
-    if stretch < 2 or t.size < MAX_PLOT_POINTS:
+    stretch = -(-2 * t.size // STYLE.points)
+    if stretch < 2 or t.size < STYLE.points:
         return t, y
     whole = t.size - t.size % stretch
     blocks = y[:whole].reshape(-1, stretch)
@@ -98,7 +97,7 @@ def plot_finding(finding: LogFinding) -> "Figure":
         raise InputError(f"the finding {finding.check!r} has no signals to be drawn")
     whole = float(shown.t[0]), float(shown.t[-1])
     views = {"whole log": whole}
-    if shown.view[1] - shown.view[0] < MAX_ZOOM_SHARE * (whole[1] - whole[0]):
+    if shown.view[1] - shown.view[0] < STYLE.zoom_share * (whole[1] - whole[0]):
         views["enlarged"] = shown.view
     figure, grid = axes_grid(len(shown.panels), len(views), [2.1] * len(shown.panels), sharex="col")
     for column, (label, view) in enumerate(views.items()):
@@ -106,7 +105,7 @@ def plot_finding(finding: LogFinding) -> "Figure":
             axes = grid[number][column]
             factor, _ = PLOT_UNITS.get(panel.unit, (1.0, ""))
             inside = np.flatnonzero((shown.t >= view[0]) & (shown.t <= view[1]))
-            part = inside[:: max(1, inside.size // MAX_PLOT_POINTS)]
+            part = inside[:: max(1, inside.size // STYLE.points)]
             for colour, (name, curve) in zip(COLOURS[number:], panel.curves.items(), strict=False):
                 axes.plot(shown.t[part], factor * curve[part], color=colour, lw=1.1, label=name)
             axes.set_xlim(*view)

@@ -12,8 +12,7 @@ from pneuopt.control.reference import Reference, Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.margins import Margins, frequency_grid, frequency_response, margins
 from pneuopt.evaluation.metric import Band, band_share, describe_band
-from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, finish_columns, legend_above
-from pneuopt.plotting.tolerances import MAX_PLOT_COLUMNS, MIN_PLOTTED_SENSITIVITY
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, STYLE, axes_grid, finish_columns, legend_above
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -72,7 +71,7 @@ def plot_steps(responses: Sequence[Response], *, band: Band = 0.02) -> "Figure":
     Figure
     """
     require(len(responses) > 0, "no response to plot")
-    shown = responses[:MAX_PLOT_COLUMNS]
+    shown = responses[: STYLE.columns]
     inside = [n for n in DRIVE_SIGNALS if all(n in response.run for response in shown)]
     figure, grid = axes_grid(2 + len(inside), len(shown), [2.6, 1.4, *(1.2 for _ in inside)], sharex="col")
     for (top, *others), response in zip(zip(*grid, strict=True), shown, strict=True):
@@ -98,7 +97,11 @@ def _draw_tracking(axes: "Axes", response: Response, band: Band) -> None:
         lw=0,
         label=f"± {describe_band(band, unit)}",
     )
-    axes.plot(*_reference_curve(reference, end), color=ORANGE, lw=1.0, label="reference")
+    t = np.array([0, reference.at, reference.at, end]) if isinstance(reference, Step) else np.linspace(0, end, 500)
+    # a step stands upright
+    upright = np.repeat([reference.initial, reference.final], 2)
+    values = upright if isinstance(reference, Step) else reference.values(t)
+    axes.plot(t, values, color=ORANGE, lw=1.0, label="reference")
     signal, before = run[response.measured], response.before
     if before is not None:
         axes.plot(*_dither_mean(before.t, before[response.measured], response), color=GREY, lw=1.0, label="before")
@@ -110,15 +113,6 @@ def _draw_tracking(axes: "Axes", response: Response, band: Band) -> None:
     axes.set_title(f"{reference.initial:g} to {reference.final:g} {unit}", fontsize=9)
     ends = [reference.initial, reference.final]
     _set_view_limits(axes, signal, ends, ends if before is None else before[response.measured])
-
-
-def _reference_curve(reference: Reference, end: float, points: int = 500) -> tuple[Array, Array]:
-    """Points of a reference up to the end of its record; a step stands upright."""
-    if isinstance(reference, Step):
-        values = [reference.initial, reference.initial, reference.final, reference.final]
-        return np.array([0, reference.at, reference.at, end]), np.array(values)
-    t = np.linspace(0, end, points)
-    return t, reference.values(t)
 
 
 def _draw_signal(axes: "Axes", response: Response, name: str, label: str, factor: float) -> None:
@@ -184,7 +178,7 @@ def plot_bode(open_loop: Linearisation, before: Linearisation | None = None) -> 
     for axes, name in ((top, "gain [dB]"), (middle, "phase [deg]"), (bottom, "|S|, dashed |T|")):
         axes.set_ylabel(name)
     bottom.set_xlabel("frequency [rad/s]")
-    bottom.set_ylim(bottom=MIN_PLOTTED_SENSITIVITY)
+    bottom.set_ylim(bottom=STYLE.least_sensitivity)
     stable = "" if m.stable else "  -  the closed loop is UNSTABLE"
     peaks = f"Ms = {m.max_sensitivity:.4g}, Mt = {m.max_complementary_sensitivity:.4g}"
     top.set_title(f"peaks of the sensitivities: {peaks}{stable}", fontsize=9)

@@ -25,15 +25,6 @@ from pneuopt.plotting.canvas import (
     legend_above,
     note_omissions,
 )
-from pneuopt.plotting.tolerances import (
-    MARKED_SHARE,
-    MAX_NUMBERED_CELLS,
-    MAX_PANELS,
-    MAX_PLOT_CHANNELS,
-    MAX_PLOT_COLUMNS,
-    NORMAL_QUANTILE_95,
-    SHOWN_LIMIT_SHARE,
-)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.studies.executors import INTERRUPTED_CASE
@@ -69,10 +60,13 @@ def plot_map(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[st
     InputError
         If there are more axes, or a column is not in the table.
     """
-    require(len(axes) in (1, 2), f"a study is drawn over one or two axes, this has {len(axes)}: {', '.join(axes)}")
+    require(
+        0 < len(axes) <= STYLE.map_axes,
+        f"a study is drawn over one or two axes, this has {len(axes)}: {', '.join(axes)}",
+    )
     require(len(metrics) > 0, "no metric to draw")
     check_names("column", [*axes, *metrics, "error"], [str(c) for c in table])
-    shown = dict(list(metrics.items())[:MAX_PLOT_COLUMNS])
+    shown = dict(list(metrics.items())[: STYLE.columns])
     width = min(10.0, 1.5 + 4.0 * len(shown))
     figure, (row,) = axes_grid(1, len(shown), [3.4], width=width)
     labels = [axis_label(name, unit) for name, unit in axes.items()]
@@ -118,9 +112,9 @@ def _draw_map(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], met
     panel.figure.colorbar(mesh, ax=panel, pad=0.02)
     panel.grid(False)
     for ticks, at in ((panel.set_xticks, x), (panel.set_yticks, y)):
-        every = 1 if len(at) <= MAX_NUMBERED_CELLS else -(-len(at) // STYLE.labels_of_long_axis)
+        every = 1 if len(at) <= STYLE.numbered_cells else -(-len(at) // STYLE.labels_of_long_axis)
         ticks(np.arange(0, len(at), every) + 0.5, [f"{v:.3g}" for v in at[::every]])
-    if max(len(x), len(y)) <= MAX_NUMBERED_CELLS:
+    if max(len(x), len(y)) <= STYLE.numbered_cells:
         for (j, i), value in np.ndenumerate(values):
             finite = bool(np.isfinite(value))
             text = f"{value:.3g}" if finite else _failure_word(metric, str(errors[j, i]))
@@ -191,34 +185,29 @@ def plot_distribution(table: "pd.DataFrame", metrics: Mapping[str, str]) -> "Fig
     """
     require(len(metrics) > 0, "no metric to draw")
     check_names("column", [*metrics, "error"], [str(c) for c in table])
-    shown = dict(list(metrics.items())[:MAX_PLOT_COLUMNS])
+    shown = dict(list(metrics.items())[: STYLE.columns])
     figure, (row,) = axes_grid(1, len(shown), [3.2], width=min(10.0, 1.5 + 3.6 * len(shown)))
     for panel, (metric, unit) in zip(row, shown.items(), strict=True):
-        _draw_shares(panel, table, metric)
+        figures = table.loc[(table["error"] == "") & table[metric].notna(), metric].to_numpy(dtype=float)
+        values = np.sort(figures[np.isfinite(figures)])
+        at_least = metric in METRICS and larger_is_better(metric)
+        values = values[::-1] if at_least else values
+        shares = np.arange(1, len(values) + 1) / len(table)
+        without = len(table) - len(values)
+        panel.set_title(f"{without} without a figure" if without else "", fontsize=10)
         panel.set_xlabel(axis_label(metric, unit))
         panel.set_ylim(0.0, 1.02)
+        if len(values):
+            panel.step([values[0], *values], [0.0, *shares], where="post", color=BLUE)
+        k = int(np.searchsorted(shares, STYLE.marked_share - 1e-9))
+        if k < len(values):
+            panel.plot([values[k]] * 2, [0.0, shares[k]], color=GREY, linestyle="--")
+            label = f"{100 * STYLE.marked_share:g} % {'at least' if at_least else 'at most'} {values[k]:.4g}"
+            place = (values[k], 0.03)
+            panel.annotate(label, place, xytext=(-3, 0), textcoords="offset points", ha="right", fontsize=8)
     row[0].set_ylabel(f"share of the {len(table)} cases [1]")
     note_omissions(figure, len(shown), len(metrics), "metrics")
     return figure
-
-
-def _draw_shares(panel: "Axes", table: "pd.DataFrame", metric: str) -> None:
-    figures = table.loc[(table["error"] == "") & table[metric].notna(), metric].to_numpy(dtype=float)
-    values = np.sort(figures[np.isfinite(figures)])
-    at_least = metric in METRICS and larger_is_better(metric)
-    values = values[::-1] if at_least else values
-    shares = np.arange(1, len(values) + 1) / len(table)
-    without = len(table) - len(values)
-    panel.set_title(f"{without} without a figure" if without else "", fontsize=10)
-    if not len(values):
-        return
-    panel.step([values[0], *values], [0.0, *shares], where="post", color=BLUE)
-    k = int(np.searchsorted(shares, MARKED_SHARE - 1e-9))
-    if k < len(values):
-        panel.plot([values[k]] * 2, [0.0, shares[k]], color=GREY, linestyle="--")
-        side = "at least" if at_least else "at most"
-        label = f"{100 * MARKED_SHARE:g} % {side} {values[k]:.4g}"
-        panel.annotate(label, (values[k], 0.03), xytext=(-3, 0), textcoords="offset points", ha="right", fontsize=8)
 
 
 def plot_sensitivity(indices: Sensitivity, local: LocalSensitivity | None = None) -> "Figure":
@@ -238,7 +227,7 @@ def plot_sensitivity(indices: Sensitivity, local: LocalSensitivity | None = None
         Of the first three figures that were told about; it says if there are more.
     """
     figures = list(indices.figures.index)
-    shown = figures[:MAX_PLOT_COLUMNS]
+    shown = figures[: STYLE.columns]
     table = indices.table
     order = table["total"].groupby(level="axis").max().sort_values(ascending=False).index.tolist()
     width = 2.2 + 2.6 * len(shown)
@@ -281,7 +270,7 @@ def plot_experiment(design: ExperimentDesign) -> "Figure":
         A panel the excitation, and one each signal that has a limit; several runs follow one another. Then half the
         95 % interval of each free parameter, over its value: before, where logs are in hand, and after.
     """
-    signals = [n for n in dict.fromkeys((design.channel, *design.limits)) if n in design.runs[0]][:MAX_PLOT_CHANNELS]
+    signals = [n for n in dict.fromkeys((design.channel, *design.limits)) if n in design.runs[0]][: STYLE.channels]
     heights = [1.3] * len(signals) + [0.6 + STYLE.parameter_height * len(design.table)]
     figure, grid = axes_grid(len(heights), 1, heights, width=8.0)
     *panels, last = (row[0] for row in grid)
@@ -310,7 +299,7 @@ def _draw_signal(panel: "Axes", design: ExperimentDesign, name: str) -> None:
             panel.axvline(begin, color=GREY, lw=0.8)
         begin += float(run.t[-1] + run.t[1])
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
-    room = SHOWN_LIMIT_SHARE * (highest - lowest)
+    room = STYLE.limit_share * (highest - lowest)
     for end in design.limits.get(name, ()):
         if lowest - room <= factor * end <= highest + room:
             panel.axhline(factor * end, color=RED, ls="--", lw=0.8)
@@ -328,7 +317,7 @@ def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
 
     def percent(column: str) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(100 * NORMAL_QUANTILE_95 * table[column].to_numpy(dtype=float) / size)
+            return np.asarray(100 * STYLE.deviations_of_95_percent * table[column].to_numpy(dtype=float) / size)
 
     before, after = percent("stderr_before"), percent("stderr_after")
     panel.hlines(places, after, before, color=GREY, lw=1)
@@ -361,7 +350,7 @@ def plot_tracking(tracking: Tracking) -> "Figure":
     library: Any = dates  # its locators have no types
 
     order = tracking.table.assign(calm=tracking.table["alarm"].isna()).sort_values(["calm", "p"]).index.tolist()
-    shown = order[:MAX_PANELS]
+    shown = order[: STYLE.panels]
     figure, grid = axes_grid(len(shown), 1, [2.2] * len(shown), sharex="col", width=8.0)
     for (panel,), name in zip(grid, shown, strict=True):
         history, row = tracking.history.loc[name], tracking.table.loc[name]

@@ -262,9 +262,9 @@ def parameter_key(parameter: Parameter, condition: str = "") -> Key:
 
 
 PARAMETER_KEYS: Mapping[str, Key] = {
-    "value": Key("where a search starts, or what holds", example='"5 kg"'),
-    "lower": Key("lower bound", example='"1 kg"'),
-    "upper": Key("upper bound", example='"20 kg"'),
+    "value": Key("where a search starts, or what holds", unit="{own}", example='"5 kg"'),
+    "lower": Key("lower bound", unit="{own}", example='"1 kg"'),
+    "upper": Key("upper bound", unit="{own}", example='"20 kg"'),
     "free": flag("whether it is identified, or tuned"),
     "log": flag("whether searches work on its logarithm"),
     "per_log": flag("whether each log has its own value"),

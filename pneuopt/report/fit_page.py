@@ -60,16 +60,26 @@ def fit_page(
     unknown = result.verdict.sentences if result.verdict else ()
     runs = list(result.trajectories.values())
     compared = (_comparison(runs, experiments, "fitted"),) if experiments and runs else ()
+    friction: tuple[Picture, ...] = ()
+    if isinstance(system, System) and compared and has_friction_map(system):
+        alt = "Friction force over speed: points that the logs imply, the fitted curve through them and its 95 % band."
+        caption = "Friction over speed: what the logs imply (points), the fitted curve and its 95 % band."
+        friction = (Picture(partial(plot_friction, system, result, experiments), alt, caption),)
+    evidence: list[Report | Picture] = []
+    for finding in findings:
+        place = f"{finding.log}: " if finding.log else ""
+        evidence.append(Report((Line(f"{place}{finding.message}"),)))
+        evidence += [_finding_picture(finding)] if finding.evidence is not None else []
     rows = result.fit.reset_index().to_dict(orient="records")
     counted = {(str(row["log"]), str(row["channel"])): float(row["noise"]) for row in rows}
     sections = (
         _estimate_section(result),
         Section("Agreement with the logs", (report_agreement(result.fit), *compared)),
         _held_out_section(result, system, held_out),
-        _friction_section(result, system, experiments),
+        Section("Friction", friction),
         Section("Residuals", (_residual_picture(runs, experiments),) if compared else ()),
         Section("Simulated and fitted again", () if trial is None else (trial,)),
-        _finding_section(findings),
+        Section("Found in the logs", tuple(evidence)),
         _known_section(result),
         data_section((*experiments, *held_out), noise=counted),
         provenance_section(result.provenance, {**head.hashes, **log_hashes(held_out)}),
@@ -154,16 +164,6 @@ def _held_out_section(
     return Section("Held-out runs", parts)
 
 
-def _friction_section(
-    result: IdentificationResult, system: System | ClosedLoop | None, experiments: Sequence[Experiment]
-) -> Section:
-    if not isinstance(system, System) or not experiments or not result.trajectories or not has_friction_map(system):
-        return Section("Friction", ())
-    alt = "Friction force over speed: points that the logs imply, the fitted curve through them and its 95 % band."
-    caption = "Friction over speed: what the logs imply (points), the fitted curve and its 95 % band."
-    return Section("Friction", (Picture(partial(plot_friction, system, result, experiments), alt, caption),))
-
-
 def _residual_picture(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Picture:
     alt = (
         "For each channel four plots: residuals over time, their autocorrelation, their correlation with the inputs, "
@@ -180,15 +180,6 @@ def _comparison(runs: Sequence[Trajectory], experiments: Sequence[Experiment], l
     alt = f"Measured and {label} signals of {_names(experiments)} over time, and below each what remains between them."
     caption = f"Measured and {label}, and what remains between them."
     return Picture(partial(plot_prediction, list(runs), list(experiments), label=label), alt, caption)
-
-
-def _finding_section(findings: Sequence[LogFinding]) -> Section:
-    parts: list[Report | Picture] = []
-    for finding in findings:
-        place = f"{finding.log}: " if finding.log else ""
-        parts.append(Report((Line(f"{place}{finding.message}"),)))
-        parts += [_finding_picture(finding)] if finding.evidence is not None else []
-    return Section("Found in the logs", tuple(parts))
 
 
 def _finding_picture(finding: LogFinding) -> Picture:

@@ -95,19 +95,10 @@ def render_page(page: Page, *, draws: bool = True) -> str:
 
     template = resources.files(__package__).joinpath("page.html").read_text("utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    numbers = count(1)
-
-    def blocks(parts: tuple[Report | Picture, ...]) -> Iterator[dict[str, Any]]:
-        for part in parts:
-            if isinstance(part, Picture):
-                if draws:
-                    block = _picture_block(part, next(numbers))
-                    yield {**block, "svg": Markup(block["svg"])} if "svg" in block else block
-            else:
-                yield from map(_report_block, part.parts)
-
-    sections = [{"title": s.title, "blocks": found} for s in page.sections if (found := list(blocks(s.parts)))]
-    verdict = list(blocks((page.verdict,)))
+    numbers = count(1) if draws else None
+    made = ((section.title, list(_make_blocks(section.parts, numbers))) for section in page.sections)
+    sections = [{"title": title, "blocks": blocks} for title, blocks in made if blocks]
+    verdict = list(_make_blocks((page.verdict,), numbers))
     tones = [block.get("tone", Tone.PLAIN.value) for block in verdict]
     tone = max(tones, key=_SEVERITY.index, default=Tone.PLAIN.value)
     script = page.script() if page.script is not None and draws else ""
@@ -123,19 +114,28 @@ def render_page(page: Page, *, draws: bool = True) -> str:
     return replace_unprintable(text)  # of a file's name, say, whose bytes are no letters
 
 
-def _picture_block(picture: Picture, number: int) -> dict[str, Any]:
-    try:
-        svg = to_svg(picture.draw(), f"figure{number}", picture.alt)
-    except InputError as error:
-        return {"kind": "line", "text": f"{picture.caption} is not drawn: {error}", "tone": "plain", "indent": 0}
-    return {"kind": "picture", "svg": svg, "number": number, "caption": picture.caption}
+def _make_blocks(parts: Sequence[Report | Picture], numbers: Iterator[int] | None) -> Iterator[dict[str, Any]]:
+    """What the template shows of a section's parts; without `numbers` no figures."""
+    from markupsafe import Markup
 
-
-def _report_block(part: Line | Table) -> dict[str, Any]:
-    if isinstance(part, Line):
-        return {"kind": "line", "text": part.text, "tone": part.tone.value, "indent": part.indent}
-    columns = [{"heading": c.heading.split("\n"), "is_text": c.is_text} for c in part.columns]
-    return {"kind": "table", "columns": columns, "rows": part.rows}
+    for part in parts:
+        if isinstance(part, Picture):
+            if numbers is None:
+                continue
+            number = next(numbers)
+            try:
+                svg = Markup(to_svg(part.draw(), f"figure{number}", part.alt))
+                yield {"kind": "picture", "svg": svg, "number": number, "caption": part.caption}
+            except InputError as error:
+                text = f"{part.caption} is not drawn: {error}"
+                yield {"kind": "line", "text": text, "tone": Tone.PLAIN.value, "indent": 0}
+            continue
+        for own in part.parts:
+            if isinstance(own, Line):
+                yield {"kind": "line", "text": own.text, "tone": own.tone.value, "indent": own.indent}
+            else:
+                columns = [{"heading": c.heading.split("\n"), "is_text": c.is_text} for c in own.columns]
+                yield {"kind": "table", "columns": columns, "rows": own.rows}
 
 
 _HASH = "sha256["
@@ -152,7 +152,15 @@ def data_section(experiments: Sequence[Experiment], noise: Mapping[tuple[str, st
         rate = write_value(float(np.median(np.diff(t))), "s", 4) if len(t) > 1 else "-"
         source = log.source.path if log.source else ""
         logs.append((log.name or "log", str(len(t)), f"{t[0]:.6g}", f"{t[-1]:.6g}", rate, source))
-        channels += [_channel_row(log, channel, noise or {}) for channel in log.trajectory]
+        for channel in log.trajectory:
+            values, unit = log.trajectory[channel], log.unit(channel) or "1"
+            column = log.source.columns.get(channel) if log.source else None
+            finite = values[np.isfinite(values)]
+            ends = [write_value(float(f(finite)), unit, 4) if finite.size else "-" for f in (np.min, np.max)]
+            level = log.noise.get(channel, (noise or {}).get((log.name, channel), math.nan))
+            shown = "-" if math.isnan(level) else write_value(level, unit, 3)
+            missing = format_number(len(values) - finite.size, 6)
+            channels.append((log.name or "log", channel, column.name if column else "", *ends, shown, missing))
     heads = *text_columns("log"), *number_columns("samples", "from [s]", "to [s]", "one every")
     own = *text_columns("log", "channel", "column"), *number_columns("least", "largest", "noise", "missing")
     known = (Line(f"in {e.name}: {n} = {value:.6g}") for e in experiments for n, value in e.conditions.items())
@@ -176,17 +184,6 @@ def provenance_section(provenance: Mapping[str, str], hashes: Mapping[str, str])
     tables = [Table(text_columns("read", "SHA-256"), files)] if files else []
     heading = [Line("options", Tone.HEADING), *(Line(text) for text in options.split("; "))] if options else []
     return Section("Provenance", (Report((*tables, *lines, *heading)),))
-
-
-def _channel_row(log: Experiment, channel: str, counted: Mapping[tuple[str, str], float]) -> tuple[str, ...]:
-    values, unit = log.trajectory[channel], log.unit(channel)
-    column = log.source.columns.get(channel) if log.source else None
-    finite = values[np.isfinite(values)]
-    low, high = (write_value(float(f(finite)), unit or "1", 4) if finite.size else "-" for f in (np.min, np.max))
-    level = log.noise.get(channel, counted.get((log.name, channel), math.nan))
-    noise = "-" if math.isnan(level) else write_value(level, unit or "1", 3)
-    missing = format_number(len(values) - finite.size, 6)
-    return (log.name or "log", channel, column.name if column else "", low, high, noise, missing)
 
 
 LAW_TEXTS = {

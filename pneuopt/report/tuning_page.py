@@ -7,10 +7,11 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import resources
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,16 +53,6 @@ from pneuopt.report.page import (
     report_forms,
     report_settings,
     write_page,
-)
-from pneuopt.report.tolerances import (
-    INCLINE,
-    INDEPENDENT,
-    LOG_RANGE,
-    RESIDUAL,
-    SHRINKAGES,
-    SLIDER_RANGE,
-    UNCHANGED_LEAST,
-    UNCHANGED_RATIO,
 )
 from pneuopt.studies.sensitivity import Sensitivity
 from pneuopt.tuning.result import TuningResult, report_active, report_certificate_status, report_gains, report_refusal
@@ -228,7 +219,19 @@ def tuning_page(
     if dither:
         verdict += Report(tuple(p for p in dither.parts[:1] if isinstance(p, Line) and p.tone in DOUBTS))
     steps, bode = view.pictures() if view is not None else (None, None)
-    outcome = _design_sections(result, was, steps) if found else _refusal_sections(result, stands, steps)
+    outcome = (
+        Section("What was tried" if stands else "Figures", (report_refusal(result, stands),)),
+        Section("The gains that stand" if stands else "The response", _some(steps)),
+    )
+    if found:
+        beside = ("was", was) if result.on_rig is None else ("on rig", result.on_rig)
+        metrics = report_metrics(result.certified, result.units, beside=beside, limits=result.limits)
+        held = report_active(result.requirements, result.active, result.parameters)
+        notes = report_notes(certificate.notes) if certificate is not None else Report()
+        outcome = (
+            Section("Gains", (report_gains(result.given, result.parameters),)),
+            Section("Before and after", (metrics, held, notes, *_some(steps))),
+        )
     sections = (
         *outcome,
         _form_section(view),
@@ -256,7 +259,16 @@ def simulation_page(
     count, cases = len(found.findings), len(found.metrics.columns)
     word = f"{count} defect{'s' if count > 1 else ''}" if count else "no defect"
     lead = Line(f"simulated: {word} in {cases} case{'s' if cases > 1 else ''}", Tone.BAD if count else Tone.GOOD)
-    broken = tuple(Line(text, Tone.BAD, 2) for text in _broken_limits(found.metrics, limits or {}))
+    broken = []
+    for name, limit in (n for n in (limits or {}).items() if n[0] in found.metrics.index):  # by the worst case
+        least = larger_is_better(name)
+        nothing = -math.inf if least else math.inf  # a case without a figure keeps no limit
+        row = found.metrics.T[name].astype(float).to_dict()
+        values = {str(case): nothing if math.isnan(v) else v for case, v in row.items()}
+        case = (min if least else max)(values, key=lambda c: values[c])
+        if values[case] < limit if least else values[case] > limit:
+            text = f"{name} {metric_cell(name, row[case])} breaks its limit of {limit:.4g} at {case}"
+            broken.append(Line(text, Tone.BAD, 2))
     verdict = (standing or Report()) + Report((lead, *(Line(f.sentence, indent=2) for f in found.findings), *broken))
     steps, bode = view.pictures() if view is not None else (None, None)
     figures = report_metrics(found.metrics, found.units, title="simulated", limits=limits)
@@ -269,26 +281,6 @@ def simulation_page(
     )
     script = None if view is None else partial(view.script, limits or {}, found.metrics)
     return Page(head.title, verdict, sections, head.warnings, script)
-
-
-def _design_sections(
-    result: TuningResult, was: "pd.DataFrame | None", steps: Picture | None
-) -> tuple[Section, Section]:
-    """Gains before and after; certified metrics beside those before, and what holds them back."""
-    beside = ("was", was) if result.on_rig is None else ("on rig", result.on_rig)
-    metrics = report_metrics(result.certified, result.units, beside=beside, limits=result.limits)
-    held = report_active(result.requirements, result.active, result.parameters)
-    notes = report_notes(result.certificate.notes) if result.certificate is not None else Report()
-    gains = Section("Gains", (report_gains(result.given, result.parameters),))
-    return gains, Section("Before and after", (metrics, held, notes, *_some(steps)))
-
-
-def _refusal_sections(result: TuningResult, stands: str, steps: Picture | None) -> tuple[Section, ...]:
-    """What was tried and refused; below it the response with the gains that stand."""
-    return (
-        Section("What was tried" if stands else "Figures", (report_refusal(result, stands),)),
-        Section("The gains that stand" if stands else "The response", _some(steps)),
-    )
 
 
 def _form_section(view: LoopView | None) -> Section:
@@ -313,21 +305,6 @@ def _loop_section(view: LoopView | None) -> Section:
     if view is None:
         return Section("The loop", ())
     return Section("The loop", (diagram_picture(view.loop), report_settings(view.loop.controller, view.parameters)))
-
-
-def _broken_limits(metrics: "pd.DataFrame", limits: Mapping[str, float]) -> Iterator[str]:
-    """A sentence a limit that the worst case breaks."""
-    for name, limit in limits.items():
-        if name not in metrics.index:
-            continue
-        least = larger_is_better(name)
-        nothing = -math.inf if least else math.inf  # a case without a figure keeps no limit
-        row = metrics.T[name].astype(float).to_dict()
-        values = {str(case): nothing if math.isnan(v) else v for case, v in row.items()}
-        case = (min if least else max)(values, key=lambda c: values[c])
-        if values[case] < limit if least else values[case] > limit:
-            shown = metric_cell(name, row[case])
-            yield f"{name} {shown} breaks its limit of {limit:.4g} at {case}"
 
 
 def _some(picture: Picture | None) -> tuple[Picture, ...]:
@@ -393,6 +370,12 @@ class RestFinder:
     loop: ClosedLoop
     reference: Step
     parameters: ParameterSet  # every parameter of the loop, as designed
+    # share of a state's nominal size, a second, that counts as zero: what a rest's own root searches leave is below
+    residual: float = 1e-6
+    # when two rests are one, as a share and in SI: below these a response cannot be told from the other
+    unchanged: tuple[float, float] = (1e-9, 1e-12)
+    # least share of the largest singular value of the residuals' slopes: below it a direction is undetermined
+    independent: float = 1e-9
 
     @cached_property
     def start(self) -> Array:
@@ -408,7 +391,7 @@ class RestFinder:
         moved: set[int] = set()
         for name, value in values:
             found = self.rest(self.parameters.with_values({name: value}))
-            moved |= set(np.flatnonzero(~np.isclose(found, self.start, UNCHANGED_RATIO, UNCHANGED_LEAST)).tolist())
+            moved |= set(np.flatnonzero(~np.isclose(found, self.start, *self.unchanged)).tolist())
         return moved
 
     def is_singular(self, unknown: Sequence[int]) -> bool:
@@ -416,11 +399,16 @@ class RestFinder:
         if not unknown:
             return False
         sizes = np.array([self.loop.states[k].nominal for k in unknown])
-        slopes = np.column_stack([self._slope(k, 1e-6 * size) for k, size in zip(unknown, sizes, strict=True)])
+        (rates, error), columns = self._residuals(self.start), []
+        for k, size in zip(unknown, sizes, strict=True):  # differences of the residuals that vanish, a column a state
+            moved, off = self._residuals(self.start + 1e-6 * size * (np.arange(len(self.start)) == k))
+            change = np.append((moved - rates)[self._vanishing], off - error if self._holds else 0.0)
+            columns.append(change / (1e-6 * size) * size)
+        slopes = np.column_stack(columns)
         weights = np.abs(slopes).max(axis=1)
         slopes = slopes[weights > 0] / weights[weights > 0, None]
         singular = np.linalg.svd(slopes, compute_uv=False) if len(slopes) >= len(unknown) else np.zeros(1)
-        return bool(singular[-1] <= INDEPENDENT * singular[0])
+        return bool(singular[-1] <= self.independent * singular[0])
 
     def data(self, unknown: Sequence[int], places: Sequence[int]) -> dict[str, Any]:
         """What the page's `findRest` reads: the residuals and states, and the parameters that move the rest."""
@@ -432,12 +420,12 @@ class RestFinder:
         nominal = np.array([q.nominal for q in self.loop.states])
         found, count = self._residuals(self.start)[0], len(nominal)
         sizes = np.tile(nominal, len(found) // count)
-        return np.flatnonzero(np.abs(found) <= RESIDUAL * sizes).tolist()
+        return np.flatnonzero(np.abs(found) <= self.residual * sizes).tolist()
 
     @cached_property
     def _holds(self) -> bool:
         """Whether the measured signal is the reference there; a controller without an integral leaves an error."""
-        return abs(self._residuals(self.start)[1]) <= RESIDUAL * self.loop.feedback.nominal
+        return abs(self._residuals(self.start)[1]) <= self.residual * self.loop.feedback.nominal
 
     def _residuals(self, x: Array) -> tuple[Array, float]:
         """Rates and what a sample changes, one after the other; the error of the measured signal."""
@@ -450,13 +438,6 @@ class RestFinder:
         parts = [rates] if motion.update is None else [rates, motion.update(0, x, u, p).full().ravel() - x]
         place = [q.name for q in loop.outputs].index(loop.feedback.name)
         return np.concatenate(parts), float(y[place]) - self.reference.initial
-
-    def _slope(self, k: int, h: float) -> Array:
-        """Of the residuals that vanish, by a state [their units a nominal size]."""
-        moved = self.start + h * (np.arange(len(self.start)) == k)
-        now, then = (self._residuals(x) for x in (self.start, moved))
-        own = (then[0] - now[0])[self._vanishing]
-        return np.append(own, then[1] - now[1] if self._holds else 0.0) / h * self.loop.states[k].nominal
 
 
 def is_refused(finder: RestFinder, name: str, value: float) -> bool:
@@ -475,7 +456,7 @@ PLANT_SECTIONS = ("load", "supply", "friction")
 NOT_MOVED = ("pid.Tt", "pid.lower", "pid.upper", "pid.fault_samples", "pid.fault_output", "friction.smoothing")
 """Parameters without a slider: limits of hardware, what only a fault shows, and what makes a loop too stiff here."""
 RANGES = {"supply.pressure": 1.5}
-"""`SLIDER_RANGE` where hardware varies less: no shop's air has three times its pressure."""
+"""Ratio of a slider's ends to its value where hardware varies less: no shop's air has three times its pressure."""
 
 
 def live_script(
@@ -506,12 +487,15 @@ def live_script(
     units = relevant_units(loop)
     sliders, rests = _sliders(finders)
     places = {q.name: k for k, q in enumerate(loop.inputs)}
+    columns = [] if certified is None else [own.astype(float).to_dict() for _, own in certified.items()]
+    # the metrics that the script reads, too; a settling time of NaN is none
+    shown = [{n: own[n] for n in LIVE_METRICS if not math.isnan(own.get(n, math.nan))} for own in columns]
     data = {
         "values": loop.parameter_vector(parameters).tolist(),
         "sliders": sliders,
         "references": [
             _reference(r, places, loop.feedback.unit)
-            | {"x0": x0, "rest": rest, "band": band_share(band, r), "certified": _figures(certified, k)}
+            | {"x0": x0, "rest": rest, "band": band_share(band, r), "certified": shown[k] if k < len(shown) else {}}
             for (k, r), x0, rest in zip(steps.items(), starts, rests, strict=True)
         ],
         "limits": {n: limit for n, limit in (limits or {}).items() if n in LIVE_METRICS},
@@ -521,21 +505,13 @@ def live_script(
         "labels": [f"{q.name} [{q.unit}]" for q in (loop.feedback, loop.outputs[-1])],
         "controller": list(loop.controller.tunable_sections),
     }
-    rest, page = (resources.files(__package__).joinpath(n).read_text("utf-8") for n in ("live_rest.js", "live.js"))
-    return f"{code}\nconst DATA = {to_script(data)};\n{rest}{page}"
+    live, page = (resources.files(__package__).joinpath(n).read_text("utf-8") for n in ("live_rest.js", "live.js"))
+    return f"{code}\nconst DATA = {to_script(data)};\n{live}{page}"
 
 
 def to_script(value: Any) -> str:
     """A value as JavaScript that no page can take for markup: ASCII without "<", infinities by their name."""
     return json.dumps(value, ensure_ascii=True).replace("<", "\\u003c")
-
-
-def _figures(certified: "pd.DataFrame | None", column: int) -> dict[str, float]:
-    """The metrics of a reference that the script reads, too; a settling time of NaN is none."""
-    if certified is None or column >= len(certified.columns):
-        return {}
-    own = certified.iloc[:, column].astype(float).to_dict()
-    return {n: own[n] for n in LIVE_METRICS if n in own and not math.isnan(own[n])}
 
 
 def _reference(reference: Step, places: Mapping[str, int], unit: str) -> dict[str, Any]:
@@ -567,38 +543,37 @@ def _sliders(finders: Sequence[RestFinder]) -> tuple[list[dict[str, Any]], list[
     return list(every.values()), [f.data(states, own) if states else None for f, states, own in found]
 
 
-def _slider(finders: Sequence[RestFinder], parameters: ParameterSet, name: str) -> dict[str, Any] | None:
-    """Of a parameter that may move; None where its ends cannot run."""
+def _slider(
+    finders: Sequence[RestFinder],
+    parameters: ParameterSet,
+    name: str,
+    *,
+    ratio: float = 3.0,  # of the ends to the value where no bounds say more: less hides what changes
+    incline: float = 0.5,  # share of its weight that a load's force is moved by: an axis tilted by 30 degrees
+    halvings: int = 4,  # of the way to an end where the loop cannot rest; beyond it is hardly a way
+    log_ratio: float = 20.0,  # of the ends from which it is logarithmic: else most of its way is one value
+) -> dict[str, Any] | None:
+    """Of a parameter that may move, within its bounds if it is tuned; None where its ends cannot run."""
     loop = finders[0].loop
     sections = (*PLANT_SECTIONS, *loop.controller.tunable_sections)
     if name in NOT_MOVED or name.partition(".")[0] not in sections:
         return None
     p = parameters[name]
-    low, high = (_runnable_end(finders, name, p.value, end) for end in _ends(parameters, name))
+    low, high = sorted((p.value / (ratio := RANGES.get(name, ratio)), p.value * ratio))
+    if name == "load.force" and "load.mass" in parameters:
+        reach = incline * GRAVITY * parameters.value("load.mass")
+        low, high = p.value - reach, p.value + reach
+    low, high = max(low, p.lower), min(high, p.upper)
+    if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
+        low, high = p.lower, p.upper
+    ends = []
+    for end in (low, high):  # or one nearer to the value, where the loop cannot rest at it
+        nearer = accumulate(range(halvings - 1), lambda last, _: (p.value + last) / 2, initial=end)
+        ends.append(next((e for e in nearer if not any(is_refused(f, name, e) for f in finders)), p.value))
+    low, high = ends
     if not low < high:
         return None
-    is_log = low > 0 and high / low > LOG_RANGE
+    is_log = low > 0 and high / low > log_ratio
     place = list(loop.parameters).index(name)
     scale, unit = PLOT_UNITS.get(p.unit, (1.0, p.unit))  # a pressure in bar, as everywhere on the page
     return {"name": name, "place": place, "scale": scale, "unit": unit, "low": low, "high": high, "isLog": is_log}
-
-
-def _runnable_end(finders: Sequence[RestFinder], name: str, value: float, end: float) -> float:
-    """The end, or one nearer to the value where the loop cannot rest at it."""
-    for _ in range(SHRINKAGES):
-        if not any(is_refused(finder, name, end) for finder in finders):
-            return end
-        end = (value + end) / 2
-    return value
-
-
-def _ends(parameters: ParameterSet, name: str) -> tuple[float, float]:
-    """From where to where a slider goes: the bounds of what is tuned, else around its value."""
-    p = parameters[name]
-    if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
-        return p.lower, p.upper
-    ends = sorted((p.value / (ratio := RANGES.get(name, SLIDER_RANGE)), p.value * ratio))
-    if name == "load.force" and "load.mass" in parameters:
-        reach = INCLINE * GRAVITY * parameters.value("load.mass")
-        ends = [p.value - reach, p.value + reach]
-    return max(ends[0], p.lower), min(ends[1], p.upper)

@@ -21,7 +21,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from math import inf, isfinite, nan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -48,7 +48,50 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-_COLUMNS = tuple(f"{index}{end}" for index in ("first", "total") for end in ("", "_low", "_high"))
+class ShareRow(TypedDict):
+    """A row of `Sensitivity.table`: shares of a figure's variance [1], and the ends of their 95 % intervals.
+
+    The intervals are by the sampling; all is NaN where too many points have no figure.
+
+    Attributes
+    ----------
+    first : float
+        What the axis brings by itself.
+    first_low, first_high : float
+        Ends of its interval.
+    total : float
+        With what the axis does by way of the others.
+    total_low, total_high : float
+        Ends of its interval.
+    """
+
+    first: float
+    first_low: float
+    first_high: float
+    total: float
+    total_low: float
+    total_high: float
+
+
+class SpreadRow(TypedDict):
+    """A row of `Sensitivity.figures`, in the figure's unit.
+
+    Attributes
+    ----------
+    mean : float
+        Mean over the box [unit].
+    std : float
+        Standard deviation over the box [unit].
+    lost : float
+        Share of the points without the figure [1].
+    """
+
+    mean: float
+    std: float
+    lost: float
+
+
+_COLUMNS = tuple(ShareRow.__annotations__)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,11 +101,9 @@ class Sensitivity(Shown):
     Attributes
     ----------
     table : DataFrame
-        A row a figure and axis: first, the share of the figure's variance that the axis brings by itself; total, its
-        share together with what it does by way of the others; the ends of their 95 % intervals by the sampling (NaN
-        where too many points have no figure).
+        A row a figure and axis, a `ShareRow`.
     figures : DataFrame
-        A row a figure: mean and standard deviation over the box, and lost, the share of points without one.
+        A row a figure, a `SpreadRow`.
     cases : DataFrame
         As `sweep` returns them.
     """
@@ -173,11 +214,8 @@ def _tabulate(cases: "pd.DataFrame", figures: Sequence[str], axes: Sequence[str]
     for figure in figures:
         blocks = cases[figure].to_numpy(dtype=float).reshape(len(axes) + 2, count)
         whole = np.isfinite(blocks).all(axis=0)
-        about[figure] = {
-            "mean": float(np.nanmean(blocks[:2])) if whole.any() else nan,
-            "std": float(np.nanstd(blocks[:2])) if whole.any() else nan,
-            "lost": 1 - float(whole.mean()),
-        }
+        mean, std = (float(f(blocks[:2])) if whole.any() else nan for f in (np.nanmean, np.nanstd))
+        about[figure] = SpreadRow(mean=mean, std=std, lost=1 - float(whole.mean()))
         enough = about[figure]["lost"] <= MAX_LOST
         kept = np.flatnonzero(whole) if enough else np.arange(0)
         if kept.size:  # SciPy takes a power of two, so in place of the points that are lost some count twice
@@ -229,6 +267,25 @@ GRID_PARAMETERS = ("dither.frequency",)
 """Parameters with which the samples of a response move: its derivative at samples that stay is not the figure's."""
 
 
+class SlopeRow(TypedDict):
+    """A row of `LocalSensitivity.table`; NaN where the design has no such figure.
+
+    Attributes
+    ----------
+    change : float
+        Change of the figure for one standard deviation of the axis [unit].
+    relative : float
+        That change over the figure, infinite where that is 0 [1].
+    share : float
+        Share of the variance that the axis would bring were the figure linear [1]: the change's square over the sum of
+        the squares, beside which `ShareRow` has first.
+    """
+
+    change: float
+    relative: float
+    share: float
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class LocalSensitivity(Shown):
     """Change of a design's figures with the tolerances.
@@ -236,10 +293,7 @@ class LocalSensitivity(Shown):
     Attributes
     ----------
     table : DataFrame
-        A row a figure and axis, as of `Sensitivity`: change, of the figure for one standard deviation of the axis [its
-        unit]; relative, that change over the figure (infinite where that is 0); share, its square over the sum of the
-        squares, the share of the variance that the axis would bring were the figure linear, beside which the first
-        index of a `Sensitivity` belongs. NaN where the design has no such figure.
+        A row a figure and axis, as of `Sensitivity`: a `SlopeRow`.
     figures : DataFrame
         A row a figure: value at the design, and std, the standard deviation that the changes make together.
     """
@@ -328,7 +382,7 @@ def local_sensitivity(
     full_loop = add_disturbances(loop, steps)
     axes = _axis_steps(full_loop, parameters, spreads)
     batch = PlantBatch(full_loop, steps, parameters, {"design": {}}, chosen, band)
-    rows, about = dict[tuple[str, str], dict[str, float]](), dict[str, dict[str, float]]()
+    rows, about = dict[tuple[str, str], SlopeRow](), dict[str, dict[str, float]]()
     for spacing, substeps in zip(batch.grids, batch.substeps, strict=True):
         y, along = _run_with_sensitivities(full_loop, batch, spacing, substeps, axes)
         moved = np.concatenate([y[None], y + SIDE * along, y - SIDE * along])
@@ -341,7 +395,7 @@ def local_sensitivity(
             with np.errstate(divide="ignore", invalid="ignore"):
                 relative, shares = changes / abs(value), squares / squares.sum() if squares.any() else squares
             for k, axis in enumerate(axes):
-                rows[figure, axis] = {"change": changes[k], "relative": relative[k], "share": shares[k]}
+                rows[figure, axis] = SlopeRow(change=changes[k], relative=relative[k], share=shares[k])
     index = pd.MultiIndex.from_tuples(rows, names=["figure", "axis"])
     return LocalSensitivity(WideFrame(list(rows.values()), index=index), WideFrame.from_dict(about, orient="index"))
 

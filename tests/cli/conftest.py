@@ -9,6 +9,7 @@ import pytest
 import tomlkit
 from jsonschema import Draft202012Validator
 
+from pneuopt.cli.shared import ScreenStyle
 from pneuopt.files.outputs import OUTPUTS, output_schema
 from pneuopt.quantities.output import write_json
 
@@ -16,7 +17,7 @@ from pneuopt.quantities.output import write_json
 @pytest.fixture(autouse=True)
 def _no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     """Standard error holds what a command says, however slow the machine is."""
-    monkeypatch.setattr("pneuopt.cli.shared.SECONDS_A_LINE", 3600.0)
+    monkeypatch.setattr("pneuopt.cli.shared.SCREEN", ScreenStyle(3600.0))
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from pneuopt.cli.shared import make_console, progress, show_report, show_sentence
+from pneuopt.cli.shared import ScreenStyle, make_console, progress, show_report, show_sentence
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, Form
 from pneuopt.control.reference import Step
@@ -161,7 +161,7 @@ def test_the_plants_are_told_verdict_first_and_what_would_help() -> None:
 def test_in_a_pipe_progress_is_a_line_every_few_seconds(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("pneuopt.cli.shared.SECONDS_A_LINE", 0.01)
+    monkeypatch.setattr("pneuopt.cli.shared.SCREEN", ScreenStyle(0.01))
     with progress("identifying", quiet=False) as report:
         report("stage 2 of 6")
         ended = threading.Event()
@@ -182,7 +182,7 @@ def test_no_color_leaves_no_escape(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     monkeypatch.setenv("NO_COLOR", "1")
     show_report(make_console(), verdict)
     assert "\x1b" not in capsys.readouterr().out
-    monkeypatch.setattr("pneuopt.cli.shared.SECONDS_A_LINE", 0.01)
+    monkeypatch.setattr("pneuopt.cli.shared.SCREEN", ScreenStyle(0.01))
     with progress("tuning", quiet=False) as report:
         report("generation 3")
         threading.Event().wait(0.1)
