@@ -359,9 +359,9 @@ class SuccessHistory:
         towards = x[rng.choice(best, m)]
         pool, own = np.vstack([x, self._archive]), np.arange(m)
         one = (own + rng.integers(1, m, size=m)) % m  # neither it nor `other` is the member itself
-        other: Indices = rng.integers(0, len(pool) - 2, size=m)
+        other: Indices = rng.integers(0, len(pool) - 2, size=len(x))
         for lower in (np.minimum(own, one), np.maximum(own, one)):
-            other = other + (other >= lower)
+            other += other >= lower
         mutant = x + F[:, None] * (towards - x) + F[:, None] * (x[one] - pool[other])
         mutant = np.where(mutant < 0, x / 2, np.where(mutant > 1, (1 + x) / 2, mutant))
         taken = rng.random((m, n)) < rates[:, None]
