@@ -28,8 +28,8 @@ from pneuopt.models.tolerances import (
     MIN_DIRECTION_SHARE,
     MIN_INERTIA_SHARE,
     MIN_REVERSALS,
-    MIN_SAMPLES,
     MIN_SPEED_RATIO,
+    MIN_START_SAMPLES,
     SMOOTHING_FACTOR,
     STICKING_SPEED,
     STRIBECK_VELOCITIES,
@@ -101,7 +101,7 @@ def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
     if seen.fast < MIN_SPEED_RATIO * seen.slow:
         speeds = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}"
         return Lack(f"{speeds}, where friction is one level", f"log {run}")
-    if below < MIN_SAMPLES:
+    if below < MIN_START_SAMPLES:
         message = f"only {below} samples are slower than the Stribeck velocity, {stribeck:.2g} {unit}"
         return Lack(message, f"log {run}")
     return None
