@@ -220,10 +220,7 @@ def _acceleration_function(system: System, speed: int, direction: int) -> ca.Fun
 
 
 def _first_root(f: Callable[[float], float], begin: float, end: float) -> float:
-    """Where f first turns positive on a step; infinity if it does not.
-
-    f is evaluated at a few points; where it has a maximum between them, that is found first.
-    """
+    """Where f first turns positive on a step, by a few points or at a maximum between them; infinity if it does not."""
     t = np.linspace(begin, end, ROOT_PROBES_PER_STEP + 1)
     values = np.array([f(at) for at in t])
     if not np.any(values[1:] > 0):

@@ -5,12 +5,10 @@ Experimental Designs, with SAS, 2007, chapter 10). A newcomer adds a class like 
 and its figure of their covariance.
 
 `linked_information`: what a log that is cut into linked segments tells about parameters, once it is identified.
-`identify` weighs the gaps between segments as if the states jumped there a little, and its covariance is the sandwich
-B^-1 M B^-1 (`Equations.covariance`): B is the Gram matrix of data and gaps with the nodes eliminated, M that of the
-data alone with the nodes where B puts them, since true gaps carry no noise. Its inverse B M^-1 B is the information
-here: with B itself, a planned run of an EMPS axis promised intervals three times as wide as its fit had, and the search
-took other runs for the best (problems/identify/next_experiment.py). The sum over logs is that of a joint fit where the
-weights of the gaps lose little.
+`identify` weighs gaps as if the states jumped there a little, and its covariance is the sandwich B^-1 M B^-1
+(`NormalEquations.covariance`): B is the Gram matrix of data and gaps with the nodes eliminated, M that of the data
+alone. Its inverse B M^-1 B is the information here: with B itself, a planned run of an EMPS axis promised intervals
+three times as wide as its fit had, and other runs seemed the best (problems/identify/next_experiment.py).
 """
 
 import math
@@ -21,13 +19,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from pneuopt.experiments.tolerances import (
-    LARGEST,
-    REACHED_ROOM,
-    SINGULAR,
-    STATE_RIDGE,
-    UNINFORMED,
-)
+from pneuopt.experiments.tolerances import LARGEST, REACHED_ROOM, SINGULAR, STATE_RIDGE, UNINFORMED
 from pneuopt.identification.result import IdentificationResult, join_names
 from pneuopt.identification.statistics import confidence_interval
 from pneuopt.identification.tolerances import UNIDENTIFIABLE_DEVIATION
@@ -400,9 +392,8 @@ class WantedPrecision:
 def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int = 0) -> Array:
     """The information (m, k, k) of m logs' linked segments about parameters, as the estimates of `identify` have it.
 
-    By the Gram matrices of each segment about its start state and w parameters, in unit noise, the derivatives of its
-    end state by the same, and the standard deviations of the gaps; the first `eliminated` parameters are each log's
-    own.
+    By each segment's Gram matrix and derivatives of its end about start state and parameters, in unit noise, and the
+    deviations of the gaps; the first `eliminated` parameters are each log's own.
     """
     m, count, n, width = ends.shape
     gaps, follows = _gap_information(ends[:, :-1], 1 / jumps**2), list[Array]()

@@ -6,15 +6,11 @@ exchanged until no exchange helps (V. V. Fedorov, Theory of Optimal Experiments,
 block by block with random changes, since limits, sticking and a run's memory leave no useful gradient of the whole;
 only what keeps every limit at every sample, for every plant that is thought possible, is taken.
 
-`DesignSearch`: blocks of an excitation by exchange, then refined whole; what is best is an `ExperimentDesign`.
-
 A short run is simulated in a fraction of the time: the search also begins with a quarter of the duration, whose
 information counts four times. Where that does better, it is refined, played twice in a row, and refined again.
 
-A `WaveBlock` is a stretch of an excitation, a wave about a level. A `PlannedRun` simulates many candidates at once
-in SIMD lanes, with their limits and their information: that of the log that the run would leave, the plant's command
-and its measured outputs. So a loop only makes the run; it is the plant that is identified, along short segments whose
-sensitivities are chained, the start state eliminated, as `identify` does.
+The information of a `PlannedRun` is that of the log that it would leave, of the plant's command and its outputs: a loop
+only makes the run; it is the plant that is identified.
 
 `predict_loss`: what a tuned loop is worth as its plant drifts, and when it violates a requirement.
 """
@@ -97,23 +93,12 @@ class Wave(Enum):
 
 @dataclass(frozen=True)
 class WaveBlock:
-    """A wave about a level.
-
-    Attributes
-    ----------
-    wave : Wave
-    amplitude : float
-        Peak [unit of the excitation].
-    frequency : float
-        [Hz]; a chirp's first one.
-    level : float
-        About which it goes, counted from the start of the run [unit of the excitation].
-    """
+    """A wave about a level."""
 
     wave: Wave
-    amplitude: float
-    frequency: float
-    level: float = 0.0
+    amplitude: float  # peak [unit of the excitation]
+    frequency: float  # [Hz]; a chirp's first one
+    level: float = 0.0  # about which it goes, counted from the start of the run [unit of the excitation]
 
     def samples(self, t: Array) -> Array:
         """The wave at instants of the block, shape (n,), without its level; it begins at zero, but for a square one."""
@@ -137,10 +122,7 @@ class WaveBlock:
 
 
 def join_blocks(blocks: Sequence[WaveBlock], t: Array, rise: float = 0.15) -> Array:
-    """The excitation of equally long blocks, counted from its start, shape (n,).
-
-    The level moves smoothly, without a knock, in the share `rise` of a block.
-    """
+    """The excitation (n,) of equally long blocks; the level moves smoothly in the share `rise` of one."""
     out = np.empty(len(t))
     edges = np.linspace(0, len(t), len(blocks) + 1).round().astype(int)
     level = 0.0
@@ -155,10 +137,7 @@ def join_blocks(blocks: Sequence[WaveBlock], t: Array, rise: float = 0.15) -> Ar
 def library(
     amplitude: float, duration: float, sample_time: float, amplitudes: int = 10, frequencies: int = 8
 ) -> list[WaveBlock]:
-    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps.
-
-    Of each kind so many amplitudes and frequencies; the refinement finds what lies between.
-    """
+    """Blocks of every kind, of so many amplitudes and frequencies; the refinement finds what lies between."""
     fastest = max(CYCLES_A_SAMPLE / sample_time, 2 / duration)
     sizes = amplitude * np.geomspace(LEAST_AMPLITUDE, 1.0, amplitudes)
     paces = np.geomspace(1 / duration, fastest, frequencies)
@@ -189,10 +168,7 @@ def vary_run(
     ends: tuple[float, float],
     fresh: Sequence[WaveBlock],
 ) -> list[WaveBlock]:
-    """A run near another one: mostly with one block changed, else with all, with one exchanged, copied or moved.
-
-    Small changes alone stay where the exchange of separate blocks began: what a block tells depends on its neighbours.
-    """
+    """A run near another one: one block changed, exchanged, copied or moved, or all, lest it stay where it began."""
     changed, amplitude = list(run), max(abs(v) for v in reach)
     k, j = (int(n) for n in rng.integers(len(run), size=2))
     kind, size = rng.random(), spread * rng.random()

@@ -1,13 +1,9 @@
 """`identifiability`: which parameters a set of logs can identify, before and after a fit.
 
-Every decision about it stands here, with its thresholds side by side; only a running search decides by itself which
-parameters its data do not determine (`shooting.convergence`, thresholds in `shooting.scaling`).
+Every decision about it stands here; only a running search decides by itself which parameters its data do not determine
+(`shooting`). `examine_logs`: what the log doctor finds in logs of a plant; `check_content` refuses logs for it.
 
-`examine_logs`: what the log doctor finds in logs of a plant; `check_content` refuses logs for it.
-
-Below: `pose_problem` of logs that pass, what plant and parameters say of the axis (`axis_from_model`), exchanged
-columns (`find_exchange`), and `mend_findings`, which mends a fault where a rule is certain and the fault is gone then.
-A newcomer adds a rule: ``rule(mended, finding, ambient) -> MendedLog | None`` and its row in `RULES`.
+A newcomer adds a rule that mends: ``rule(mended, finding, ambient) -> MendedLog | None`` and its row in `RULES`.
 """
 
 import math
@@ -116,9 +112,8 @@ def identifiability(
 
 
 def verdict_from_sensitivities(problem: EstimationProblem, start: Start, variance: float = 1.0) -> Verdict:
-    """The verdict from the sensitivities at a start or fit; `variance` of the residuals in noise variances.
+    """The verdict from the sensitivities at a start or fit, without gaps; `variance` of residuals in noise variances.
 
-    They are taken along the start's states and without gaps: a segment begins with the sensitivities of all before it.
     Where they are not finite, or the start is so stiff that integrating it would take hours, all figures are NaN.
     """
     segments = segment(problem.transcription(start))
@@ -225,10 +220,7 @@ def prior_influenced(covariance: Array, prior_covariance: Array) -> Mask:
 
 
 def prior_dominated(covariance: Array, prior_covariance: Array, values: Array, held: Iterable[float]) -> Mask:
-    """The mask of estimates that the logs do not identify: they lean on priors, and are not known well even so.
-
-    A factor of ten says nothing of what is held at zero, so nothing that leans on it is known.
-    """
+    """The mask of estimates that lean on priors, and are not known well even so; nothing is that leans on a zero."""
     is_close = np.sqrt(np.diag(covariance)) <= MAX_PRIOR_DEVIATION * np.abs(values)
     is_close &= all(held)
     return prior_influenced(covariance, prior_covariance) & ~is_close
@@ -318,10 +310,7 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
 def _log_root_information(
     segments: Segments, weighted: Array, end_sensitivities: Array, first: int, chain: Array, at_once: int = 2000
 ) -> Array:
-    """Square root of one log's information about the parameters; QR eliminates its start state, ordered first.
-
-    So many segments are reduced at once: memory against time.
-    """
+    """Square root of one log's information about the parameters; QR, of so many segments, eliminates the start."""
     n, k = end_sensitivities.shape[1], len(chain)
     carried = np.concatenate([np.eye(n), np.zeros((n, k))], axis=1)
     carried[np.isfinite(segments.fixed_start[first])] = 0.0
@@ -563,10 +552,9 @@ Rule = Callable[[MendedLog, LogFinding, float], MendedLog | None]
 
 
 def mend_findings(model: Fittable, mended: MendedLog, parameters: ParameterSet, ambient: float) -> MendedLog:
-    """Mend the faults of a log for which there is a rule; a rule after which the fault is still found is taken back.
+    """Mend the faults of a log by rules, each taken back where its fault stays; gauge pressures count from `ambient`.
 
-    Gauge pressures count from `ambient` [Pa]. Where motion and force are both wrong nobody can tell what is right:
-    `LogError`.
+    Where motion and force are both wrong nobody can tell what is right: `LogError`.
     """
     several = len({f.channel for f in _find_faults(model, mended.log, parameters)}) > 1
     pair = find_exchange(model, mended.log, parameters) if several else None

@@ -120,8 +120,7 @@ class LoggedLoop:
     def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array:
         """The start states on which no measured output depends, from a candidate; NaN for those that are estimated.
 
-        The command is computed anew at the first sample; of previous error and derivative only a sum counts, and what
-        a compensator remembers soon passes.
+        Of previous error and derivative only a sum counts, and what a compensator remembers soon passes.
         """
         held = {*UNSEEN_STATES, *(f"pid.{n}" for n in RESET_STATES)}
         held |= {
@@ -274,10 +273,7 @@ def _acting_samples(t: Array, sample_time: float, name: str) -> Array:
 def _signal_along_log(
     measured: Trajectory, wanted: str, feedback: str, reference: str, name: str, window: int = 21
 ) -> Array:
-    """A signal that the controller sees along a log, without holes; a speed or position follows from the other.
-
-    A position is differentiated over so many samples.
-    """
+    """A signal that the controller sees along a log, without holes; a speed follows from `window` of positions."""
     if wanted in measured:
         return measured.fill_gaps(wanted)
     t, step = measured.t, float(np.median(np.diff(measured.t)))

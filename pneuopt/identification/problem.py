@@ -340,10 +340,9 @@ def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Inter
 
 
 def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tuple[str, ...]]:
-    """Bridge the short holes of a log's inputs and cut it at the long ones; returns the log and what was done in words.
+    """Bridge the short holes of a log's inputs and cut it at the long ones (`holes`); the log and sentences on that.
 
-    `holes` of a cut log names the samples whose inputs nobody knows; a sampled loop is refused there, for its
-    controller goes on.
+    A sampled loop is refused at a long one, for its controller goes on.
     """
     log, inputs = experiment.trajectory, names(system.inputs)
     known: Mask = np.asarray(np.isfinite(log.matrix(inputs)).all(axis=1))

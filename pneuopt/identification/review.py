@@ -62,8 +62,7 @@ def review_fit(
 ) -> tuple[IdentificationResult, tuple[Profile, ...]]:
     """Review the intervals of a fit, mark what its logs do not identify, and return the profiles traced on the way.
 
-    Doubtful linear intervals become those of the profile likelihood. Without convergence no interval stays, and the
-    status names the worst place. Ctrl-C leaves the other intervals as they are.
+    Without convergence no interval stays, and the status names the worst place.
     """
     start = problem.start_from(result)
     if not result.status.converged:
@@ -122,10 +121,7 @@ def _verdict_at(problem: EstimationProblem, start: Start, result: Identification
 
 
 def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple[dict[str, Profile], list[str]]:
-    """Profiles of parameters with doubtful linear intervals, and of those that move far along an open profile.
-
-    The second value names the parameters that Ctrl-C left without one.
-    """
+    """Profiles where a linear interval is doubtful, or moves far along an open one; and the names that Ctrl-C left."""
     found: dict[str, Profile] = {}
     rows = result.estimates
     known = rows.index[np.isfinite(rows["stderr"])]
@@ -152,8 +148,7 @@ def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple
 def _widen_dragged(result: IdentificationResult, profiles: Mapping[str, Profile]) -> IdentificationResult:
     """The result with intervals that hold where a closed profile drags parameters that have none of their own.
 
-    Each value along a profile within its interval fits the logs as well, with all that the others became. Static
-    friction over a Stribeck velocity that was known to a factor of thirty had 2 N, and was 16 deviations off.
+    Static friction over a Stribeck velocity that was known to a factor of thirty was 16 deviations off, with +-2 N.
     """
     estimates = result.estimates.copy()
     for profile in profiles.values():

@@ -1,12 +1,11 @@
 """`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs.
 
-`fit_candidates` fits all alike, for residuals compare only where the models run alike: whole logs, or windows of one
-length, without gaps that take a misfit in their place; and at common widths, for a width that each candidate has chosen
-for itself would be a hidden parameter, by which Coulomb friction can imitate presliding or the Stribeck curve. Windows
-and widths are those of the leader, the simplest of the candidates that follow the logs best in short searches.
+`fit_candidates` fits all alike, for residuals compare only so: over whole logs or windows of one length, and at common
+widths; one that each candidate has chosen for itself would be a hidden parameter, by which Coulomb friction can imitate
+presliding or the Stribeck curve. Both are the leader's, the simplest of those that short searches find best.
 
-`try_candidate` is such a search, with loose gaps. Gaps only relax a fit: where it has ended with many times the squares
-of another model's whole fit, the model cannot explain the logs, and minutes of search would show only that.
+`try_candidate`, such a search, has loose gaps, which only relax a fit: a model that leaves many times the squares of
+another one's whole fit cannot explain the logs.
 """
 
 import fnmatch

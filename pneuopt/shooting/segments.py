@@ -314,11 +314,7 @@ def fine_steps(segments: Segments, steps: int, refine: int) -> int:
 
 
 def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
-    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78.
-
-    The stiffness is taken at nodes all along the start and at the extremes of every state and input; the result is
-    `SUBSTEPS_CAP` at most, for a start may be absurd.
-    """
+    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78."""
     return substeps_for(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
 
 

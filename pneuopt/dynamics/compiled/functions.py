@@ -70,10 +70,9 @@ def compile_rate(ode: ca.Function) -> Callable[[float, Array, Array, Array], Arr
 
 
 def compile_held_rate(ode: ca.Function) -> Callable[[float, Array, Array], Callable[[float, Array], Array]]:
-    """``hold(origin, u, p) -> f``, ``f(t, x) -> xdot`` at ``origin + t``: `compile_rate` under inputs that are held.
+    """``hold(origin, u, p) -> f``, ``f(t, x) -> xdot`` at ``origin + t``: `compile_rate` in two thirds of its time.
 
-    It takes two thirds of the time: LSODA asks for it 10,000 times a second. The next call of any f overwrites its
-    array; the inputs are those of the last `hold`. Not thread-safe.
+    The next call of any f overwrites its array; the inputs are those of the last `hold`. Not thread-safe.
     """
     code = _BoundCode.of(_with_dense_outputs(ode, "system_function"), wanted=1)
     (at, states, inputs, parameters), (rate,), call, pointers = code.buffers, code.results, code.call, code.pointers

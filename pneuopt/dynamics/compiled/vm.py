@@ -191,11 +191,7 @@ def run_in_vm(
     states: int,
     threads: int = 1,
 ) -> VmRun:
-    """Integrate m segments of n samples each, as `Rollout.run` does with x0, u, p, t and h.
-
-    `functions` are those of `prepare_rollout`; the first `start_columns` of the sensitivity's columns are the start
-    state's.
-    """
+    """Integrate as `Rollout.run` does by `prepare_rollout`'s functions; the first `start_columns` are the start's."""
     (m, n), nx = given[3].shape, given[0].shape[1]
     if nx == 0 and n > 1:  # a model without a state: each of its samples is a segment
         x0, u, p, t, h = given
@@ -349,8 +345,7 @@ def bind_array_step(
 ) -> Callable[[], None]:
     """A call without arguments that takes a step of all segments from inputs (t, h, x, u, p, S) to results (x, S).
 
-    Their shapes are (numbers, segments), S column by column; `program` is that of `rate`, ``(t, x, u, p) -> (xdot,
-    d(xdot)/dx, d(xdot)/d(chosen parameters))`` with sparse slopes.
+    Their shapes are (numbers, segments), S column by column; `program` is that of `rate` (`prepare_rollout`).
     """
     at, size, x, u, p, flat = inputs
     nx, m = x.shape
