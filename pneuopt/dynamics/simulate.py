@@ -164,7 +164,7 @@ def continue_simulation(
     rtol: float = 1e-10,
     atol: float = 1e-12,
 ) -> tuple[Trajectory, tuple[Contact, ...]]:
-    """Continue a run from where `simulate` ended, its controller having acted, to the end or a contact, told."""
+    """Continue a run from where `simulate` ended, its controller having acted; also returns a contact that ends it."""
     run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol), continues=True)
     return run.trajectory(), met
 

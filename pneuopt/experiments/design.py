@@ -155,7 +155,7 @@ class ExperimentDesign(Result):
         return WideFrame.from_dict(rows, orient="index")
 
     def summary(self) -> Report:
-        """The gain of the runs, the intervals before and after, the limits that they touch, and the signal to play."""
+        """The gain of the runs, intervals before and after, the limits that they touch, and what is played in words."""
         rows = []
         for name, row in self.table.iterrows():
             ends = [_join(row["before_low"], row["before_high"]), _join(row["after_low"], row["after_high"])]
@@ -164,7 +164,21 @@ class ExperimentDesign(Result):
             rows.append((str(name), format_number(row["value"], 4), *ends, shrunk, str(row["unit"]), mark))
         heads = number_columns("value", "95 % now", "95 % after", "narrower")
         intervals = Table((*text_columns("parameter"), *heads, *text_columns("unit", "")), tuple(rows))
-        return Report((self._verdict(), *self._remarks(), intervals, *self._steps()))
+        figures = f"{self.stats['before']:.2g} to {self.stats['after']:.2g}"
+        tried = f"{self.stats['tried']:.0f} excitations of {self.stats['plants']:.0f} plants"
+        remarks = [f"{self.criterion}: relative standard deviation from {figures}; {tried} were tried"]
+        if others := [n for n in self.unidentifiable if not self.table["target"][n]]:
+            remarks.append(f"still unidentifiable: {join_names(others)}, which nobody has asked for")
+        if self.active_limits:
+            remarks.append(f"limits that are reached: {join_names(self.active_limits)}; wider ones would allow more")
+        shown, steps = 8, list[Line]()
+        start = write_value(self.stats["origin"], self.units[self.channel], 4)
+        for k, blocks in enumerate(self.blocks, 1):
+            lead = f"run {k}: " if len(self.blocks) > 1 else ""
+            more = f"; and {len(blocks) - shown} more" if len(blocks) > shown else ""
+            steps.append(Line(lead + "; ".join(blocks[:shown]) + more, indent=2))
+        begin = Line(f"{self.channel} begins at {start}; about that, each block as long as the others:")
+        return Report((self._verdict(), *(Line(r, indent=2) for r in remarks), intervals, begin, *steps))
 
     def _verdict(self, useful: float = 1.5) -> Line:
         """The ratio by which the targets' intervals shrink; below a `useful` one runs are hardly worth their time."""
@@ -186,28 +200,6 @@ class ExperimentDesign(Result):
         many = f"{least:.1f} to {most:.1f} times" if most > 1.05 * least else f"{least:.1f} times"
         tone = Tone.GOOD if least >= useful else Tone.DOUBTFUL
         return Line(f"{lead} makes the asked intervals {many} narrower", tone)
-
-    def _remarks(self) -> list[Line]:
-        """The criterion, what stays unidentifiable, and the active limits."""
-        figures = f"{self.stats['before']:.2g} to {self.stats['after']:.2g}"
-        tried = f"{self.stats['tried']:.0f} excitations of {self.stats['plants']:.0f} plants"
-        out = [Line(f"{self.criterion}: relative standard deviation from {figures}; {tried} were tried", indent=2)]
-        others = [n for n in self.unidentifiable if not self.table["target"][n]]
-        if others:
-            out.append(Line(f"still unidentifiable: {join_names(others)}, which nobody has asked for", indent=2))
-        if self.active_limits:
-            what = join_names(list(self.active_limits))
-            out.append(Line(f"limits that are reached: {what}; wider ones would allow more", indent=2))
-        return out
-
-    def _steps(self, shown: int = 8) -> list[Line]:
-        start = write_value(self.stats["origin"], self.units[self.channel], 4)
-        out = [Line(f"{self.channel} begins at {start}; about that, each block as long as the others:")]
-        for k, blocks in enumerate(self.blocks, 1):
-            lead = f"run {k}: " if len(self.blocks) > 1 else ""
-            more = f"; and {len(blocks) - shown} more" if len(blocks) > shown else ""
-            out.append(Line(lead + "; ".join(blocks[:shown]) + more, indent=2))
-        return out
 
 
 def tabulate_design(

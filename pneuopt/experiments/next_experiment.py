@@ -291,12 +291,12 @@ class PlannedRun:
         """The information of each run's log about the free parameters, as in `identify`, in their units; (m, k, k)."""
         m, n = runs.shape[:2]
         size = max(1, self.batch // n)
-        parts = [self._information(runs[i : i + size], parameters, substeps) for i in range(0, m, size)]
-        k = len(self.free)
-        return np.concatenate(parts) if parts else np.zeros((0, k, k))
-
-    def _information(self, runs: Array, parameters: ParameterSet, substeps: int) -> Array:
-        m, n = runs.shape[:2]
+        if m > size:
+            parts = [self.information(runs[i : i + size], parameters, substeps) for i in range(0, m, size)]
+            return np.concatenate(parts)
+        out = np.zeros((m, len(self.free), len(self.free)))
+        if not m:
+            return out
         method = LeastSquares()  # as `identify` places its nodes and weighs its gaps in the end
         length = max(2, round(method.segment_time / self.sample_time))
         count = -(-n // length)
@@ -317,8 +317,7 @@ class PlannedRun:
         own = np.array([abs(known.value(n)) or 1.0 for n in (*self.per_log, *self.free)])
         nominal = np.array([q.nominal for q in self.plant.states])
         scale = np.concatenate([nominal, own])
-        jumps = method.stages[-1].gap * gap_scales(self._segments_about_rest(parameters), LeastSquares().kinematic)
-        out = np.zeros((m, len(self.free), len(self.free)))
+        jumps = method.stages[-1].gap * gap_scales(self._segments_about_rest(parameters), method.kinematic)
         kept = own[len(self.per_log) :]
         given = grams[good] * np.outer(scale, scale), ends[good] * scale / nominal[:, None]
         out[good] = linked_information(*given, jumps, len(self.per_log)) / np.outer(kept, kept)

@@ -287,7 +287,15 @@ def list_assumptions(
     system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
 ) -> tuple[Assumption, ...]:
     """The noise, the behaviour between samples and the fixed parameters that nobody has stated."""
-    found = [*_noise_levels(system, given, checked)]
+    found, levels = list[Assumption](), dict[str, float]()
+    units = {q.name: q.unit.partition("(")[0] for q in system.outputs}
+    for log, full in zip(given, checked, strict=True):
+        for channel in (n for n in outputs_in_log(system, full) if n not in log.noise and n not in levels):
+            levels[channel] = float(f"{full.noise[channel]:.3g}")
+            shown = estimate_noise(full.trajectory[channel], full.trajectory.t)
+            how = "its resolution, as the logs show" if shown.is_quantisation else "white, as the logs show"
+            noise = f"noise of {channel}", levels[channel], units[channel], f"[noise] {channel}"
+            found.append(Assumption(*noise, SIDECAR, how))
     behaviour = {
         n: kind for log in given for n, kind in input_behaviour(system, log).items() if n not in log.intersample
     }
@@ -309,20 +317,6 @@ def list_assumptions(
             reason = f"{used.meaning}; identify chooses it by the logs"
         found.append(Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason))
     return tuple(found)
-
-
-def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> Iterator[Assumption]:
-    units = {q.name: q.unit.partition("(")[0] for q in system.outputs}
-    found: dict[str, float] = {}
-    for log, full in zip(given, checked, strict=True):
-        for channel in outputs_in_log(system, full):
-            if channel not in log.noise and channel not in found:
-                found[channel] = float(f"{full.noise[channel]:.3g}")
-                shown = estimate_noise(full.trajectory[channel], full.trajectory.t)
-                how = "its resolution, as the logs show" if shown.is_quantisation else "white, as the logs show"
-                yield Assumption(
-                    f"noise of {channel}", found[channel], units[channel], f"[noise] {channel}", SIDECAR, how
-                )
 
 
 MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"

@@ -58,7 +58,7 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.mending import MendedLog, convert, empty_cells, leave_out
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import InputError, LogError, require
-from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import Fit, LeastSquares
 from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
 from pneuopt.shooting.tolerances import MAX_SEARCH_SUBSTEPS
@@ -243,7 +243,9 @@ def _make_verdict(
             rows[name] = [p.value, *[math.nan] * 4, True]
             reasons[name] = "the best fit is at its bound, and the other intervals hold for that value only"
             continue
-        unit, size = p.value if p.log else 1.0, 1.0 if p.log else _comparison_size(name, p, problem)
+        unit, given, least = p.value if p.log else 1.0, problem.parameters[name.partition("[")[0]], float(p.unit == "1")
+        is_offset = p.lower < 0 and not least  # whose usual size is unknown
+        size = 1.0 if p.log else 0.0 if is_offset else max(abs(p.value), abs(given.value), least)
         relative = spread[i] / size if size > 0 else math.nan
         lack = None if trusted else missing_excitation(hints, name, names, seen)
         is_unidentifiable = (
@@ -261,14 +263,6 @@ def _make_verdict(
     exceeds = [w["inflation"] > MAX_INFLATION and w["relative"] > HARMLESS_DEVIATION for w in worst]
     harmful = tuple(tuple(group) for group, is_harmful in zip(groups, exceeds, strict=True) if is_harmful)
     return Verdict(table, harmful, reasons, identification_hints=hints)
-
-
-def _comparison_size(name: str, p: Parameter, problem: EstimationProblem) -> float:
-    """The size that a standard deviation is divided by; 0 for an offset, whose usual size is unknown."""
-    if p.lower < 0 and p.unit != "1":
-        return 0.0
-    given = problem.parameters[name.partition("[")[0]].value
-    return max(abs(p.value), abs(given), 1.0 if p.unit == "1" else 0.0)
 
 
 def _unidentifiable_reason(alone: float, relative: float, lack: Lack | None, usual_remedy: str) -> str:
@@ -600,31 +594,26 @@ def _between_jumps(mended: MendedLog, finding: LogFinding, _: float) -> MendedLo
     return empty_cells(mended, finding.channel, lost, "between two jumps")
 
 
-def _at_stop(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
-    lost = None if finding.evidence is None else finding.evidence.contradiction
-    return None if lost is None else leave_out(mended, lost, "at an end stop that the model has not")
-
-
-def _turn_sign(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
-    """Turn the sign of a force that brakes on balance; of two pressures nobody knows which sensor is meant."""
-    if finding.channel not in mended.log.trajectory:
-        return None
-    return convert(mended, finding.channel, -1.0, 0.0, "for it brakes the motion on balance")
-
-
-def _to_absolute(mended: MendedLog, finding: LogFinding, ambient: float) -> MendedLog | None:
-    if "a vacuum" not in finding.message:
-        return None
-    return convert(mended, finding.channel, 1.0, ambient, "for it is a gauge pressure that is read as absolute")
-
-
 RULES: dict[str, Rule] = {
     "jumps": _between_jumps,
-    "stops": _at_stop,
-    "work": _turn_sign,
+    "stops": lambda mended, finding, _: (
+        leave_out(mended, finding.evidence.contradiction, "at an end stop that the model has not")
+        if finding.evidence is not None
+        else None
+    ),
+    # a force that brakes on balance; of two pressures nobody knows which sensor is meant
+    "work": lambda mended, finding, _: (
+        convert(mended, finding.channel, -1.0, 0.0, "for it brakes the motion on balance")
+        if finding.channel in mended.log.trajectory
+        else None
+    ),
     "scale": lambda mended, finding, _: convert(
         mended, finding.channel, 1e-3, 0.0, "for it moves as fast as mm that are read as m"
     ),
-    "pressures": _to_absolute,
+    "pressures": lambda mended, finding, ambient: (
+        convert(mended, finding.channel, 1.0, ambient, "for it is a gauge pressure that is read as absolute")
+        if "a vacuum" in finding.message
+        else None
+    ),
 }
 """By the name of the check."""

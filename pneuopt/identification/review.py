@@ -344,11 +344,18 @@ def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict
 
 
 def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -> WrongValue | None:
-    """The value that a fit finds with it freed; None where that explains too little, or it hardly changes."""
+    """The value that a short fit finds with it freed; None where that explains too little, or it hardly changes."""
     freed = replace(problem, parameters=problem.parameters.freed(name))
-    found = _search_freed(freed, fit, 1 + (1 - MIN_EXPLAINED_SHARE) * excess / fit.count)
-    if found is None:
-        return None
+    allowed = 1 + (1 - MIN_EXPLAINED_SHARE) * excess / fit.count  # squares a sample
+    *others, last = (replace(stage, iterations=TRIAL_FIT_ITERATIONS) for stage in freed.method.stages[1:])
+    method, found = replace(freed.method, max_misfit=allowed, allows_state_noise=False), fit
+    for stages in ((*others, replace(last, refine=1)), (replace(last, iterations=LAST_TRIAL_ITERATIONS),)):
+        found = solve_least_squares(freed.transcription(freed.start_from(found)), replace(method, stages=stages))
+        if found.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        optimum, is_left = found.optimum, found.end is SearchEnd.ABANDONED
+        if is_left or optimum is None or optimum.equations.promised_squares(optimum.keep) > allowed * fit.count:
+            return None
     place, given = found.parameters.free_names.index(name), problem.parameters[name]
     squares = 2 * found.stats["cost"]
     share = 1 - (squares - fit.count) / excess
@@ -361,18 +368,3 @@ def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -
     if not (share >= MIN_EXPLAINED_SHARE and is_clear and found.jumps is None):
         return None
     return WrongValue(name, given.value, value, given.unit, min(1.0, share), squares)
-
-
-def _search_freed(freed: EstimationProblem, fit: Fit, allowed: float) -> Fit | None:
-    """A short search with a value freed; None where its squares a sample would stay above those that are allowed."""
-    *others, last = (replace(stage, iterations=TRIAL_FIT_ITERATIONS) for stage in freed.method.stages[1:])
-    method = replace(freed.method, max_misfit=allowed, allows_state_noise=False)
-    found = fit
-    for stages in ((*others, replace(last, refine=1)), (replace(last, iterations=LAST_TRIAL_ITERATIONS),)):
-        found = solve_least_squares(freed.transcription(freed.start_from(found)), replace(method, stages=stages))
-        if found.status.code is Code.INTERRUPTED:
-            raise KeyboardInterrupt
-        optimum, is_left = found.optimum, found.end is SearchEnd.ABANDONED
-        if is_left or optimum is None or optimum.equations.promised_squares(optimum.keep) > allowed * fit.count:
-            return None
-    return found

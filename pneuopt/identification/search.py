@@ -87,8 +87,7 @@ def fit_from_starts(
     interrupted, tightest = False, problem.method.stages[-1].gap
     is_plain = loss is None and not estimate_noise
     try:
-        confirms, left_after = lambda: _only_needs_confirmation(fits), lambda: _stages_before_left(problem, fits[0][1])
-        for start in starts_by_cost(problem, confirms, left_after, lambda: _cost_after_guesses(problem, fits)):
+        for start in starts_by_cost(problem, fits):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
             # a search that joins the best one only confirms it: without noise of the states where that did not settle
@@ -147,51 +146,38 @@ def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: b
     return status
 
 
-def starts_by_cost(
-    problem: EstimationProblem,
-    confirms: Callable[[], bool] = lambda: False,
-    left_after: Callable[[], int] = lambda: 0,
-    left_cost: Callable[[], float] = lambda: math.nan,
-) -> Iterator[Start]:
+def starts_by_cost(problem: EstimationProblem, fits: Sequence[Candidate] = ()) -> Iterator[Start]:
     """The model's first start, then the others, settled to what each holds, the least cost first.
 
-    `confirms`: the next start is taken as it is. The first was `left_after` so many stages, at the others' `left_cost`.
+    `fits` are those from the starts up to then, the best first. An optimum needs one more start, as it is; one whose
+    gaps stand for noise of the states takes all so, for settling with wide gaps says little there.
     """
-    candidates = problem.candidates
+    candidates, gaps = problem.candidates, [stage.gap for stage in problem.method.stages]
     yield candidates[0]
-    while len(candidates) > 1 and confirms():
+    while len(candidates) > 1 and fits and is_optimum(fits[0][1]) and (len(fits) == 1 or fits[0][1].jumps is not None):
         candidates = candidates[1:]
         yield candidates[0]
     guessed = [c for c in candidates if c.trial_parameters]
+    # after how many stages the first start was left, and what it cost after as many as the others get
+    left, known = 0, math.nan
+    if fits and fits[0][1].end is SearchEnd.ABANDONED:
+        left, last = 1 + gaps.index(fits[0][1].stats["gap_deviation"]), gaps[:GUESS_STAGES][-1]
+        known = next((cost for gap, cost in fits[0][1].stage_costs if gap == last), math.nan)
     # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
-    left = left_after()
     stages = min(GUESS_STAGES, left or GUESS_STAGES) if problem.has_gaps else 1
-    settled, known = list[tuple[tuple[float, float], Start]](), left_cost() if left else math.nan
-    others = list(guessed) if len(guessed) > 1 else []
+    settled, others = list[tuple[tuple[float, float], Start]](), list(guessed) if len(guessed) > 1 else []
     while others:
         cost, start, explains = _settle_start(problem, others.pop(0), stages)
         if explains:
             yield start
             continue
         settled.append((cost, start))
-        if cost[1] <= SAME_MISFIT_RATIO * known and cost[0] == problem.method.stages[GUESS_STAGES - 1].gap:
+        if cost[1] <= SAME_MISFIT_RATIO * known and cost[0] == gaps[GUESS_STAGES - 1]:
             break
     yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
     yield from others
     yield from [c for c in candidates[1:] if len(guessed) < 2 or not c.trial_parameters]
     yield from candidates[:1] if left and len(guessed) < 2 else []
-
-
-def _stages_before_left(problem: EstimationProblem, fit: Fit) -> int:
-    """The stages after which a search was left for other starts; 0 if it was not."""
-    gaps = [stage.gap for stage in problem.method.stages]
-    return 1 + gaps.index(fit.stats["gap_deviation"]) if fit.end is SearchEnd.ABANDONED else 0
-
-
-def _cost_after_guesses(problem: EstimationProblem, fits: Sequence[Candidate]) -> float:
-    """The cost of the first start after the stages in which the others settle; NaN where it was left before."""
-    gap = problem.method.stages[min(GUESS_STAGES, len(problem.method.stages)) - 1].gap
-    return next((cost for stage, cost in fits[0][1].stage_costs if stage == gap), math.nan)
 
 
 def _settle_start(
@@ -300,12 +286,6 @@ def is_at_noise(problem: EstimationProblem, fit: Fit) -> bool:
         fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
         or fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * white_chi_square(problem, fit)
     )
-
-
-def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
-    """Whether the next start is tried as it is: one behind an optimum, or each where its gaps stand for state noise."""
-    best = fits[0][1]
-    return is_optimum(best) and (len(fits) == 1 or best.jumps is not None)
 
 
 def _are_enough(fits: Sequence[Candidate]) -> bool:

@@ -251,6 +251,8 @@ def missed_curvature(
 
     It is the term ``damping * diagonal`` of a node which, added to the model, would have promised the cost that came.
     """
+    if not math.isfinite(trial.cost):
+        return np.zeros(len(step))
     linear, linked, n = equations.linearisation, equations.segments.linked, step.shape[1]
     change = np.zeros(linear.end_sensitivities.shape[::2])  # of each segment's start state, and of its columns
     change[:, :n] = step

@@ -971,7 +971,9 @@ class LevenbergMarquardt:
                 trial = self._trial(current, reduced, step)
                 is_lower = trial.cost < current.cost
                 if self.damps_nodes and (not is_lower or self.node_damping.any()):
-                    self.node_damping = self._missed_curvature(current, trial)
+                    shift = (trial.nodes - current.nodes) / self.objective.segments.nominal
+                    given = shift, trial.z - current.z, trial.equations, self.objective.sigma
+                    self.node_damping = missed_curvature(current.equations, *given)
                 if is_lower:
                     self.damping = self.damping * 0.1 if self.damping > MIN_DAMPING else 0.0
                     return trial
@@ -1026,13 +1028,6 @@ class LevenbergMarquardt:
                 break
             trial = settled
         return trial
-
-    def _missed_curvature(self, current: Iterate, trial: Iterate) -> Array:
-        """The curvature that a trial shows and the model has missed, by node; none of a trial that is not finite."""
-        if not math.isfinite(trial.cost):
-            return np.zeros(len(current.nodes))
-        step, moved = (trial.nodes - current.nodes) / self.objective.segments.nominal, trial.z - current.z
-        return missed_curvature(current.equations, step, moved, trial.equations, self.objective.sigma)
 
 
 def assess_convergence(

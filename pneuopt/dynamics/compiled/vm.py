@@ -13,18 +13,13 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy.special import erf
 
 from pneuopt.dynamics.compiled.c_writer import Instruction, read_instructions
 from pneuopt.dynamics.tolerances import ARRAY_SEGMENTS, BLOCK_SEGMENTS, FOLDED_STEPS, OPERATIONS_A_THREAD
 from pneuopt.quantities.arrays import Array
 
 Operation = Callable[..., Any]
-
-
-def _erf(value: Array, out: Array) -> None:
-    from scipy.special import erf
-
-    erf(value, out)
 
 
 OPERATIONS: dict[int, Operation] = {
@@ -44,7 +39,7 @@ OPERATIONS: dict[int, Operation] = {
     ca.OP_LOG: np.log,
     ca.OP_LOG1P: np.log1p,
     ca.OP_EXPM1: np.expm1,
-    ca.OP_ERF: _erf,
+    ca.OP_ERF: erf,
     ca.OP_SIN: np.sin,
     ca.OP_COS: np.cos,
     ca.OP_TAN: np.tan,
