@@ -168,7 +168,7 @@ def vary_run(
     ends: tuple[float, float],
     fresh: Sequence[WaveBlock],
 ) -> list[WaveBlock]:
-    """A run near another one: one block changed, exchanged, copied or moved, or all, lest it stay where it began."""
+    """A run near another one: one block changed, exchanged, copied or moved, or all; small changes stay near."""
     changed, amplitude = list(run), max(abs(v) for v in reach)
     k, j = (int(n) for n in rng.integers(len(run), size=2))
     kind, size = rng.random(), spread * rng.random()
@@ -481,8 +481,7 @@ class DesignSearch:
     def _reach(self) -> tuple[float, float]:
         """The range of the excitation, down and up from the start."""
         low, high = self.run.excited_limits()
-        origin = self.run.origin
-        return low - origin, high - origin
+        return low - self.run.origin, high - self.run.origin
 
     @cached_property
     def _waves(self) -> list[WaveBlock]:
@@ -492,8 +491,7 @@ class DesignSearch:
 
     def _choose_blocks(self) -> list[list[WaveBlock]]:
         """The blocks of all runs by exchange: their information adds up."""
-        t = self._grid[: self.samples // self._blocks]
-        waves = self._waves
+        t, waves = self._grid[: self.samples // self._blocks], self._waves
         gains, keeps = self._evaluate(np.stack([np.clip(b.samples(t), *self._reach) for b in waves]))
         if not keeps.any():
             raise self._infeasible(waves, t)
@@ -556,10 +554,8 @@ class DesignSearch:
 
     def _evaluate(self, signals: Array) -> tuple[Array, Array]:
         """Information of excitations, shape (plants, m, k, k), and whether all plants keep the limits under them."""
-        keeps = np.ones(len(signals), dtype=bool)
-        low, high = self._reach
-        keeps &= (signals.min(axis=1) >= low - 1e-12) & (signals.max(axis=1) <= high + 1e-12)
-        k = len(self.run.free)
+        (low, high), k = self._reach, len(self.run.free)
+        keeps = (signals.min(axis=1) >= low - 1e-12) & (signals.max(axis=1) <= high + 1e-12)
         gains = np.zeros((len(self.plants), len(signals), k, k))
         self.tried += len(signals)
         shown = {}
@@ -761,9 +757,8 @@ def _known_information(free: Sequence[str], covariance: "pd.DataFrame | None") -
     if known:
         values = covariance.loc[known, known].to_numpy(dtype=float)
         spread = np.sqrt(np.diag(values))
-        out[np.ix_(place, place)] = np.linalg.pinv(values / np.outer(spread, spread), hermitian=True) / np.outer(
-            spread, spread
-        )
+        scale = np.outer(spread, spread)
+        out[np.ix_(place, place)] = np.linalg.pinv(values / scale, hermitian=True) / scale
     return out
 
 
@@ -778,13 +773,8 @@ def _draw(
     spread = np.sqrt(np.diag(covariance.loc[known, known].to_numpy(dtype=float)))
     most = MAX_WRONG * np.array([value_size(parameters, n) for n in known])
     cut = np.minimum(1.0, most / np.maximum(spread, 1e-300))
-    return (
-        draw_plants(
-            parameters, covariance.loc[known, known] * np.outer(cut, cut), count, seed=further(seed, "next_experiment")
-        )
-        if known
-        else {}
-    )
+    shrunk, own = covariance.loc[known, known] * np.outer(cut, cut), further(seed, "next_experiment")
+    return draw_plants(parameters, shrunk, count, seed=own) if known else {}
 
 
 def _known_names(free: Sequence[str], covariance: "pd.DataFrame") -> list[str]:
@@ -883,8 +873,7 @@ def predict_loss(
     for date, is_ahead, values in plants:
         known = parameters.with_values({n: v for n, v in values.items() if np.isfinite(v)})
         rows[date] = {"ahead": is_ahead, **_certify(loop, references, known, spec)}
-    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("date")
-    return DesignOutlook(table)
+    return DesignOutlook(pd.DataFrame.from_dict(rows, orient="index").rename_axis("date"))
 
 
 def _certify(
@@ -894,9 +883,8 @@ def _certify(
     proof = certificate(loop, references, parameters, band=spec.band, envelope=spec.envelope)
     failures = list(dict.fromkeys(finding.defect.value for finding in proof.findings))
     for case in proof.metrics:
-        violated = spec.violations(
-            requirement_values({str(n): float(v) for n, v in proof.metrics[case].items()}), SLACK
-        )
+        figures = {str(n): float(v) for n, v in proof.metrics[case].items()}
+        violated = spec.violations(requirement_values(figures), SLACK)
         failures += [n for n in map(metric_name, violated) if n not in failures]
     row: dict[str, float | str] = {}
     for name in (n for n in spec.metric_names if n in proof.metrics.index):

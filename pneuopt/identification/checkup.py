@@ -274,9 +274,8 @@ def check(
         check_free(logs, parameters)
     except ModelError as error:
         found.append(LogFinding("", str(error), True, FREE_CHECK))
-    ranked = sorted(
-        (_locate(_rank(f, found, logs), logs) for f in found), key=lambda f: list(Severity).index(f.severity)
-    )
+    ranked = [_locate(_rank(f, found, logs), logs) for f in found]
+    ranked.sort(key=lambda f: list(Severity).index(f.severity))
     is_open = any(f.severity is Severity.FAULT for f in ranked)
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
     verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates[0])
@@ -406,11 +405,7 @@ def _line(text: str, indent: int) -> Line:
 
 def _log_record(log: Experiment) -> LogRow:
     source, t = log.source, log.trajectory.t
-    columns = (
-        {n: {"column": c.name, "unit": c.unit, "said_by": c.said_by} for n, c in source.columns.items()}
-        if source
-        else {}
-    )
+    columns = source.columns if source else {}
     return {
         "log": log.name,
         "file": source.path if source else "",
@@ -419,7 +414,8 @@ def _log_record(log: Experiment) -> LogRow:
         "begin": float(t[0]),
         "end": float(t[-1]),
         "sample_time": float(np.median(np.diff(t))),
-        "channels": columns or {n: {} for n in log.trajectory},
+        "channels": {n: {"column": c.name, "unit": c.unit, "said_by": c.said_by} for n, c in columns.items()}
+        or {n: {} for n in log.trajectory},
         "unread": list(source.unread) if source else [],
         "sidecar": source.sidecar if source else "",
         "remarks": list(log.remarks),

@@ -291,11 +291,7 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
         inverse = 1 / np.maximum(singular, INFORMATION_ROUNDING)
         spread[informed] = np.linalg.norm(right * inverse[:, None], axis=0) / size[informed]
         parts = np.abs(right[inverse > MAX_INFLATION])
-        member = (
-            parts > MIN_COMBINATION_SHARE * parts.max(axis=1, keepdims=True)
-            if parts.size
-            else np.zeros_like(parts, dtype=bool)
-        )
+        member = parts > MIN_COMBINATION_SHARE * parts.max(axis=1, keepdims=True, initial=0.0)
         weak = np.zeros((len(member), len(size)), dtype=bool)
         weak[:, informed] = member
     return spread, alone, weak[weak.sum(axis=1) > 1]
@@ -481,10 +477,8 @@ class _Body:
         for q in (*self.plant.states, *self.plant.inputs):
             if q.name == self.axis.speed or q.name.startswith("friction."):
                 continue
-            weight = (self.force(vector, {q.name: base[q.name] + self.change * q.nominal}) - at_base) / (
-                self.change * q.nominal
-            )
-            weights[q.name] = weight
+            step = self.change * q.nominal
+            weights[q.name] = (self.force(vector, {q.name: base[q.name] + step}) - at_base) / step
         sizes = {q.name: abs(weights.get(q.name, 0.0)) * q.nominal for q in (*self.plant.states, *self.plant.inputs)}
         pushes = {n: weight for n, weight in weights.items() if sizes[n] > MIN_FORCE_SHARE * max(sizes.values())}
         return pushes, float(at_base - sum(weight * base[n] for n, weight in pushes.items()))

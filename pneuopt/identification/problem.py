@@ -85,10 +85,8 @@ class EstimationProblem:
         Parameters without an estimate begin at their given values.
         """
         if isinstance(fit, IdentificationResult):
-            runs, found = (
-                tuple(fit.trajectories.values()),
-                {str(n): float(v) for n, v in fit.estimates["value"].items()},
-            )
+            runs = tuple(fit.trajectories.values())
+            found = {str(n): float(v) for n, v in fit.estimates["value"].items()}
         else:
             runs, found = fit.trajectories, {n: fit.parameters.value(n) for n in fit.parameters.free_names}
         given = self.unknowns()
@@ -187,10 +185,7 @@ NEEDED = {
     "outputs": "without one there is nothing to compare",
     "noise": "a constant channel shows none; state its [noise] in the sidecar",
 }
-SETPOINT_CHANNELS = (
-    "speed_reference",
-    "position_reference",
-)  # a loop's set-points may stay in a log; no plant reads them
+SETPOINT_CHANNELS = ("speed_reference", "position_reference")  # of a loop; they may stay in a log, no plant reads them
 
 
 def as_experiments(experiments: Experiment | Iterable[Experiment]) -> tuple[Experiment, ...]:

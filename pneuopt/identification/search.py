@@ -219,9 +219,8 @@ def fit_fixing_unidentifiable(
     for is_given in (True, False) if not first.status.converged else (True,):
         held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
         is_settled = fit.status.converged and not fit.unidentifiable
-        if fit.status.code is Code.INTERRUPTED or (
-            is_settled and not rejects_fixed_values(fit, first, len(held.fixed))
-        ):
+        is_taken = is_settled and not rejects_fixed_values(fit, first, len(held.fixed))
+        if fit.status.code is Code.INTERRUPTED or is_taken:
             return held, fit
     return problem, first
 
@@ -264,10 +263,8 @@ def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> t
         return held, part
     # where those held may be ten times as large, the logs may tell nothing of any other
     values = np.array([part.parameters.value(n) for n in part.parameters.free_names])
-    covariance, free = (
-        part.covariance + part.prior_covariance,
-        [n not in held.fixed for n in part.parameters.free_names],
-    )
+    covariance = part.covariance + part.prior_covariance
+    free = [n not in held.fixed for n in part.parameters.free_names]
     leans = prior_dominated(covariance, part.prior_covariance, values, held.fixed.values())
     return (problem, fit) if leans[free].all() else (held, part)
 
@@ -329,13 +326,8 @@ def rank(fit: Fit, tightest: float) -> tuple[int, float]:
 
 def are_alike(best: Fit, second: Fit) -> bool:
     """Whether both ended at an optimum, at the same cost."""
-    same = (best.jumps is None) == (second.jumps is None)
-    return (
-        is_optimum(best)
-        and is_optimum(second)
-        and same
-        and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
-    )
+    same = is_optimum(best) and is_optimum(second) and (best.jumps is None) == (second.jumps is None)
+    return same and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
 
 
 def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], Candidate]) -> Candidate:

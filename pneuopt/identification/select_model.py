@@ -536,10 +536,8 @@ def _notes(system: System, fit: IdentificationResult | Refutation) -> tuple[str,
         [str(n) for n, own in fit.estimates["note"].items() if own == note]
         for note in (UNIDENTIFIABLE_NOTE, AT_BOUND_NOTE)
     )
-    order, found = (
-        system.identification_hints.at_least,
-        fit.parameters.select(n for n in fit.parameters if n not in unknown),
-    )
+    order = system.identification_hints.at_least
+    found = fit.parameters.select(n for n in fit.parameters if n not in unknown)
     below = [(n, m) for n, m in order.items() if n in found and m in found and found.value(n) < found.value(m)]
     unphysical = ", ".join(f"{n} ({found.value(n):.4g}) below {m} ({found.value(m):.4g})" for n, m in below)
     return ", ".join(unknown), ", ".join(bound), unphysical, fit.status.message

@@ -205,7 +205,7 @@ class _Race:
         return self.run({**trial.widths, **scaled})
 
     def run(self, widths: dict[str, float], *, confirms: bool = False) -> _WidthTrial:
-        """A short search from the model's first start; one that confirms goes on to tight gaps, for alike costs."""
+        """A short search from the model's first start; one that confirms goes on to gaps whose costs compare."""
         stages = self.confirming_stages if confirms else (TRIAL_STAGE,)
         problem = replace(self._problem, parameters=self._problem.parameters.with_values(widths))
         # an empty last stage: the last one of a method would iterate to its end

@@ -114,10 +114,7 @@ class NormalEquations:
         out = np.full((len(keep), len(keep)), np.nan)
         out[np.ix_(keep, keep)] = bread
         if not noisy_gaps:
-            n, meat = (
-                self.gaps.shape[1],
-                np.zeros_like(reduced.schur),
-            )  # the data's own Gram matrix, nodes following
+            n, meat = self.gaps.shape[1], np.zeros_like(reduced.schur)  # of the data alone, the nodes following
             for rows, columns, unknowns in self.segments.blocks:
                 E = np.zeros((rows.stop - rows.start, self.linearisation.end_sensitivities.shape[2], len(meat)))
                 E[:, :n] = -reduced.node_sensitivity[rows]

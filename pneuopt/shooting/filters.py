@@ -164,7 +164,7 @@ class PredictionErrors:
         self.adapt_steps(scaling.start[None])
 
     def adapt_steps(self, z: Array) -> None:
-        """Take the steps that the stiffest of some sets (s, k) asks for: fewer lost slips at the right parameters."""
+        """Take the steps that the stiffest of sets (s, k) asks for: by fewer, right parameters lost their slips."""
         nodes = self._rough * self.segments.nominal
         found = [choose_integration(self.segments, nodes, self.scaling.values(each)) for each in z]
         implicit = [segments for segments, _ in found if segments.implicit_state is not None]

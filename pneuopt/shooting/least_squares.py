@@ -296,8 +296,7 @@ class Fit:
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:
     """Solve a transcription without costs and limits from its guesses; Ctrl-C gives the best iterate, marked."""
     began, state = time.perf_counter(), start_search(segment(transcription), method or LeastSquares())
-    state = run_search(state)
-    return end_search(state, time.perf_counter() - began)
+    return end_search(run_search(state), time.perf_counter() - began)
 
 
 @dataclass(frozen=True, eq=False)
@@ -1158,10 +1157,9 @@ def end_search(state: SearchState, seconds: float) -> Fit:
 def unsettled_covariance(state: SearchState) -> Array:
     """The covariance (own units) of the step that kinks still ask for. Shape (k, k)."""
     equations, z = state.iterate.equations, state.iterate.z
-    asked, reduced = np.zeros(len(z)), equations.arrow.eliminate(0.0)
-    solved = None if reduced is None else reduced.step(state.setup.scaling.movable(z, equations, reduced))
-    if solved is not None:
-        asked = equations.linearisation.chain * solved.parameters
+    reduced = equations.arrow.eliminate(0.0)
+    solved = reduced and reduced.step(state.setup.scaling.movable(z, equations, reduced))
+    asked = equations.linearisation.chain * solved.parameters if solved else np.zeros(len(z))
     return np.outer(asked, asked)
 
 

@@ -144,9 +144,8 @@ class Rollout:
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         kept = np.empty((m, -(-n // states), nx)) if states else None
-        self._call_library(
-            (x, us, ps, ts, hs), substeps, states, (None, None, y, dy, kept, x_end, dx_end, None, None, None)
-        )
+        others = None, None, y, dy, kept, x_end, dx_end, None, None, None
+        self._call_library((x, us, ps, ts, hs), substeps, states, others)
         return RolloutResult(y, x_end, kept, _swap_last_axes(dy), _swap_last_axes(dx_end))
 
     def gram(
@@ -209,12 +208,8 @@ class Rollout:
             e = np.concatenate([dy, (run.y - y)[..., None]], axis=-1) * w[..., None]
             e = np.where(np.isfinite(y)[..., None], e, 0.0)
             flat = e.reshape(len(y), -1, e.shape[-1])
-            grams, squares, sums = (
-                np.swapaxes(flat, 1, 2) @ flat,
-                np.sum(e[..., -1] ** 2, axis=1),
-                e[..., :-1].sum(axis=1),
-            )
-            parts.append((grams, squares, sums, run.y, run.x_end, dx_end))
+            squares, sums = np.sum(e[..., -1] ** 2, axis=1), e[..., :-1].sum(axis=1)
+            parts.append((np.swapaxes(flat, 1, 2) @ flat, squares, sums, run.y, run.x_end, dx_end))
         return Gram(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _call_library(
@@ -303,13 +298,7 @@ def _swap_last_axes(array: Array | None) -> Array | None:
 
 
 C_SOURCE_FOLDER = Path(__file__).parent
-INPUT_RATES = {
-    "t": 1,
-    "u": 1,
-    "p": 0,
-    "x": 2,
-    "S": 2,
-}  # how often the inputs of a piece change: an index into `c_writer.RATES`
+INPUT_RATES = {"t": 1, "u": 1, "p": 0, "x": 2, "S": 2}  # how often inputs change: an index into `c_writer.RATES`
 PIECE_OUTPUTS = {"step": ("x_next", "S_next"), "output": ("y", "dy"), "update": ("x_next", "S_next")}
 STEP_INPUT_RATES = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
 
