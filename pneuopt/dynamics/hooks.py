@@ -1,9 +1,5 @@
 """Model hooks: what a model hands its `System` beside the equations.
 
-How an identification starts from logs, what is wrong with logs, where the plant rests, which hardware cannot exist, the
-limits beyond which the equations no longer hold (end stops, a vacuum), and which motion a log must show for the model's
-parameters to be identifiable (`System.identification_hints`).
-
 Names are those of parameters. A part of a plant uses its own ("viscous") for its own parameters and whole ones
 ("load.force") for those of other parts; `IdentificationHints.with_prefix` turns the first into the second.
 """
@@ -218,21 +214,12 @@ class Width:
 
 @dataclass(frozen=True)
 class IdentificationHints:
-    """What a model tells an identification: the motion its parameters need in a log, and the runs that separate them.
+    """What a model tells an identification: the motion that parameters need in a log, the runs that separate them."""
 
-    Parameters
-    ----------
-    needs : mapping of str to Need
-        By parameter.
-    runs : tuple of SeparatingRun
-        The first that suits a group counts.
-    at_least : mapping of str to str
-        Parameters that no plant has below another one: static friction below Coulomb friction.
-    """
-
-    needs: Mapping[str, Need] = field(default_factory=dict, metadata=NOT_SAVED)
-    runs: tuple[SeparatingRun, ...] = ()
+    needs: Mapping[str, Need] = field(default_factory=dict, metadata=NOT_SAVED)  # by parameter
+    runs: tuple[SeparatingRun, ...] = ()  # the first that suits a group counts
     widths: tuple[Width, ...] = ()
+    # parameters that no plant has below another one: static friction below Coulomb friction
     at_least: Mapping[str, str] = field(default_factory=dict)
 
     def __or__(self, other: "IdentificationHints") -> "IdentificationHints":

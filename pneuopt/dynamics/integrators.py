@@ -13,10 +13,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from pneuopt.dynamics.tolerances import (
-    MIN_SLOPE,
-    SOLVER_ITERATIONS,
-)
+from pneuopt.dynamics.tolerances import MIN_SLOPE, SOLVER_ITERATIONS
 
 
 def rk4(rate: Callable[[ca.SX, ca.SX], ca.SX], t: ca.SX, h: ca.SX, x: ca.SX) -> ca.SX:
@@ -100,8 +97,7 @@ def solve_scalar(residual: Callable[[ca.SX], tuple[ca.SX, ca.SX]], guess: ca.SX)
     """The root of an increasing function by Newton's method, halved where that leaves what encloses the root.
 
     Its slope is `MIN_SLOPE` at least, on average from the guess on. Zero is tried next where it may lie between:
-    friction is steepest at rest, and from there Newton's method goes uphill to a root on either side without a step too
-    far.
+    friction is steepest at rest, from where Newton's method takes no step too far.
     """
     value, slope = residual(guess)
     far = guess - value / MIN_SLOPE

@@ -4,9 +4,8 @@
 by `simulate` and, where it is fittable, by `identify`. Nobody asks a model for its type. A drive is none: `as_system`
 and `as_runnable` take its system, and every verb that is given a model begins with one of them.
 
-`count_from_centre` makes a plant whose command counts from the centre of its valve. A valve for 0 to 10 V is closed
-near 5 V. Its wire and its logs count from 0 V; a controller's command, its limits and its dither count from the centre,
-whatever that is. What a loop puts on the wire is the centre plus its command.
+`count_from_centre` makes a plant whose command counts from the centre of its valve, as a controller's does: one for 0
+to 10 V is closed near 5 V, and its wire and its logs count from 0 V.
 """
 
 from collections.abc import Callable, Mapping, Sequence

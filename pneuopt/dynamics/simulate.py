@@ -164,11 +164,7 @@ def continue_simulation(
     rtol: float = 1e-10,
     atol: float = 1e-12,
 ) -> tuple[Trajectory, tuple[Contact, ...]]:
-    """Continue a run from the state in which `simulate` ended, to the inputs' end or to the first contact.
-
-    A sampled controller has already acted at ``inputs.t[0]``; the trajectory ends before the instant of a contact,
-    which is returned, too.
-    """
+    """Continue a run from where `simulate` ended, its controller having acted; also returns a contact that ends it."""
     run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol), continues=True)
     return run.trajectory(), met
 
@@ -311,10 +307,7 @@ def _time_tolerance(t: Array) -> float:
 
 
 def _restart_times(t: Array, u: Array, sample_time: float | None, slack: float) -> tuple[Array, Mask]:
-    """Instants at which the integration restarts: the start, changes of u, samples; and which are samples.
-
-    u is each input that is held, and each slope of one that is linear.
-    """
+    """Instants of restarts, at the start, changes of u (held inputs, slopes of others), samples; which are samples."""
     changes = t[np.append(True, np.any(u[1:] != u[:-1], axis=1))]
     if sample_time is None:
         return changes, np.zeros(len(changes), dtype=bool)

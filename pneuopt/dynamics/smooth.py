@@ -105,10 +105,9 @@ class LimitMonitor:
         return x
 
     def follow(self, run: Integration, instants: Array, recorded: int, *, stops: bool) -> Array:
-        """Advance a run that was just restarted through instants, and record it at the first `recorded` of them.
+        """Advance a run that was just restarted through instants, recorded at so many, to the state at the last.
 
-        Returns the state at the last instant. With `stops` the run ends before the first recorded one by which a limit
-        was met.
+        With `stops` the run ends before the first recorded one by which a limit was met.
         """
         t, places = self._with_checks(instants)
         x = run.advance_along(t) if isinstance(run, SmoothIntegration) else None
@@ -302,11 +301,7 @@ class WorkArrays:
         self._kept = list[Array]()
 
     def give_to(self, solver: Any) -> None:
-        """Let SciPy's LSODA, just restarted, work in these; in its own the first time.
-
-        No public name leads to its arrays: a solver that does not show them where this one does keeps its own, with the
-        same answer.
-        """
+        """Let SciPy's LSODA, just restarted, work in these; one without these private names keeps its own."""
         integrator: Any = getattr(getattr(solver, "_lsoda_solver", solver), "_integrator", None)
         fresh = [getattr(integrator, name, None) for name in ("rwork", "iwork")]
         handed = getattr(integrator, "call_args", [])[4:6]

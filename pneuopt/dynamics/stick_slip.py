@@ -48,10 +48,8 @@ class StickSlipIntegration:
     def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
         message = "Karnopp's friction needs a plant with a state 'speed' and a parameter 'friction.direction'"
         require("speed" in names(system.states) and FRICTION_DIRECTION in system.parameters, message, ModelError)
-        self._speed, self._direction = (
-            names(system.states).index("speed"),
-            list(system.parameters).index(FRICTION_DIRECTION),
-        )
+        self._speed = names(system.states).index("speed")
+        self._direction = list(system.parameters).index(FRICTION_DIRECTION)
         self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
         self._end = 1.001 * (grid[-1] - grid[0]) + 1e-3  # LSODA derives its first step from it
         self._p = {d: self._with_direction(p, d) for d in (-1, 0, 1)}
@@ -220,10 +218,7 @@ def _acceleration_function(system: System, speed: int, direction: int) -> ca.Fun
 
 
 def _first_root(f: Callable[[float], float], begin: float, end: float) -> float:
-    """Where f first turns positive on a step; infinity if it does not.
-
-    f is evaluated at a few points; where it has a maximum between them, that is found first.
-    """
+    """Where f first turns positive on a step, by a few points or at a maximum between them; infinity if it does not."""
     t = np.linspace(begin, end, ROOT_PROBES_PER_STEP + 1)
     values = np.array([f(at) for at in t])
     if not np.any(values[1:] > 0):

@@ -407,8 +407,7 @@ def slopes(t: Array, u: Array, linear: Mask) -> Array:
 def add_slopes(discrete: DiscreteSystem, linear: Mask) -> DiscreteSystem:
     """A sampled system of which some inputs run linearly within a sample; where none does, the system itself.
 
-    Its inputs are those of `discrete`, then a slope for each linear one, then the instant of the sample [s], as
-    `append_slopes` gives them. It takes every slope, zero too, so one system serves logs that differ in what they hold.
+    Its inputs are those of `append_slopes`; it takes every slope, zero too, so that it serves logs that differ in that.
     """
     if not linear.any():
         return discrete

@@ -5,12 +5,10 @@ Experimental Designs, with SAS, 2007, chapter 10). A newcomer adds a class like 
 and its figure of their covariance.
 
 `linked_information`: what a log that is cut into linked segments tells about parameters, once it is identified.
-`identify` weighs the gaps between segments as if the states jumped there a little, and its covariance is the sandwich
-B^-1 M B^-1 (`Equations.covariance`): B is the Gram matrix of data and gaps with the nodes eliminated, M that of the
-data alone with the nodes where B puts them, since true gaps carry no noise. Its inverse B M^-1 B is the information
-here: with B itself, a planned run of an EMPS axis promised intervals three times as wide as its fit had, and the search
-took other runs for the best (problems/identify/next_experiment.py). The sum over logs is that of a joint fit where the
-weights of the gaps lose little.
+`identify` weighs gaps as if the states jumped there a little, and its covariance is the sandwich B^-1 M B^-1
+(`NormalEquations.covariance`): B is the Gram matrix of data and gaps with the nodes eliminated, M that of the data
+alone. Its inverse B M^-1 B is the information here: with B itself, a planned run of an EMPS axis promised intervals
+three times as wide as its fit had, and other runs seemed the best (problems/identify/next_experiment.py).
 """
 
 import math
@@ -21,13 +19,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from pneuopt.experiments.tolerances import (
-    LARGEST,
-    REACHED_ROOM,
-    SINGULAR,
-    STATE_RIDGE,
-    UNINFORMED,
-)
+from pneuopt.experiments.tolerances import LARGEST, REACHED_ROOM, SINGULAR, STATE_RIDGE, UNINFORMED
 from pneuopt.identification.result import IdentificationResult, join_names
 from pneuopt.identification.statistics import confidence_interval
 from pneuopt.identification.tolerances import UNIDENTIFIABLE_DEVIATION
@@ -163,7 +155,7 @@ class ExperimentDesign(Result):
         return WideFrame.from_dict(rows, orient="index")
 
     def summary(self) -> Report:
-        """The gain of the runs, the intervals before and after, the limits that they touch, and the signal to play."""
+        """The gain of the runs, intervals before and after, the limits that they touch, and what is played in words."""
         rows = []
         for name, row in self.table.iterrows():
             ends = [_join(row["before_low"], row["before_high"]), _join(row["after_low"], row["after_high"])]
@@ -172,7 +164,21 @@ class ExperimentDesign(Result):
             rows.append((str(name), format_number(row["value"], 4), *ends, shrunk, str(row["unit"]), mark))
         heads = number_columns("value", "95 % now", "95 % after", "narrower")
         intervals = Table((*text_columns("parameter"), *heads, *text_columns("unit", "")), tuple(rows))
-        return Report((self._verdict(), *self._remarks(), intervals, *self._steps()))
+        figures = f"{self.stats['before']:.2g} to {self.stats['after']:.2g}"
+        tried = f"{self.stats['tried']:.0f} excitations of {self.stats['plants']:.0f} plants"
+        remarks = [f"{self.criterion}: relative standard deviation from {figures}; {tried} were tried"]
+        if others := [n for n in self.unidentifiable if not self.table["target"][n]]:
+            remarks.append(f"still unidentifiable: {join_names(others)}, which nobody has asked for")
+        if self.active_limits:
+            remarks.append(f"limits that are reached: {join_names(self.active_limits)}; wider ones would allow more")
+        shown, steps = 8, list[Line]()
+        start = write_value(self.stats["origin"], self.units[self.channel], 4)
+        for k, blocks in enumerate(self.blocks, 1):
+            lead = f"run {k}: " if len(self.blocks) > 1 else ""
+            more = f"; and {len(blocks) - shown} more" if len(blocks) > shown else ""
+            steps.append(Line(lead + "; ".join(blocks[:shown]) + more, indent=2))
+        begin = Line(f"{self.channel} begins at {start}; about that, each block as long as the others:")
+        return Report((self._verdict(), *(Line(r, indent=2) for r in remarks), intervals, begin, *steps))
 
     def _verdict(self, useful: float = 1.5) -> Line:
         """The ratio by which the targets' intervals shrink; below a `useful` one runs are hardly worth their time."""
@@ -194,28 +200,6 @@ class ExperimentDesign(Result):
         many = f"{least:.1f} to {most:.1f} times" if most > 1.05 * least else f"{least:.1f} times"
         tone = Tone.GOOD if least >= useful else Tone.DOUBTFUL
         return Line(f"{lead} makes the asked intervals {many} narrower", tone)
-
-    def _remarks(self) -> list[Line]:
-        """The criterion, what stays unidentifiable, and the active limits."""
-        figures = f"{self.stats['before']:.2g} to {self.stats['after']:.2g}"
-        tried = f"{self.stats['tried']:.0f} excitations of {self.stats['plants']:.0f} plants"
-        out = [Line(f"{self.criterion}: relative standard deviation from {figures}; {tried} were tried", indent=2)]
-        others = [n for n in self.unidentifiable if not self.table["target"][n]]
-        if others:
-            out.append(Line(f"still unidentifiable: {join_names(others)}, which nobody has asked for", indent=2))
-        if self.active_limits:
-            what = join_names(list(self.active_limits))
-            out.append(Line(f"limits that are reached: {what}; wider ones would allow more", indent=2))
-        return out
-
-    def _steps(self, shown: int = 8) -> list[Line]:
-        start = write_value(self.stats["origin"], self.units[self.channel], 4)
-        out = [Line(f"{self.channel} begins at {start}; about that, each block as long as the others:")]
-        for k, blocks in enumerate(self.blocks, 1):
-            lead = f"run {k}: " if len(self.blocks) > 1 else ""
-            more = f"; and {len(blocks) - shown} more" if len(blocks) > shown else ""
-            out.append(Line(lead + "; ".join(blocks[:shown]) + more, indent=2))
-        return out
 
 
 def tabulate_design(
@@ -400,9 +384,8 @@ class WantedPrecision:
 def linked_information(grams: Array, ends: Array, jumps: Array, eliminated: int = 0) -> Array:
     """The information (m, k, k) of m logs' linked segments about parameters, as the estimates of `identify` have it.
 
-    By the Gram matrices of each segment about its start state and w parameters, in unit noise, the derivatives of its
-    end state by the same, and the standard deviations of the gaps; the first `eliminated` parameters are each log's
-    own.
+    By each segment's Gram matrix and derivatives of its end about start state and parameters, in unit noise, and the
+    deviations of the gaps; the first `eliminated` parameters are each log's own.
     """
     m, count, n, width = ends.shape
     gaps, follows = _gap_information(ends[:, :-1], 1 / jumps**2), list[Array]()

@@ -6,15 +6,11 @@ exchanged until no exchange helps (V. V. Fedorov, Theory of Optimal Experiments,
 block by block with random changes, since limits, sticking and a run's memory leave no useful gradient of the whole;
 only what keeps every limit at every sample, for every plant that is thought possible, is taken.
 
-`DesignSearch`: blocks of an excitation by exchange, then refined whole; what is best is an `ExperimentDesign`.
-
 A short run is simulated in a fraction of the time: the search also begins with a quarter of the duration, whose
 information counts four times. Where that does better, it is refined, played twice in a row, and refined again.
 
-A `WaveBlock` is a stretch of an excitation, a wave about a level. A `PlannedRun` simulates many candidates at once
-in SIMD lanes, with their limits and their information: that of the log that the run would leave, the plant's command
-and its measured outputs. So a loop only makes the run; it is the plant that is identified, along short segments whose
-sensitivities are chained, the start state eliminated, as `identify` does.
+The information of a `PlannedRun` is that of the log that it would leave, of the plant's command and its outputs: a loop
+only makes the run; it is the plant that is identified.
 
 `predict_loss`: what a tuned loop is worth as its plant drifts, and when it violates a requirement.
 """
@@ -97,23 +93,12 @@ class Wave(Enum):
 
 @dataclass(frozen=True)
 class WaveBlock:
-    """A wave about a level.
-
-    Attributes
-    ----------
-    wave : Wave
-    amplitude : float
-        Peak [unit of the excitation].
-    frequency : float
-        [Hz]; a chirp's first one.
-    level : float
-        About which it goes, counted from the start of the run [unit of the excitation].
-    """
+    """A wave about a level."""
 
     wave: Wave
-    amplitude: float
-    frequency: float
-    level: float = 0.0
+    amplitude: float  # peak [unit of the excitation]
+    frequency: float  # [Hz]; a chirp's first one
+    level: float = 0.0  # about which it goes, counted from the start of the run [unit of the excitation]
 
     def samples(self, t: Array) -> Array:
         """The wave at instants of the block, shape (n,), without its level; it begins at zero, but for a square one."""
@@ -137,10 +122,7 @@ class WaveBlock:
 
 
 def join_blocks(blocks: Sequence[WaveBlock], t: Array, rise: float = 0.15) -> Array:
-    """The excitation of equally long blocks, counted from its start, shape (n,).
-
-    The level moves smoothly, without a knock, in the share `rise` of a block.
-    """
+    """The excitation (n,) of equally long blocks; the level moves smoothly in the share `rise` of one."""
     out = np.empty(len(t))
     edges = np.linspace(0, len(t), len(blocks) + 1).round().astype(int)
     level = 0.0
@@ -155,10 +137,7 @@ def join_blocks(blocks: Sequence[WaveBlock], t: Array, rise: float = 0.15) -> Ar
 def library(
     amplitude: float, duration: float, sample_time: float, amplitudes: int = 10, frequencies: int = 8
 ) -> list[WaveBlock]:
-    """Blocks of every known kind: slow ramps, steps, sines from presliding to full range, chirps.
-
-    Of each kind so many amplitudes and frequencies; the refinement finds what lies between.
-    """
+    """Blocks of every kind, of so many amplitudes and frequencies; the refinement finds what lies between."""
     fastest = max(CYCLES_A_SAMPLE / sample_time, 2 / duration)
     sizes = amplitude * np.geomspace(LEAST_AMPLITUDE, 1.0, amplitudes)
     paces = np.geomspace(1 / duration, fastest, frequencies)
@@ -189,10 +168,7 @@ def vary_run(
     ends: tuple[float, float],
     fresh: Sequence[WaveBlock],
 ) -> list[WaveBlock]:
-    """A run near another one: mostly with one block changed, else with all, with one exchanged, copied or moved.
-
-    Small changes alone stay where the exchange of separate blocks began: what a block tells depends on its neighbours.
-    """
+    """A run near another one: one block changed, exchanged, copied or moved, or all; small changes stay near."""
     changed, amplitude = list(run), max(abs(v) for v in reach)
     k, j = (int(n) for n in rng.integers(len(run), size=2))
     kind, size = rng.random(), spread * rng.random()
@@ -315,12 +291,12 @@ class PlannedRun:
         """The information of each run's log about the free parameters, as in `identify`, in their units; (m, k, k)."""
         m, n = runs.shape[:2]
         size = max(1, self.batch // n)
-        parts = [self._information(runs[i : i + size], parameters, substeps) for i in range(0, m, size)]
-        k = len(self.free)
-        return np.concatenate(parts) if parts else np.zeros((0, k, k))
-
-    def _information(self, runs: Array, parameters: ParameterSet, substeps: int) -> Array:
-        m, n = runs.shape[:2]
+        if m > size:
+            parts = [self.information(runs[i : i + size], parameters, substeps) for i in range(0, m, size)]
+            return np.concatenate(parts)
+        out = np.zeros((m, len(self.free), len(self.free)))
+        if not m:
+            return out
         method = LeastSquares()  # as `identify` places its nodes and weighs its gaps in the end
         length = max(2, round(method.segment_time / self.sample_time))
         count = -(-n // length)
@@ -341,8 +317,7 @@ class PlannedRun:
         own = np.array([abs(known.value(n)) or 1.0 for n in (*self.per_log, *self.free)])
         nominal = np.array([q.nominal for q in self.plant.states])
         scale = np.concatenate([nominal, own])
-        jumps = method.stages[-1].gap * gap_scales(self._segments_about_rest(parameters), LeastSquares().kinematic)
-        out = np.zeros((m, len(self.free), len(self.free)))
+        jumps = method.stages[-1].gap * gap_scales(self._segments_about_rest(parameters), method.kinematic)
         kept = own[len(self.per_log) :]
         given = grams[good] * np.outer(scale, scale), ends[good] * scale / nominal[:, None]
         out[good] = linked_information(*given, jumps, len(self.per_log)) / np.outer(kept, kept)
@@ -506,8 +481,7 @@ class DesignSearch:
     def _reach(self) -> tuple[float, float]:
         """The range of the excitation, down and up from the start."""
         low, high = self.run.excited_limits()
-        origin = self.run.origin
-        return low - origin, high - origin
+        return low - self.run.origin, high - self.run.origin
 
     @cached_property
     def _waves(self) -> list[WaveBlock]:
@@ -517,8 +491,7 @@ class DesignSearch:
 
     def _choose_blocks(self) -> list[list[WaveBlock]]:
         """The blocks of all runs by exchange: their information adds up."""
-        t = self._grid[: self.samples // self._blocks]
-        waves = self._waves
+        t, waves = self._grid[: self.samples // self._blocks], self._waves
         gains, keeps = self._evaluate(np.stack([np.clip(b.samples(t), *self._reach) for b in waves]))
         if not keeps.any():
             raise self._infeasible(waves, t)
@@ -581,10 +554,8 @@ class DesignSearch:
 
     def _evaluate(self, signals: Array) -> tuple[Array, Array]:
         """Information of excitations, shape (plants, m, k, k), and whether all plants keep the limits under them."""
-        keeps = np.ones(len(signals), dtype=bool)
-        low, high = self._reach
-        keeps &= (signals.min(axis=1) >= low - 1e-12) & (signals.max(axis=1) <= high + 1e-12)
-        k = len(self.run.free)
+        (low, high), k = self._reach, len(self.run.free)
+        keeps = (signals.min(axis=1) >= low - 1e-12) & (signals.max(axis=1) <= high + 1e-12)
         gains = np.zeros((len(self.plants), len(signals), k, k))
         self.tried += len(signals)
         shown = {}
@@ -786,9 +757,8 @@ def _known_information(free: Sequence[str], covariance: "pd.DataFrame | None") -
     if known:
         values = covariance.loc[known, known].to_numpy(dtype=float)
         spread = np.sqrt(np.diag(values))
-        out[np.ix_(place, place)] = np.linalg.pinv(values / np.outer(spread, spread), hermitian=True) / np.outer(
-            spread, spread
-        )
+        scale = np.outer(spread, spread)
+        out[np.ix_(place, place)] = np.linalg.pinv(values / scale, hermitian=True) / scale
     return out
 
 
@@ -803,13 +773,8 @@ def _draw(
     spread = np.sqrt(np.diag(covariance.loc[known, known].to_numpy(dtype=float)))
     most = MAX_WRONG * np.array([value_size(parameters, n) for n in known])
     cut = np.minimum(1.0, most / np.maximum(spread, 1e-300))
-    return (
-        draw_plants(
-            parameters, covariance.loc[known, known] * np.outer(cut, cut), count, seed=further(seed, "next_experiment")
-        )
-        if known
-        else {}
-    )
+    shrunk, own = covariance.loc[known, known] * np.outer(cut, cut), further(seed, "next_experiment")
+    return draw_plants(parameters, shrunk, count, seed=own) if known else {}
 
 
 def _known_names(free: Sequence[str], covariance: "pd.DataFrame") -> list[str]:
@@ -908,8 +873,7 @@ def predict_loss(
     for date, is_ahead, values in plants:
         known = parameters.with_values({n: v for n, v in values.items() if np.isfinite(v)})
         rows[date] = {"ahead": is_ahead, **_certify(loop, references, known, spec)}
-    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("date")
-    return DesignOutlook(table)
+    return DesignOutlook(pd.DataFrame.from_dict(rows, orient="index").rename_axis("date"))
 
 
 def _certify(
@@ -919,9 +883,8 @@ def _certify(
     proof = certificate(loop, references, parameters, band=spec.band, envelope=spec.envelope)
     failures = list(dict.fromkeys(finding.defect.value for finding in proof.findings))
     for case in proof.metrics:
-        violated = spec.violations(
-            requirement_values({str(n): float(v) for n, v in proof.metrics[case].items()}), SLACK
-        )
+        figures = {str(n): float(v) for n, v in proof.metrics[case].items()}
+        violated = spec.violations(requirement_values(figures), SLACK)
         failures += [n for n in map(metric_name, violated) if n not in failures]
     row: dict[str, float | str] = {}
     for name in (n for n in spec.metric_names if n in proof.metrics.index):

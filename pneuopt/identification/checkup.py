@@ -274,9 +274,8 @@ def check(
         check_free(logs, parameters)
     except ModelError as error:
         found.append(LogFinding("", str(error), True, FREE_CHECK))
-    ranked = sorted(
-        (_locate(_rank(f, found, logs), logs) for f in found), key=lambda f: list(Severity).index(f.severity)
-    )
+    ranked = [_locate(_rank(f, found, logs), logs) for f in found]
+    ranked.sort(key=lambda f: list(Severity).index(f.severity))
     is_open = any(f.severity is Severity.FAULT for f in ranked)
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
     verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates[0])
@@ -287,7 +286,15 @@ def list_assumptions(
     system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment], parameters: ParameterSet
 ) -> tuple[Assumption, ...]:
     """The noise, the behaviour between samples and the fixed parameters that nobody has stated."""
-    found = [*_noise_levels(system, given, checked)]
+    found, levels = list[Assumption](), dict[str, float]()
+    units = {q.name: q.unit.partition("(")[0] for q in system.outputs}
+    for log, full in zip(given, checked, strict=True):
+        for channel in (n for n in outputs_in_log(system, full) if n not in log.noise and n not in levels):
+            levels[channel] = float(f"{full.noise[channel]:.3g}")
+            shown = estimate_noise(full.trajectory[channel], full.trajectory.t)
+            how = "its resolution, as the logs show" if shown.is_quantisation else "white, as the logs show"
+            noise = f"noise of {channel}", levels[channel], units[channel], f"[noise] {channel}"
+            found.append(Assumption(*noise, SIDECAR, how))
     behaviour = {
         n: kind for log in given for n, kind in input_behaviour(system, log).items() if n not in log.intersample
     }
@@ -309,20 +316,6 @@ def list_assumptions(
             reason = f"{used.meaning}; identify chooses it by the logs"
         found.append(Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason))
     return tuple(found)
-
-
-def _noise_levels(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> Iterator[Assumption]:
-    units = {q.name: q.unit.partition("(")[0] for q in system.outputs}
-    found: dict[str, float] = {}
-    for log, full in zip(given, checked, strict=True):
-        for channel in outputs_in_log(system, full):
-            if channel not in log.noise and channel not in found:
-                found[channel] = float(f"{full.noise[channel]:.3g}")
-                shown = estimate_noise(full.trajectory[channel], full.trajectory.t)
-                how = "its resolution, as the logs show" if shown.is_quantisation else "white, as the logs show"
-                yield Assumption(
-                    f"noise of {channel}", found[channel], units[channel], f"[noise] {channel}", SIDECAR, how
-                )
 
 
 MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
@@ -412,11 +405,7 @@ def _line(text: str, indent: int) -> Line:
 
 def _log_record(log: Experiment) -> LogRow:
     source, t = log.source, log.trajectory.t
-    columns = (
-        {n: {"column": c.name, "unit": c.unit, "said_by": c.said_by} for n, c in source.columns.items()}
-        if source
-        else {}
-    )
+    columns = source.columns if source else {}
     return {
         "log": log.name,
         "file": source.path if source else "",
@@ -425,7 +414,8 @@ def _log_record(log: Experiment) -> LogRow:
         "begin": float(t[0]),
         "end": float(t[-1]),
         "sample_time": float(np.median(np.diff(t))),
-        "channels": columns or {n: {} for n in log.trajectory},
+        "channels": {n: {"column": c.name, "unit": c.unit, "said_by": c.said_by} for n, c in columns.items()}
+        or {n: {} for n in log.trajectory},
         "unread": list(source.unread) if source else [],
         "sidecar": source.sidecar if source else "",
         "remarks": list(log.remarks),

@@ -1,13 +1,9 @@
 """`identifiability`: which parameters a set of logs can identify, before and after a fit.
 
-Every decision about it stands here, with its thresholds side by side; only a running search decides by itself which
-parameters its data do not determine (`shooting.convergence`, thresholds in `shooting.scaling`).
+Every decision about it stands here; only a running search decides by itself which parameters its data do not determine
+(`shooting`). `examine_logs`: what the log doctor finds in logs of a plant; `check_content` refuses logs for it.
 
-`examine_logs`: what the log doctor finds in logs of a plant; `check_content` refuses logs for it.
-
-Below: `pose_problem` of logs that pass, what plant and parameters say of the axis (`axis_from_model`), exchanged
-columns (`find_exchange`), and `mend_findings`, which mends a fault where a rule is certain and the fault is gone then.
-A newcomer adds a rule: ``rule(mended, finding, ambient) -> MendedLog | None`` and its row in `RULES`.
+A newcomer adds a rule that mends: ``rule(mended, finding, ambient) -> MendedLog | None`` and its row in `RULES`.
 """
 
 import math
@@ -62,7 +58,7 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.mending import MendedLog, convert, empty_cells, leave_out
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import InputError, LogError, require
-from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import Fit, LeastSquares
 from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
 from pneuopt.shooting.tolerances import MAX_SEARCH_SUBSTEPS
@@ -116,9 +112,8 @@ def identifiability(
 
 
 def verdict_from_sensitivities(problem: EstimationProblem, start: Start, variance: float = 1.0) -> Verdict:
-    """The verdict from the sensitivities at a start or fit; `variance` of the residuals in noise variances.
+    """The verdict from the sensitivities at a start or fit, without gaps; `variance` of residuals in noise variances.
 
-    They are taken along the start's states and without gaps: a segment begins with the sensitivities of all before it.
     Where they are not finite, or the start is so stiff that integrating it would take hours, all figures are NaN.
     """
     segments = segment(problem.transcription(start))
@@ -225,10 +220,7 @@ def prior_influenced(covariance: Array, prior_covariance: Array) -> Mask:
 
 
 def prior_dominated(covariance: Array, prior_covariance: Array, values: Array, held: Iterable[float]) -> Mask:
-    """The mask of estimates that the logs do not identify: they lean on priors, and are not known well even so.
-
-    A factor of ten says nothing of what is held at zero, so nothing that leans on it is known.
-    """
+    """The mask of estimates that lean on priors, and are not known well even so; nothing is that leans on a zero."""
     is_close = np.sqrt(np.diag(covariance)) <= MAX_PRIOR_DEVIATION * np.abs(values)
     is_close &= all(held)
     return prior_influenced(covariance, prior_covariance) & ~is_close
@@ -251,7 +243,9 @@ def _make_verdict(
             rows[name] = [p.value, *[math.nan] * 4, True]
             reasons[name] = "the best fit is at its bound, and the other intervals hold for that value only"
             continue
-        unit, size = p.value if p.log else 1.0, 1.0 if p.log else _comparison_size(name, p, problem)
+        unit, given, least = p.value if p.log else 1.0, problem.parameters[name.partition("[")[0]], float(p.unit == "1")
+        is_offset = p.lower < 0 and not least  # whose usual size is unknown
+        size = 1.0 if p.log else 0.0 if is_offset else max(abs(p.value), abs(given.value), least)
         relative = spread[i] / size if size > 0 else math.nan
         lack = None if trusted else missing_excitation(hints, name, names, seen)
         is_unidentifiable = (
@@ -269,14 +263,6 @@ def _make_verdict(
     exceeds = [w["inflation"] > MAX_INFLATION and w["relative"] > HARMLESS_DEVIATION for w in worst]
     harmful = tuple(tuple(group) for group, is_harmful in zip(groups, exceeds, strict=True) if is_harmful)
     return Verdict(table, harmful, reasons, identification_hints=hints)
-
-
-def _comparison_size(name: str, p: Parameter, problem: EstimationProblem) -> float:
-    """The size that a standard deviation is divided by; 0 for an offset, whose usual size is unknown."""
-    if p.lower < 0 and p.unit != "1":
-        return 0.0
-    given = problem.parameters[name.partition("[")[0]].value
-    return max(abs(p.value), abs(given), 1.0 if p.unit == "1" else 0.0)
 
 
 def _unidentifiable_reason(alone: float, relative: float, lack: Lack | None, usual_remedy: str) -> str:
@@ -305,11 +291,7 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
         inverse = 1 / np.maximum(singular, INFORMATION_ROUNDING)
         spread[informed] = np.linalg.norm(right * inverse[:, None], axis=0) / size[informed]
         parts = np.abs(right[inverse > MAX_INFLATION])
-        member = (
-            parts > MIN_COMBINATION_SHARE * parts.max(axis=1, keepdims=True)
-            if parts.size
-            else np.zeros_like(parts, dtype=bool)
-        )
+        member = parts > MIN_COMBINATION_SHARE * parts.max(axis=1, keepdims=True, initial=0.0)
         weak = np.zeros((len(member), len(size)), dtype=bool)
         weak[:, informed] = member
     return spread, alone, weak[weak.sum(axis=1) > 1]
@@ -318,10 +300,7 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
 def _log_root_information(
     segments: Segments, weighted: Array, end_sensitivities: Array, first: int, chain: Array, at_once: int = 2000
 ) -> Array:
-    """Square root of one log's information about the parameters; QR eliminates its start state, ordered first.
-
-    So many segments are reduced at once: memory against time.
-    """
+    """Square root of one log's information about the parameters; QR, of so many segments, eliminates the start."""
     n, k = end_sensitivities.shape[1], len(chain)
     carried = np.concatenate([np.eye(n), np.zeros((n, k))], axis=1)
     carried[np.isfinite(segments.fixed_start[first])] = 0.0
@@ -498,10 +477,8 @@ class _Body:
         for q in (*self.plant.states, *self.plant.inputs):
             if q.name == self.axis.speed or q.name.startswith("friction."):
                 continue
-            weight = (self.force(vector, {q.name: base[q.name] + self.change * q.nominal}) - at_base) / (
-                self.change * q.nominal
-            )
-            weights[q.name] = weight
+            step = self.change * q.nominal
+            weights[q.name] = (self.force(vector, {q.name: base[q.name] + step}) - at_base) / step
         sizes = {q.name: abs(weights.get(q.name, 0.0)) * q.nominal for q in (*self.plant.states, *self.plant.inputs)}
         pushes = {n: weight for n, weight in weights.items() if sizes[n] > MIN_FORCE_SHARE * max(sizes.values())}
         return pushes, float(at_base - sum(weight * base[n] for n, weight in pushes.items()))
@@ -563,10 +540,9 @@ Rule = Callable[[MendedLog, LogFinding, float], MendedLog | None]
 
 
 def mend_findings(model: Fittable, mended: MendedLog, parameters: ParameterSet, ambient: float) -> MendedLog:
-    """Mend the faults of a log for which there is a rule; a rule after which the fault is still found is taken back.
+    """Mend the faults of a log by rules, each taken back where its fault stays; gauge pressures count from `ambient`.
 
-    Gauge pressures count from `ambient` [Pa]. Where motion and force are both wrong nobody can tell what is right:
-    `LogError`.
+    Where motion and force are both wrong nobody can tell what is right: `LogError`.
     """
     several = len({f.channel for f in _find_faults(model, mended.log, parameters)}) > 1
     pair = find_exchange(model, mended.log, parameters) if several else None
@@ -612,31 +588,26 @@ def _between_jumps(mended: MendedLog, finding: LogFinding, _: float) -> MendedLo
     return empty_cells(mended, finding.channel, lost, "between two jumps")
 
 
-def _at_stop(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
-    lost = None if finding.evidence is None else finding.evidence.contradiction
-    return None if lost is None else leave_out(mended, lost, "at an end stop that the model has not")
-
-
-def _turn_sign(mended: MendedLog, finding: LogFinding, _: float) -> MendedLog | None:
-    """Turn the sign of a force that brakes on balance; of two pressures nobody knows which sensor is meant."""
-    if finding.channel not in mended.log.trajectory:
-        return None
-    return convert(mended, finding.channel, -1.0, 0.0, "for it brakes the motion on balance")
-
-
-def _to_absolute(mended: MendedLog, finding: LogFinding, ambient: float) -> MendedLog | None:
-    if "a vacuum" not in finding.message:
-        return None
-    return convert(mended, finding.channel, 1.0, ambient, "for it is a gauge pressure that is read as absolute")
-
-
 RULES: dict[str, Rule] = {
     "jumps": _between_jumps,
-    "stops": _at_stop,
-    "work": _turn_sign,
+    "stops": lambda mended, finding, _: (
+        leave_out(mended, finding.evidence.contradiction, "at an end stop that the model has not")
+        if finding.evidence is not None
+        else None
+    ),
+    # a force that brakes on balance; of two pressures nobody knows which sensor is meant
+    "work": lambda mended, finding, _: (
+        convert(mended, finding.channel, -1.0, 0.0, "for it brakes the motion on balance")
+        if finding.channel in mended.log.trajectory
+        else None
+    ),
     "scale": lambda mended, finding, _: convert(
         mended, finding.channel, 1e-3, 0.0, "for it moves as fast as mm that are read as m"
     ),
-    "pressures": _to_absolute,
+    "pressures": lambda mended, finding, ambient: (
+        convert(mended, finding.channel, 1.0, ambient, "for it is a gauge pressure that is read as absolute")
+        if "a vacuum" in finding.message
+        else None
+    ),
 }
 """By the name of the check."""

@@ -60,13 +60,7 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.output import one_blas_thread
-from pneuopt.quantities.parameters import (
-    ParameterSet,
-    as_tuple,
-    check_argument,
-    check_number,
-    wrong_argument,
-)
+from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_argument, check_number, wrong_argument
 from pneuopt.quantities.status import Code, Progress, ProgressReporter, Status, provenance
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, solve_least_squares

@@ -120,8 +120,7 @@ class LoggedLoop:
     def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array:
         """The start states on which no measured output depends, from a candidate; NaN for those that are estimated.
 
-        The command is computed anew at the first sample; of previous error and derivative only a sum counts, and what
-        a compensator remembers soon passes.
+        Of previous error and derivative only a sum counts, and what a compensator remembers soon passes.
         """
         held = {*UNSEEN_STATES, *(f"pid.{n}" for n in RESET_STATES)}
         held |= {
@@ -207,7 +206,7 @@ class LoggedLoop:
         return {self.loop.feedback.name, self.loop.pid_signal.name, *self.loop.readings}
 
     def _replay_controller(self, log: Log, name: str, *, was_at_rest: bool) -> Trajectory:
-        """The controller's states before each sample, and "control", along the logged signals that it sees."""
+        """The controller's states before each sample, of a rest or an empty integral, and "control", along a log."""
         discrete, rollout, alone = self._controller
         t, wanted = log.measured.t, self.inputs[0].name
         acts = _acting_samples(t, self._sample_time, name)
@@ -215,7 +214,13 @@ class LoggedLoop:
             f"logged.{n}": _signal_along_log(log.measured, n, self.loop.feedback.name, wanted, name) for n in self._seen
         }
         columns |= {"reference": log.measured[wanted]} | self._reference_rates(log.measured, acts)
-        begun = self._controller_start(log, {n: column[0] for n, column in columns.items()}, was_at_rest=was_at_rest)
+        controller, shown = alone.controller, {n: columns[f"logged.{n}"][0] for n in self._seen}
+        known, measured = controller.values(log.parameters), shown[controller.pid_signal.name]
+        position = shown[controller.feedback.name]
+        inner = controller.inner_inputs({"reference": columns["reference"][0]}, position, known)
+        begun = {n: float(v) for n, v in controller.start(inner, measured, shown, 0.0, known).items()}
+        rested = begun["pid.integral"] + begun["pid.transfer"]  # noise keeps the error of a rest from being zero
+        begun |= {"sensor.reading": measured, "pid.integral": rested if was_at_rest else 0.0, "pid.transfer": 0.0}
         start = np.array([[begun[n] for n in names(discrete.states)]])
         u = np.column_stack([*(columns[n] for n in names(alone.inputs)), acts])
         p, h = alone.parameter_vector(log.parameters), np.append(np.diff(t), 0.0)
@@ -224,18 +229,6 @@ class LoggedLoop:
         assert run.x is not None
         states = dict(zip(names(discrete.states), run.x[0].T, strict=True))
         return Trajectory(t, states | {"control": run.y[0, :, names(discrete.outputs).index("control")]})
-
-    def _controller_start(self, log: Log, first: Mapping[str, float], *, was_at_rest: bool) -> dict[str, float]:
-        """The controller's states before a log whose first signals are known: of a rest, or with an empty integral."""
-        alone = self._controller[2].controller
-        known = alone.values(log.parameters)
-        shown = {n: first[f"logged.{n}"] for n in self._seen}
-        measured, position = shown[alone.pid_signal.name], shown[alone.feedback.name]
-        inner = alone.inner_inputs({"reference": first["reference"]}, position, known)
-        x0 = {n: float(v) for n, v in alone.start(inner, measured, shown, 0.0, known).items()}
-        x0 |= {"sensor.reading": measured}
-        rested = x0["pid.integral"] + x0["pid.transfer"]  # noise keeps the error of a rest from being zero
-        return x0 | {"pid.integral": rested if was_at_rest else 0.0, "pid.transfer": 0.0}
 
 
 def _add_acting_input(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSystem:
@@ -274,10 +267,7 @@ def _acting_samples(t: Array, sample_time: float, name: str) -> Array:
 def _signal_along_log(
     measured: Trajectory, wanted: str, feedback: str, reference: str, name: str, window: int = 21
 ) -> Array:
-    """A signal that the controller sees along a log, without holes; a speed or position follows from the other.
-
-    A position is differentiated over so many samples.
-    """
+    """A signal that the controller sees along a log, without holes; a speed follows from `window` of positions."""
     if wanted in measured:
         return measured.fill_gaps(wanted)
     t, step = measured.t, float(np.median(np.diff(measured.t)))

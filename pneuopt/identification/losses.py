@@ -104,9 +104,7 @@ def fit_robustly(
 ) -> tuple[EstimationProblem, Fit]:
     """Repeat a fit with new weights and noise levels until neither they nor the estimates move.
 
-    Each channel's noise becomes the white part of its residuals: a wrong model's slow error stays visible. The
-    variances are inflated by Huber's sandwich ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for
-    all.
+    Each channel's noise becomes the white part of its residuals: a wrong model's slow error stays visible.
     """
     if loss is None and not estimate_noise:
         return problem, fit
@@ -176,7 +174,7 @@ def _refit(
     found = solve_least_squares(problem.transcription(problem.start_from(fit)), method)
     if loss is None:
         return problem, replace(found, variance_inflation=1.0)
-    # the variance by Huber's sandwich, at the scale of each channel, over that of weighted least squares
+    # the variance by Huber's sandwich, E psi^2 / (E psi')^2 at each channel's scale, over that of least squares
     parts = [(r, np.broadcast_to(scales[n], r.shape), weights[n]) for n, r in residuals.items()]
     r, s, w = (np.concatenate([part[i].ravel() for part in parts]) for i in range(3))
     known = np.isfinite(r)

@@ -6,13 +6,10 @@ changes when one cluster is left out measure their variance: CR3, the jackknife,
 with the degrees of freedom of Bell and McCaffrey (Survey Methodology 28(2), 2002), so that few clusters give a wide
 interval and not a lucky one. `problems/identify/interval_coverage.py` measures the coverage.
 
-`motion_p`: whether the mean of the residuals depends on the simulated motion, which is an error of the model.
-
-`suspect_widths`: whether the logs reject a width that only serves the integration, and which estimates it biases. The
-width counts as one more parameter, and the gradient of the cost by it at the estimates decides (Rao's score test, Proc.
-Cambridge Philos. Soc. 44, 1948): no fit with another width is needed, which the integration could not follow where it
-is narrow. After true stiction the Stribeck velocity was 7 % off, 5.6 of its deviations, with residuals of 1.006 times
-the noise (`problems/identify/mismatch.py`).
+`suspect_widths`: a width that only serves the integration counts as one more parameter, and the gradient of the cost by
+it at the estimates decides (Rao's score test, Proc. Cambridge Philos. Soc. 44, 1948), without a fit that the
+integration could not follow where it is narrow. After true stiction the Stribeck velocity was 7 % off, 5.6 of its
+deviations, with residuals of 1.006 times the noise (`problems/identify/mismatch.py`).
 """
 
 import math
@@ -155,10 +152,9 @@ def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: 
 
 
 def degrees_of_freedom(problem: EstimationProblem, fit: Fit) -> int:
-    """Residuals of a fit less the parameters and the start states that it has taken from them; at least one.
+    """Residuals of a fit less its parameters and start states, of each part of a log; at least one.
 
-    A log has a start state, and another one behind each hole in its inputs and in each window. States that no output
-    shows are not fitted, and a part takes no more than it has samples.
+    States that no output shows are not fitted, and a part takes no more than it has samples.
     """
     if fit.optimum is None:
         segments = segment(problem.transcription(problem.start_from(fit)))
@@ -234,8 +230,7 @@ def robust_covariance(
 ) -> RobustCovariance:
     """The covariance (k, k) that gives each parameter its widest interval among white residuals and clusters.
 
-    `classes` are further clusters, by a motion on which the residuals depend; with any, agreement of the blocks is no
-    excuse.
+    `classes` are clusters by a motion on which the residuals depend; with any, agreement of the blocks is no excuse.
     """
     halves = [blocks, blocks.halve(), blocks.halve().halve()]  # halving ends at one cluster a log
     times = [c for i, c in enumerate(halves) if c.count > 1 and c.count not in [h.count for h in halves[:i]]]
@@ -343,10 +338,9 @@ class Signal(NamedTuple):
 
 
 def motion_p(values: Array, residuals: Array, derivatives: Array, scores: FitScores, blocks: Indices) -> float:
-    """Probability that chance makes one output's residuals (m,) depend so much on a signal (m,), by segment.
+    """Probability by chance of Hotelling's T^2 (1931) of one output's residuals (m,) summed over classes of a signal.
 
-    Of Hotelling's T^2 (1931) of the sums over classes of the signal, less what a change of the parameters explains
-    (`derivatives`, (m, k)); sums of different blocks of time count as independent.
+    Less what a change of the parameters explains (`derivatives`, (m, k)); blocks of time count as independent.
     """
     members = _classes(values) == np.arange(MOTION_CLASSES)[:, None]
     explained = np.linalg.solve(scores.whole_information, (members @ derivatives).T)

@@ -85,10 +85,8 @@ class EstimationProblem:
         Parameters without an estimate begin at their given values.
         """
         if isinstance(fit, IdentificationResult):
-            runs, found = (
-                tuple(fit.trajectories.values()),
-                {str(n): float(v) for n, v in fit.estimates["value"].items()},
-            )
+            runs = tuple(fit.trajectories.values())
+            found = {str(n): float(v) for n, v in fit.estimates["value"].items()}
         else:
             runs, found = fit.trajectories, {n: fit.parameters.value(n) for n in fit.parameters.free_names}
         given = self.unknowns()
@@ -187,10 +185,7 @@ NEEDED = {
     "outputs": "without one there is nothing to compare",
     "noise": "a constant channel shows none; state its [noise] in the sidecar",
 }
-SETPOINT_CHANNELS = (
-    "speed_reference",
-    "position_reference",
-)  # a loop's set-points may stay in a log; no plant reads them
+SETPOINT_CHANNELS = ("speed_reference", "position_reference")  # of a loop; they may stay in a log, no plant reads them
 
 
 def as_experiments(experiments: Experiment | Iterable[Experiment]) -> tuple[Experiment, ...]:
@@ -340,10 +335,9 @@ def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Inter
 
 
 def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tuple[str, ...]]:
-    """Bridge the short holes of a log's inputs and cut it at the long ones; returns the log and what was done in words.
+    """Bridge the short holes of a log's inputs and cut it at the long ones (`holes`); the log and sentences on that.
 
-    `holes` of a cut log names the samples whose inputs nobody knows; a sampled loop is refused there, for its
-    controller goes on.
+    A sampled loop is refused at a long one, for its controller goes on.
     """
     log, inputs = experiment.trajectory, names(system.inputs)
     known: Mask = np.asarray(np.isfinite(log.matrix(inputs)).all(axis=1))

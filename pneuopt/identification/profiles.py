@@ -233,10 +233,7 @@ class _Refits:
         return pd.DataFrame(rows)
 
     def _scale(self, noise: float, *, limited: bool) -> float:
-        """The cost that counts as one variance, from the curvature: weighted gaps rise less than the likelihood.
-
-        It is limited to the variance of the residuals where these are white.
-        """
+        """The cost that counts as one variance, by curvature, as weighted gaps rise less; `limited` to `noise`."""
         if not (math.isfinite(self.spread) and self.spread > 0):
             return noise
         step = min(self.spread, MAX_LOG_PROBE) if self.parameter.log else self.spread
@@ -300,10 +297,7 @@ def _is_at_level(refits: _Refits, point: _ProfilePoint, target: float) -> bool:
 
 
 def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePoint, target: float) -> None:
-    """Locate a crossing of the level by false position on the root of the deviance, which is nearly linear.
-
-    Where refits end at two optima, it may jump over the level; the place of the jump is all that is to be found there.
-    """
+    """Locate a crossing of the level by false position on the deviance's root, nearly linear; or its jump."""
     for _ in range(MAX_REFITS_A_SIDE):
         if abs(outside.z - inside.z) <= END_TOLERANCE * abs(outside.z - refits.centre):
             return

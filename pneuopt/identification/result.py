@@ -17,7 +17,7 @@ from pneuopt.dynamics.hooks import IdentificationHints, Lack, LoggedMotion
 from pneuopt.identification.tolerances import MOVING_SPEED_SHARE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import TIED, Column, Line, Report, Table, format_number, number_columns, text_columns
+from pneuopt.quantities.report import TIED, Line, Report, Table, format_number, number_columns, text_columns
 from pneuopt.quantities.results import Result, Shown
 from pneuopt.quantities.status import Status, report_status
 from pneuopt.quantities.trajectories import Trajectory
@@ -343,10 +343,18 @@ def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:
     """Agreement of each log and channel; of more than so many the median and the worst."""
     if fit.empty:  # no channel was compared
         return Report()
+    rows, flat = list[tuple[str, ...]](), fit.reset_index()
     if len(fit) > most_rows:
-        return Report((_agreement_in_short(fit),))
-    rows = []
-    for row in fit.reset_index().to_dict(orient="records"):
+        for channel in flat["channel"].unique():
+            own = flat[flat["channel"] == channel].sort_values("nrmse", na_position="first")
+            worst, middle = own.iloc[-1], own[["nrmse", "rmse"]].median()
+            figures = [format_number(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"], worst["free_run_nrmse"])]
+            rmse = format_number(middle["rmse"], 4)
+            rows.append((str(channel), str(len(own)), *figures, str(worst["log"]), rmse, str(worst["unit"])))
+        figures_heads = number_columns("logs", "NRMSE [%]: median", "worst", "free")
+        rest = *text_columns("in log"), *number_columns("RMSE: median"), *text_columns("unit")
+        return Report((Table((*text_columns("channel"), *figures_heads, *rest), tuple(rows)),))
+    for row in flat.to_dict(orient="records"):
         shares = [format_number(100 * row[n], 4) for n in ("nrmse", "free_run_nrmse")]
         figures = [*shares, *(format_number(row[n], 4) for n in ("rmse", "free_run_rmse"))]
         rows.append((str(row["log"]), str(row["channel"]), *figures, str(row["unit"])))
@@ -357,21 +365,6 @@ def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:
 def join_names(names: Sequence[str]) -> str:
     """Names in a sentence: "a, b and c"."""
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def _agreement_in_short(fit: "pd.DataFrame") -> Table:
-    rows, flat = [], fit.reset_index()
-    for channel in flat["channel"].unique():
-        own = flat[flat["channel"] == channel].sort_values("nrmse", na_position="first")
-        worst, middle = own.iloc[-1], own[["nrmse", "rmse"]].median()
-        figures = [format_number(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"], worst["free_run_nrmse"])]
-        rmse = format_number(middle["rmse"], 4)
-        rows.append((str(channel), str(len(own)), *figures, str(worst["log"]), rmse, str(worst["unit"])))
-    columns = (
-        *(Column("channel", is_text=True), *number_columns("logs", "NRMSE [%]: median", "worst", "free")),
-        *(Column("in log", is_text=True), Column("RMSE: median"), Column("unit", is_text=True)),
-    )
-    return Table(columns, tuple(rows))
 
 
 def _format_to_stderr(value: float, spread: float) -> str:

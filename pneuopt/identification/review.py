@@ -62,8 +62,7 @@ def review_fit(
 ) -> tuple[IdentificationResult, tuple[Profile, ...]]:
     """Review the intervals of a fit, mark what its logs do not identify, and return the profiles traced on the way.
 
-    Doubtful linear intervals become those of the profile likelihood. Without convergence no interval stays, and the
-    status names the worst place. Ctrl-C leaves the other intervals as they are.
+    Without convergence no interval stays, and the status names the worst place.
     """
     start = problem.start_from(result)
     if not result.status.converged:
@@ -122,10 +121,7 @@ def _verdict_at(problem: EstimationProblem, start: Start, result: Identification
 
 
 def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple[dict[str, Profile], list[str]]:
-    """Profiles of parameters with doubtful linear intervals, and of those that move far along an open profile.
-
-    The second value names the parameters that Ctrl-C left without one.
-    """
+    """Profiles where a linear interval is doubtful, or moves far along an open one; and the names that Ctrl-C left."""
     found: dict[str, Profile] = {}
     rows = result.estimates
     known = rows.index[np.isfinite(rows["stderr"])]
@@ -152,8 +148,7 @@ def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple
 def _widen_dragged(result: IdentificationResult, profiles: Mapping[str, Profile]) -> IdentificationResult:
     """The result with intervals that hold where a closed profile drags parameters that have none of their own.
 
-    Each value along a profile within its interval fits the logs as well, with all that the others became. Static
-    friction over a Stribeck velocity that was known to a factor of thirty had 2 N, and was 16 deviations off.
+    Static friction over a Stribeck velocity that was known to a factor of thirty was 16 deviations off, with +-2 N.
     """
     estimates = result.estimates.copy()
     for profile in profiles.values():
@@ -349,11 +344,18 @@ def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict
 
 
 def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -> WrongValue | None:
-    """The value that a fit finds with it freed; None where that explains too little, or it hardly changes."""
+    """The value that a short fit finds with it freed; None where that explains too little, or it hardly changes."""
     freed = replace(problem, parameters=problem.parameters.freed(name))
-    found = _search_freed(freed, fit, 1 + (1 - MIN_EXPLAINED_SHARE) * excess / fit.count)
-    if found is None:
-        return None
+    allowed = 1 + (1 - MIN_EXPLAINED_SHARE) * excess / fit.count  # squares a sample
+    *others, last = (replace(stage, iterations=TRIAL_FIT_ITERATIONS) for stage in freed.method.stages[1:])
+    method, found = replace(freed.method, max_misfit=allowed, allows_state_noise=False), fit
+    for stages in ((*others, replace(last, refine=1)), (replace(last, iterations=LAST_TRIAL_ITERATIONS),)):
+        found = solve_least_squares(freed.transcription(freed.start_from(found)), replace(method, stages=stages))
+        if found.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        optimum, is_left = found.optimum, found.end is SearchEnd.ABANDONED
+        if is_left or optimum is None or optimum.equations.promised_squares(optimum.keep) > allowed * fit.count:
+            return None
     place, given = found.parameters.free_names.index(name), problem.parameters[name]
     squares = 2 * found.stats["cost"]
     share = 1 - (squares - fit.count) / excess
@@ -366,18 +368,3 @@ def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -
     if not (share >= MIN_EXPLAINED_SHARE and is_clear and found.jumps is None):
         return None
     return WrongValue(name, given.value, value, given.unit, min(1.0, share), squares)
-
-
-def _search_freed(freed: EstimationProblem, fit: Fit, allowed: float) -> Fit | None:
-    """A short search with a value freed; None where its squares a sample would stay above those that are allowed."""
-    *others, last = (replace(stage, iterations=TRIAL_FIT_ITERATIONS) for stage in freed.method.stages[1:])
-    method = replace(freed.method, max_misfit=allowed, allows_state_noise=False)
-    found = fit
-    for stages in ((*others, replace(last, refine=1)), (replace(last, iterations=LAST_TRIAL_ITERATIONS),)):
-        found = solve_least_squares(freed.transcription(freed.start_from(found)), replace(method, stages=stages))
-        if found.status.code is Code.INTERRUPTED:
-            raise KeyboardInterrupt
-        optimum, is_left = found.optimum, found.end is SearchEnd.ABANDONED
-        if is_left or optimum is None or optimum.equations.promised_squares(optimum.keep) > allowed * fit.count:
-            return None
-    return found

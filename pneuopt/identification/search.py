@@ -1,27 +1,17 @@
 """`fit_from_starts`: the best fit from the model's own starts, with the parameters held that logs cannot identify.
 
-The first start is tried alone. Where it is left, the parameters to which the prediction errors of a filter lead are
-tried (`fit_from_predictions`). Where these fail, too, the guessed parameters of each other start (`trial_parameters`,
-as the Stribeck velocity) are held for a few iterations, until the states and the other parameters have settled to them;
-the first that explains the logs is tried at once, the others are then tried by the cost they reached. A parameter that
-the data do not determine is held at its given value: that needs no weight for a prior beside that of the data, and the
-prior's spread is counted in the covariance of the others (`Fit.prior_covariance`).
+The first start is tried alone, then the parameters to which the prediction errors of a filter lead, then the others by
+their cost after a few iterations with their guesses held. A parameter that the data do not determine is held at its
+given value: that needs no weight for a prior beside that of the data, and the prior's spread is counted in the
+covariance of the others (`Fit.prior_covariance`).
 
-`fit_logs`: the short ways of long logs first: most need no more than a short search. Where gaps have to close slowly, a
-filter follows the parameters that wide gaps have found, or those of the liveliest part of each log (`cut_excerpts`),
-from node to node, and the tight gaps begin with its states (`problems/identify/random_plants.py --kind other`).
+`fit_logs`: the short ways of long logs first; most need no more (`problems/identify/random_plants.py --kind other`).
 
-What mends an end: `tighten_gaps`, where the gaps of a wrong model take a part of its misfit; `fit_from_profiles`, where
-a profile finds less cost than the fit; `enforce_ordering`, where a search has left a parameter below one that bounds it
-(static friction of 0 N), and `mark_order`, where the logs put it there beyond chance.
-
-`fit_in_windows`: a long log that the model does not follow from end to end, fitted in windows that it follows.
-
-A plant that integrates adds up whatever its model misses: the position runs away from the log, and the gaps of a fit
-that links its segments take the misfit in their place. In windows with a start state each the model runs freely for a
-limited time only. Short windows show little of slow terms, long ones gather what the model misses; the length is that
-with the narrowest intervals among those that agree with all shorter ones (the rule of Lepski, Theory of Probability and
-its Applications 35(3), 1991; problems/identify/windows.py holds its estimates to the truth).
+`fit_in_windows`: a plant that integrates adds up whatever its model misses: the position runs away from the log, and
+the gaps of a fit that links its segments take the misfit in their place. In windows with a start state each the model
+runs freely for a limited time only. Short windows show little of slow terms, long ones gather what the model misses;
+the length is that with the narrowest intervals among those that agree with all shorter ones (the rule of Lepski, Theory
+of Probability and its Applications 35(3), 1991; problems/identify/windows.py holds its estimates to the truth).
 """
 
 import math
@@ -75,13 +65,7 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.equations import ParameterScaling
 from pneuopt.shooting.filters import PredictionErrors, filter_nodes
-from pneuopt.shooting.least_squares import (
-    BudgetSpentError,
-    Fit,
-    SearchEnd,
-    close_gaps,
-    solve_least_squares,
-)
+from pneuopt.shooting.least_squares import BudgetSpentError, Fit, SearchEnd, close_gaps, solve_least_squares
 from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
 from pneuopt.shooting.tolerances import GATHERED_DEVIATION, MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
 
@@ -95,17 +79,15 @@ def fit_from_starts(
     estimate_noise: bool = False,
     gives_up: Callable[[EstimationProblem, Fit], bool] = lambda *_: False,
 ) -> Candidate:
-    """Fit from the first start that converges at the noise's level; else take the best of all that were tried.
+    """Fit from the first start that ends at the noise's level; else the best of all until two agree on the least cost.
 
-    A wrong basin leaves residuals above the noise, so more starts are tried until two agree on the least cost.
     `gives_up` is called with the best fit so far: whether another start cannot help.
     """
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
     is_plain = loss is None and not estimate_noise
     try:
-        confirms, left_after = lambda: _only_needs_confirmation(fits), lambda: _stages_before_left(problem, fits[0][1])
-        for start in starts_by_cost(problem, confirms, left_after, lambda: _cost_after_guesses(problem, fits)):
+        for start in starts_by_cost(problem, fits):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
             # a search that joins the best one only confirms it: without noise of the states where that did not settle
@@ -142,10 +124,7 @@ def fit_from_starts(
 
 
 def _fit_predicted(problem: EstimationProblem, first: Fit) -> Fit | None:
-    """The fit by prediction errors where the first start was left; None where that does not explain the logs.
-
-    Raises `KeyboardInterrupt` if it was interrupted.
-    """
+    """The fit by prediction errors where the first start was left; None where that does not explain the logs."""
     found = fit_from_predictions(problem, HOPELESS_MISFIT) if first.end is SearchEnd.ABANDONED else None
     if found is not None and found.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
@@ -167,35 +146,33 @@ def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: b
     return status
 
 
-def starts_by_cost(
-    problem: EstimationProblem,
-    confirms: Callable[[], bool] = lambda: False,
-    left_after: Callable[[], int] = lambda: 0,
-    left_cost: Callable[[], float] = lambda: math.nan,
-) -> Iterator[Start]:
+def starts_by_cost(problem: EstimationProblem, fits: Sequence[Candidate] = ()) -> Iterator[Start]:
     """The model's first start, then the others, settled to what each holds, the least cost first.
 
-    `confirms` tells whether the first optimum only needs confirmation, by the next start as it is; `left_after` after
-    how many stages the first start was left, `left_cost` what it cost after as many as the others get.
+    `fits` are those from the starts up to then, the best first. An optimum needs one more start, as it is; one whose
+    gaps stand for noise of the states takes all so, for settling with wide gaps says little there.
     """
-    candidates = problem.candidates
+    candidates, gaps = problem.candidates, [stage.gap for stage in problem.method.stages]
     yield candidates[0]
-    while len(candidates) > 1 and confirms():
+    while len(candidates) > 1 and fits and is_optimum(fits[0][1]) and (len(fits) == 1 or fits[0][1].jumps is not None):
         candidates = candidates[1:]
         yield candidates[0]
     guessed = [c for c in candidates if c.trial_parameters]
+    # after how many stages the first start was left, and what it cost after as many as the others get
+    left, known = 0, math.nan
+    if fits and fits[0][1].end is SearchEnd.ABANDONED:
+        left, last = 1 + gaps.index(fits[0][1].stats["gap_deviation"]), gaps[:GUESS_STAGES][-1]
+        known = next((cost for gap, cost in fits[0][1].stage_costs if gap == last), math.nan)
     # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
-    left = left_after()
     stages = min(GUESS_STAGES, left or GUESS_STAGES) if problem.has_gaps else 1
-    settled, known = list[tuple[tuple[float, float], Start]](), left_cost() if left else math.nan
-    others = list(guessed) if len(guessed) > 1 else []
+    settled, others = list[tuple[tuple[float, float], Start]](), list(guessed) if len(guessed) > 1 else []
     while others:
         cost, start, explains = _settle_start(problem, others.pop(0), stages)
         if explains:
             yield start
             continue
         settled.append((cost, start))
-        if cost[1] <= SAME_MISFIT_RATIO * known and cost[0] == problem.method.stages[GUESS_STAGES - 1].gap:
+        if cost[1] <= SAME_MISFIT_RATIO * known and cost[0] == gaps[GUESS_STAGES - 1]:
             break
     yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
     yield from others
@@ -203,26 +180,13 @@ def starts_by_cost(
     yield from candidates[:1] if left and len(guessed) < 2 else []
 
 
-def _stages_before_left(problem: EstimationProblem, fit: Fit) -> int:
-    """The stages after which a search was left for other starts; 0 if it was not."""
-    gaps = [stage.gap for stage in problem.method.stages]
-    return 1 + gaps.index(fit.stats["gap_deviation"]) if fit.end is SearchEnd.ABANDONED else 0
-
-
-def _cost_after_guesses(problem: EstimationProblem, fits: Sequence[Candidate]) -> float:
-    """The cost of the first start after the stages in which the others settle; NaN where it was left before."""
-    gap = problem.method.stages[min(GUESS_STAGES, len(problem.method.stages)) - 1].gap
-    return next((cost for stage, cost in fits[0][1].stage_costs if stage == gap), math.nan)
-
-
 def _settle_start(
     problem: EstimationProblem, candidate: Start, stages: int, width: float = 1e-9
 ) -> tuple[tuple[float, float], Start, bool]:
     """The cost of a start after some stages with its guesses held, the start from there, and whether that is the noise.
 
-    A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones. With
-    noise of the states a wrong guess explains any log. Bounds of some `width` [1] hold a guess, for equal
-    ones would compile other equations.
+    Wider gaps cost less, which says nothing: they rank behind. Bounds of some `width` [1] hold a guess, for equal ones
+    would compile other equations; with noise of the states a wrong guess would explain any log.
     """
     transcription = problem.transcription(candidate)
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
@@ -255,9 +219,8 @@ def fit_fixing_unidentifiable(
     for is_given in (True, False) if not first.status.converged else (True,):
         held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
         is_settled = fit.status.converged and not fit.unidentifiable
-        if fit.status.code is Code.INTERRUPTED or (
-            is_settled and not rejects_fixed_values(fit, first, len(held.fixed))
-        ):
+        is_taken = is_settled and not rejects_fixed_values(fit, first, len(held.fixed))
+        if fit.status.code is Code.INTERRUPTED or is_taken:
             return held, fit
     return problem, first
 
@@ -300,10 +263,8 @@ def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> t
         return held, part
     # where those held may be ten times as large, the logs may tell nothing of any other
     values = np.array([part.parameters.value(n) for n in part.parameters.free_names])
-    covariance, free = (
-        part.covariance + part.prior_covariance,
-        [n not in held.fixed for n in part.parameters.free_names],
-    )
+    covariance = part.covariance + part.prior_covariance
+    free = [n not in held.fixed for n in part.parameters.free_names]
     leans = prior_dominated(covariance, part.prior_covariance, values, held.fixed.values())
     return (problem, fit) if leans[free].all() else (held, part)
 
@@ -322,16 +283,6 @@ def is_at_noise(problem: EstimationProblem, fit: Fit) -> bool:
         fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
         or fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * white_chi_square(problem, fit)
     )
-
-
-def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
-    """Whether the next start is tried as it is, after fits of which the first is the best.
-
-    So is one start where the best fit ended at an optimum; and each where its gaps stand for noise of the states, for
-    settling with wide gaps says little there.
-    """
-    best = fits[0][1]
-    return is_optimum(best) and (len(fits) == 1 or best.jumps is not None)
 
 
 def _are_enough(fits: Sequence[Candidate]) -> bool:
@@ -355,8 +306,7 @@ def is_optimum(fit: Fit) -> bool:
 def is_in_order(problem: EstimationProblem, fit: Fit) -> bool:
     """Whether each free parameter that another one bounds is clearly above it, as static friction above Coulomb's.
 
-    Where it is not, a search may have lost it: it has ended so at the noise, with a Stribeck velocity 13 times too
-    high, while the logs showed static friction of nearly twice Coulomb's.
+    Else a search may have lost it: one ended so at the noise, its Stribeck velocity 13 times too high.
     """
     order, found = problem.system.plant.identification_hints.at_least, fit.parameters
     bounded = [n for n in found.free_names if n not in problem.fixed and order.get(n) in found]
@@ -364,11 +314,7 @@ def is_in_order(problem: EstimationProblem, fit: Fit) -> bool:
 
 
 def rank(fit: Fit, tightest: float) -> tuple[int, float]:
-    """The order of fits: by cost among fits of one kind.
-
-    Noise of the states, or the wide gaps in which an interruption leaves a search, lower the cost of any model; such
-    fits come after those that explain the log without.
-    """
+    """The order of fits: by cost; after those that explain the log come those with state noise or wide gaps."""
     cost = fit.stats["cost"]
     is_cut = fit.end is SearchEnd.ABANDONED or fit.status.code is Code.INTERRUPTED
     if is_cut and fit.stats["gap_deviation"] > tightest:
@@ -380,13 +326,8 @@ def rank(fit: Fit, tightest: float) -> tuple[int, float]:
 
 def are_alike(best: Fit, second: Fit) -> bool:
     """Whether both ended at an optimum, at the same cost."""
-    same = (best.jumps is None) == (second.jumps is None)
-    return (
-        is_optimum(best)
-        and is_optimum(second)
-        and same
-        and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
-    )
+    same = is_optimum(best) and is_optimum(second) and (best.jumps is None) == (second.jumps is None)
+    return same and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
 
 
 def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], Candidate]) -> Candidate:
@@ -408,8 +349,7 @@ def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], C
 def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candidate | None:
     """A fit that explains long logs to their noise, or was interrupted; None if they need a longer search.
 
-    What was tried is appended to `tried`. With a parameter held, or one that does not settle, one more start has been
-    tried before; with one that is not clearly above another that bounds it, one that has led to the same.
+    What was tried is appended to `tried`; a doubtful fit needs another one before it.
     """
     for found in _tries(problem):
         held, fit, label = found
@@ -425,11 +365,9 @@ def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candid
 
 
 def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
-    """The attempts before a long search of long logs; none where they are short.
+    """The attempts before a long search of long logs: short, from filtered states, from a part; none of short logs.
 
-    First a short search: most logs need no more, and one that is cut near the noise goes on. Then the fit from states
-    that are filtered, and that from the parameters of a part of each log. The states of the whole logs are filtered by
-    these parameters, too: rough states would spoil what the parts have found.
+    The states of whole logs are filtered by a part's parameters: rough states would spoil what it has found.
     """
     parts = cut_excerpts(problem)
     if parts is None:
@@ -458,10 +396,9 @@ def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
 
 
 def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> Candidate | None:
-    """The fit with tight gaps from states that are filtered by the parameters of one with wide gaps.
+    """The fit with tight gaps from states filtered by the parameters of wide ones, whose nodes would close slowly.
 
-    Nodes that wide gaps have let go apart close slowly; a filter follows the same parameters from node to node. Where
-    the rough states are far off, wide gaps begin with filtered ones, too. None where they leave more than the noise.
+    Where the rough states are far off, wide gaps begin with filtered ones, too. None where they leave more than noise.
     """
     stages = problem.method.stages
     first_and_third = stages[:GUESS_STAGES:2]

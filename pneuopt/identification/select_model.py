@@ -1,12 +1,11 @@
 """`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs.
 
-`fit_candidates` fits all alike, for residuals compare only where the models run alike: whole logs, or windows of one
-length, without gaps that take a misfit in their place; and at common widths, for a width that each candidate has chosen
-for itself would be a hidden parameter, by which Coulomb friction can imitate presliding or the Stribeck curve. Windows
-and widths are those of the leader, the simplest of the candidates that follow the logs best in short searches.
+`fit_candidates` fits all alike, for residuals compare only so: over whole logs or windows of one length, and at common
+widths; one that each candidate has chosen for itself would be a hidden parameter, by which Coulomb friction can imitate
+presliding or the Stribeck curve. Both are the leader's, the simplest of those that short searches find best.
 
-`try_candidate` is such a search, with loose gaps. Gaps only relax a fit: where it has ended with many times the squares
-of another model's whole fit, the model cannot explain the logs, and minutes of search would show only that.
+`try_candidate`, such a search, has loose gaps, which only relax a fit: a model that leaves many times the squares of
+another one's whole fit cannot explain the logs.
 """
 
 import fnmatch
@@ -537,10 +536,8 @@ def _notes(system: System, fit: IdentificationResult | Refutation) -> tuple[str,
         [str(n) for n, own in fit.estimates["note"].items() if own == note]
         for note in (UNIDENTIFIABLE_NOTE, AT_BOUND_NOTE)
     )
-    order, found = (
-        system.identification_hints.at_least,
-        fit.parameters.select(n for n in fit.parameters if n not in unknown),
-    )
+    order = system.identification_hints.at_least
+    found = fit.parameters.select(n for n in fit.parameters if n not in unknown)
     below = [(n, m) for n, m in order.items() if n in found and m in found and found.value(n) < found.value(m)]
     unphysical = ", ".join(f"{n} ({found.value(n):.4g}) below {m} ({found.value(m):.4g})" for n, m in below)
     return ", ".join(unknown), ", ".join(bound), unphysical, fit.status.message

@@ -10,8 +10,6 @@ Statistics in Medicine 22, 2003, with the lower limit of Roever, Knapp, Friede, 
 Whoever looks after each log would meet chance sooner or later. So each look has the same, smaller level (Pocock,
 Biometrika 64(2), 1977), with which chance raises an alarm in the asked share of whole histories. It is found by drawing
 histories: where errors are equally large the test's distribution depends on the dates alone, not on error or scatter.
-
-`compare_logs`: a test whether several logs are of one drive, from fits of each log alone.
 """
 
 import math

@@ -3,10 +3,8 @@
 Friction's sign and a valve's edges are sharp; a model rounds them, for its integration. Which width serves depends on
 the log: a wide one creeps where the drive sticks and hides a dead zone, a narrow one takes many integration steps. So
 each width that nobody has stated is narrowed, or else widened, as long as that lowers the cost of a short search with
-loose gaps (problems/identify/foreign_rig.py); a search at a wide width, followed by narrower ones, would stay in the
-optimum of the wide one. A wider one must explain the logs: where the model lacks a term, it would take the term's
-place (problems/identify/seal_friction.py). A width is stated where its parameter differs from the model's own, in its
-value or its source.
+loose gaps (problems/identify/foreign_rig.py); a search that narrows on its way would stay in the wide one's optimum. A
+wider one must explain the logs, or it would take a missing term's place (problems/identify/seal_friction.py).
 """
 
 from collections.abc import Sequence, Set
@@ -64,10 +62,7 @@ def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[
 
 
 def advise_widths(problem: EstimationProblem) -> tuple[str, ...]:
-    """Other values for the widths that the user has stated, each tried in a short search; empty if none is better.
-
-    So it is, too, where the CPU budget ends before that is known.
-    """
+    """Better values for the widths that the user has stated, by short searches; empty if the CPU budget ends before."""
     given = problem.parameters
     known = [w.name for w in _present(problem) if given[w.name].source != COMMON_WIDTH]
     stated = {n for n in known if not given[n].free and not _is_open(problem, n)}
@@ -210,10 +205,7 @@ class _Race:
         return self.run({**trial.widths, **scaled})
 
     def run(self, widths: dict[str, float], *, confirms: bool = False) -> _WidthTrial:
-        """A short search from the model's first start, which depends on the widths, too.
-
-        One that confirms goes on to tight gaps, whatever they cost: costs compare at the same gaps only.
-        """
+        """A short search from the model's first start; one that confirms goes on to gaps whose costs compare."""
         stages = self.confirming_stages if confirms else (TRIAL_STAGE,)
         problem = replace(self._problem, parameters=self._problem.parameters.with_values(widths))
         # an empty last stage: the last one of a method would iterate to its end

@@ -91,10 +91,7 @@ class NormalEquations:
         return np.asarray(np.sqrt(self.linearisation.squares.sum(axis=0) / np.maximum(self.segments.counts, 1)))
 
     def promised_squares(self, keep: Mask) -> float:
-        """The squares at the end of an undamped step in the kept parameters, by these equations; NaN if there is none.
-
-        Rounding, and a step that would go far, may make them negative.
-        """
+        """The squares after an undamped step in the kept parameters, by these equations, NaN if there is none."""
         reduced = self.arrow.eliminate(0.0)
         step = reduced and reduced.step(keep)
         return 2 * self.cost - self.arrow.descent_rate(step) if step else math.nan
@@ -105,12 +102,10 @@ class NormalEquations:
         return indistinguishable_parameters(reduced.schur[square], self.arrow.corner[square])
 
     def covariance(self, keep: Mask, *, noisy_gaps: bool = False) -> Array | None:
-        """Covariance of the parameters (own units, unit noise): the sandwich over true data noise only.
+        """Covariance of the kept parameters (own units, unit noise; None: undetermined), NaN for others: the sandwich.
 
         True gaps carry no noise, so the plain inverse is too wide; with the sandwich (H. White, Econometrica 50 (1982)
-        1-25) 95 % intervals hold the truth 95 times in 100 (problems/identify/interval_coverage.py). The plain inverse
-        is right for gaps that stand for noise of the states. Rows of parameters that are not kept are NaN; None where
-        the data do not determine the kept ones.
+        1-25) 95 % intervals hold the truth 95 times in 100 (problems/identify/interval_coverage.py).
         """
         reduced = self.arrow.eliminate(0.0)
         if reduced is None or self.unidentifiable_parameters(reduced, keep).size:
@@ -119,10 +114,7 @@ class NormalEquations:
         out = np.full((len(keep), len(keep)), np.nan)
         out[np.ix_(keep, keep)] = bread
         if not noisy_gaps:
-            n, meat = (
-                self.gaps.shape[1],
-                np.zeros_like(reduced.schur),
-            )  # the data's own Gram matrix, nodes following
+            n, meat = self.gaps.shape[1], np.zeros_like(reduced.schur)  # of the data alone, the nodes following
             for rows, columns, unknowns in self.segments.blocks:
                 E = np.zeros((rows.stop - rows.start, self.linearisation.end_sensitivities.shape[2], len(meat)))
                 E[:, :n] = -reduced.node_sensitivity[rows]
@@ -160,8 +152,7 @@ def normal_equations(
 ) -> NormalEquations:
     """Run all segments with sensitivities from their nodes (m, n), and assemble data and gap residuals.
 
-    `q` holds all parameters, `chain` (k,) the slopes of the free ones over those searched, `sigma` (n,) the gaps'
-    deviations in nominal sizes.
+    `chain` (k,) are the parameters' slopes over those searched, `sigma` (n,) the gaps' deviations in nominal sizes.
     """
     run = segments.gram(nodes, q, substeps, correction)
     scale = np.concatenate([segments.nominal, np.ones(run.grams.shape[1] - nodes.shape[1])])
@@ -220,10 +211,9 @@ def _assemble(segments: Segments, slopes: SegmentLinearisation, weight: Array) -
 def correct_residuals(
     equations: NormalEquations, nodes: Array, correction: IntegrationCorrection, sigma: Array
 ) -> NormalEquations:
-    """The normal equations with other residuals, by finer integration steps, and the sensitivities as they are.
+    """The normal equations with residuals by finer integration steps; sensitivities and the data's gradient stay.
 
-    The gradient by the data stays that of the old residuals, which moves no parameter by more standard deviations than
-    the root of the sum of squares by which they have changed.
+    That moves no parameter by more standard deviations than the root of the squares by which residuals change.
     """
     segments, slopes = equations.segments, equations.linearisation
     squares = np.nansum(((slopes.y + correction.y - segments.measured) * segments.weights) ** 2, axis=1)
@@ -256,10 +246,10 @@ def missed_curvature(
 ) -> Array:
     """The curvature that Gauss-Newton's model has missed along a step, by node (m,), where a few missed nearly all.
 
-    A segment's residuals are nonlinear in its own node. What its cost exceeds the model's by is put down to a term
-    ``damping * diagonal`` of that node, which added to the model would have promised the cost that came. Where many
-    nodes have missed some, the step was too long as a whole, and no node is damped.
+    It is the term ``damping * diagonal`` of a node which, added to the model, would have promised the cost that came.
     """
+    if not math.isfinite(trial.cost):
+        return np.zeros(len(step))
     linear, linked, n = equations.linearisation, equations.segments.linked, step.shape[1]
     change = np.zeros(linear.end_sensitivities.shape[::2])  # of each segment's start state, and of its columns
     change[:, :n] = step
@@ -280,10 +270,7 @@ def missed_curvature(
 
 
 def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: bool) -> tuple[str, ...]:
-    """Sentences on residuals beyond `level` (mean squares, in noise variances); none if there are none.
-
-    With `noisy_gaps` the gaps stand for noise of the states.
-    """
+    """Sentences on residuals beyond `level` (mean squares, in noise variances), or on gaps as noise of the states."""
     segments = equations.segments
     lead = "the model does not explain the log to its noise: "
     tail = "the intervals count that as noise: they do not hold the bias of a wrong model"

@@ -5,15 +5,12 @@ together where a drive sticks and slips, and a search over all nodes at once fre
 Kalman filter follows the model from node to node (Bell and Cathey, IEEE Transactions on Automatic Control 38(2), 1993,
 for its iteration), in pieces of the log side by side.
 
-`PredictionErrors`: how well several sets of parameters predict a part of a log, and where they had better be. Where a
-drive sticks and slips, nodes with wide gaps take over what wrong parameters miss, and tight gaps trap them. A filter
-has no such unknowns: it predicts each segment from those before it, and its errors lead to the parameters (Ljung,
-System Identification, 2nd ed. 1999, chapter 7), though over many side minima. Where the state may gather a wide
-deviation from segment to segment these are few; it then shrinks, as the gaps of a search do.
+`PredictionErrors`: where sets of parameters had better be. Nodes with wide gaps take over what wrong parameters miss; a
+filter has no such unknowns: it predicts each segment from those before it, and its errors lead to the parameters
+(Ljung, System Identification, 2nd ed. 1999, chapter 7), past few side minima where states may gather wide deviations.
 
-`fit_scores`: a segment's score is the gradient of half its squared residuals (its data, and the gap behind it) by the
-parameters, with the nodes following them; at an optimum the scores sum to zero. Its information J'J is that of the same
-residuals.
+`fit_scores`: the gradient of half a segment's squares (its data, and the gap behind it) by the parameters, with the
+nodes following them, which sum to zero at an optimum; and the information J'J of the same residuals.
 """
 
 from contextlib import suppress
@@ -47,10 +44,9 @@ from pneuopt.shooting.tolerances import (
 
 
 def filter_nodes(segments: Segments, nodes: Array, q: Array, gathered: float = GATHERED_DEVIATION) -> Array:
-    """Filter the states at the nodes (m, n_states): estimates from the measurements up to each segment's end.
+    """Filter the states at the nodes (m, n_states), rough `nodes` before, by measurements up to each segment's end.
 
-    The pieces start from rough `nodes`; `q` (k,) holds all parameters, and `gathered` is the deviation that a state
-    gathers from node to node, in nominal sizes.
+    `q` (k,) holds all parameters; `gathered` is the deviation of a state from node to node, in nominal sizes.
     """
     first = np.arange(0, segments.count, PIECE_SEGMENTS)
     segments, substeps = choose_integration(segments, nodes, q)
@@ -168,10 +164,7 @@ class PredictionErrors:
         self.adapt_steps(scaling.start[None])
 
     def adapt_steps(self, z: Array) -> None:
-        """Take as many integration steps as the stiffest of some sets asks for, shape (s, k).
-
-        With those of a softer one, slips were lost at the right parameters, which then cost more than wrong ones.
-        """
+        """Take the steps that the stiffest of sets (s, k) asks for: by fewer, right parameters lost their slips."""
         nodes = self._rough * self.segments.nominal
         found = [choose_integration(self.segments, nodes, self.scaling.values(each)) for each in z]
         implicit = [segments for segments, _ in found if segments.implicit_state is not None]
@@ -268,8 +261,7 @@ class FitScores:
     def simulate_white(self, count: int, groups: Indices) -> Array:
         """Scores of groups in linear fits to white residuals of unit variance, shape (count, n_groups, k).
 
-        The nodes follow the residuals of a few segments before and behind them, so that the scores of neighbours are
-        not independent even where the residuals are.
+        Nodes follow the residuals of a few segments around, so that scores of neighbours are not independent.
         """
         rng, grams = np.random.default_rng(0), self._equations.linearisation.grams[:, :-1, :-1]
         values, vectors = np.linalg.eigh(grams)

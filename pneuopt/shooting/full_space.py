@@ -1,9 +1,7 @@
 """Full-space multiple shooting with IPOPT: every node's state is an unknown, derivatives are exact. The reference path.
 
 The unknowns are the free parameters, in units of their range or as logarithms, and the states at the nodes, in units
-of their nominal size; a transcription becomes one MX graph of unknowns, objective and constraints. `prepare_full_space`
-makes the graph and its derivatives once; `solve_from` solves it from any start, `follow_path` along a path. Below these
-stand the graph (`flatten`), the unknowns with their bounds and guesses, and what a solver's outcome says.
+of their nominal size; a transcription becomes one MX graph of unknowns, objective and constraints.
 """
 
 import itertools
@@ -64,20 +62,16 @@ class FullSpace:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The solution of a problem with costs and limits.
-
-    `cost` and `largest_violation` of a limit are NaN and infinite where the solver could not start; `seconds` is its
-    wall time [s]. `multipliers` are the largest absolute ones of each limit and of each bound that is active, by name.
-    """
+    """The solution of a problem with costs and limits; cost NaN and violation inf: the solver could not start."""
 
     trajectories: tuple[Trajectory, ...]  # states and outputs, one a phase
     parameters: ParameterSet  # the problem's parameters with the free ones solved for
     status: Status
     cost: float = math.nan
     largest_violation: float = math.inf
-    seconds: float = 0.0
+    seconds: float = 0.0  # wall time [s]
     stats: Mapping[str, float] = field(default_factory=dict)  # iterations and largest gap
-    multipliers: Mapping[str, float] = field(default_factory=dict)
+    multipliers: Mapping[str, float] = field(default_factory=dict)  # largest of each active limit and bound
 
 
 def solve_full_space(transcription: Transcription, method: FullSpace | None = None) -> Solution:

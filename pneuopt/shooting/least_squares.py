@@ -4,18 +4,8 @@ The gaps between segments are weighted residuals, and are tightened in stages: a
 whole record, as single shooting does, which fails there (problems/speed/benchmark_identification.py). Each step is a
 banded Cholesky with an arrow, linear in the record's length.
 
-A search is a frozen `SearchState`; each move takes one and returns the next. Only `LevenbergMarquardt`, which takes the
-steps of one stage, changes itself. The moves, in the order of the search and of this file:
-
-    start_search           guesses become nodes; the stiffness there gives the integration steps
-    run_stages             the schedule, its gaps ever tighter
-      run_stage              weigh the gaps, choose integration steps, iterate; in the last stage again by finer steps
-      shorten                after a first stage at the noise: one of `Shortcut` in place of the stages between
-      repeat_last_stage      one of `Repeat`, until the last stage converges or creeps
-      allow_state_noise      where gaps absorb the misfit of the model: they are estimated as noise of its states
-        loosen, tighten        that optimum, and the one with tight gaps if it leads there
-    refine_steps           finer integration steps at an optimum, until they move no estimate
-    end_search             the fit with its covariance, and the parameters that are not determined
+A search is a frozen `SearchState`; each move takes one and returns the next, in the order of the search and of this
+file. Only `LevenbergMarquardt`, which takes the steps of one stage, changes itself.
 
     stage    gap [nominal sizes]   iterations   what is particular to it
     first    1e-2                  12           log parameters are drawn to their start, as by all gaps above `WIDE_GAP`
@@ -165,10 +155,7 @@ class Stage:
 
     @property
     def has_prior(self) -> bool:
-        """Whether log parameters are drawn to their start: wide gaps hide what some of them do.
-
-        Not in a stage that may be the last, which refines its steps.
-        """
+        """Whether log parameters are drawn to their start: wide gaps hide what some do; a last stage refines steps."""
         return self.gap > WIDE_GAP and self.refine == 1
 
 
@@ -307,13 +294,9 @@ class Fit:
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:
-    """Solve a transcription that has residuals and bounds, but neither costs nor limits, from its guesses and values.
-
-    Whatever its status, a fit is returned; that of an interruption (Ctrl-C) is the best iterate so far, marked.
-    """
+    """Solve a transcription without costs and limits from its guesses; Ctrl-C gives the best iterate, marked."""
     began, state = time.perf_counter(), start_search(segment(transcription), method or LeastSquares())
-    state = run_search(state)
-    return end_search(state, time.perf_counter() - began)
+    return end_search(run_search(state), time.perf_counter() - began)
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,16 +340,12 @@ NO_POSITIONS = np.zeros(0, dtype=np.intp)
 
 
 class ConvergenceTest(NamedTuple):
-    """The status of an iterate, and the positions of free parameters that the data do not determine there.
-
-    `unsettled` is the one that would still move most where nothing else is wrong; `largest_step` is that of a converged
-    iterate, in standard deviations.
-    """
+    """The status of an iterate, and the positions of free parameters that the data do not determine there."""
 
     status: Status
     unidentifiable: Indices = NO_POSITIONS
-    unsettled: Indices = NO_POSITIONS
-    largest_step: float = 0.0
+    unsettled: Indices = NO_POSITIONS  # the one that would still move most where nothing else is wrong
+    largest_step: float = 0.0  # of a converged iterate [standard deviations]
 
 
 @dataclass(frozen=True, eq=False)
@@ -451,10 +430,7 @@ class SearchState:
 
     @property
     def is_near_end(self) -> bool:
-        """Whether a search explains the log to its noise in a last stage that is to converge, which refines its steps.
-
-        One that only settles a start ends with wide gaps, where nodes that are damped alone are left behind.
-        """
+        """Whether a search explains the log to its noise in a last stage that refines its steps, and so converges."""
         return self.stage is self.method.stages[-1] and self.stage.refine > 1 and self.is_at_noise
 
     @property
@@ -586,13 +562,7 @@ def run_search(state: SearchState) -> SearchState:
 
 @keeps_state
 def run_stages(state: SearchState) -> SearchState:
-    """Run the schedule of stages, from loose gaps to tight ones, until one of them ends the search.
-
-    A first stage that explains the logs to their noise is followed by the last one at once; the stages between are for
-    starts from which that does not soon converge. Where the linearised equations say that tight gaps would leave many
-    times the noise, it is followed by the search for noise of the states: the model is wrong, and the stages between
-    would only show that.
-    """
+    """Run the schedule of stages, from loose gaps to tight ones, until one of them ends the search."""
     if state.setup.is_too_stiff:
         verdict = f"the model is so stiff that a sample takes {state.setup.required_substeps} integration steps"
         remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
@@ -664,10 +634,7 @@ def enter_stage(state: SearchState, stage: Stage, nodes: Array, z: Array) -> Sea
 
 
 def renew_integration(state: SearchState, nodes: Array, z: Array) -> tuple[Segments, int, Array]:
-    """The integration at these nodes and parameters, its steps, and the values that it was chosen for.
-
-    The state's own where hardly a value has changed, or the user gave the steps; fewer steps, too, after a bad start.
-    """
+    """The integration, its steps, and the values it was chosen for; the state's own where hardly one has changed."""
     values, setup = state.setup.scaling.values(z), state.setup
     if state.method.substeps or np.allclose(values, state.stiffness_values, rtol=STIFFNESS_UPDATE_CHANGE):
         return state.segments, state.substeps, state.stiffness_values
@@ -678,10 +645,7 @@ def renew_integration(state: SearchState, nodes: Array, z: Array) -> tuple[Segme
 
 @keeps_state
 def finish_stage(state: SearchState, iterations: int) -> SearchState:
-    """Iterate in a stage, then again with the finer steps that it asks for.
-
-    Where an iterate explains the log to its noise, the finer steps correct its residuals within the stage.
-    """
+    """Iterate in a stage, then again with the finer steps that it asks for; at the noise they correct residuals."""
     state = iterate(state, iterations)
     if not (state.stage.refine > 1 and state.correction is None and not state.is_hopeless):
         return state
@@ -738,10 +702,8 @@ def describe_iteration(state: SearchState) -> str:
 def is_negligible_step(state: SearchState, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
     """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
 
-    The states of noisy gaps estimate that noise, and settle long after the parameters, whose step then counts; so it
-    does where the model misses the logs and the search is slow: the deviations are then those of the residuals, near
-    such an optimum Gauss-Newton steps go to and fro for long, and what is far below a deviation is far below the bias,
-    too. Where no parameter is free, the states are what is asked for.
+    With noisy gaps, whose states settle late, the parameters' step counts; so it does where a wrong model's search is
+    slow, in deviations of the residuals: what is far below these is far below the bias.
     """
     promised, equations = 0.5 * current.equations.arrow.descent_rate(step), current.equations
     is_last, misfit = state.stage.gap <= state.method.stages[-1].gap, max(1.0, 2 * current.cost / equations.count)
@@ -842,10 +804,7 @@ class Repeat(Enum):
 def choose_repeat(state: SearchState, found: ConvergenceTest) -> Repeat:
     """How the last stage goes on: while it lowers the cost steeply, or at the noise at all, but has not converged.
 
-    Parameters that the data do not determine end it, for a caller holds them. Friction at rest has a kink in the speed,
-    over which Gauss-Newton steps overshoot; nodes that do so are damped alone, and one that ends where its equations
-    no longer move it is trapped, and keeps the rest of the log from its optimum. Gaps that stand for noise of the
-    states are what is estimated, and free no node.
+    Nodes that overshoot a kink of friction at rest are damped alone; one that its equations no longer move is trapped.
     """
     is_trial = state.stage.iterations <= TRIAL_ITERATIONS
     falls = state.last_decrease > STEEP_DECREASE and not is_trial
@@ -862,10 +821,7 @@ def trapped_nodes(state: SearchState) -> Indices:
 
 @keeps_state
 def repeat_last_stage(state: SearchState) -> SearchState:
-    """Run the last stage again as `choose_repeat` says, and conclude.
-
-    Where a repeat moves no estimate, what the kinks still ask for no longer keeps it from having converged.
-    """
+    """Run the last stage again as `choose_repeat` says; once that moves no estimate, kinks count no longer."""
     least_decrease = 0.5 * state.method.tolerance**2  # that of a step of so many deviations
     count = min(TRIAL_ITERATIONS, state.stage.iterations)
     for _ in range(MAX_REPEATS * state.stage.iterations // max(1, count)):
@@ -906,10 +862,7 @@ def moved_deviations(state: SearchState, z: Array) -> float:
 
 
 def allow_state_noise(state: SearchState) -> SearchState:
-    """The optimum with gaps that stand for noise of the states of a wrong model; where there is none, nothing moves.
-
-    They are the tightest with which all residuals agree.
-    """
+    """The optimum with the tightest gaps that agree as noise of a wrong model's states; or nothing moves."""
     for stage, at in stages_to_loosen(state) if state.method.allows_state_noise else ():
         state = loosen(state, stage, at.nodes, at.z)
         if state.end is SearchEnd.OPTIMUM:
@@ -929,10 +882,7 @@ def stages_to_loosen(state: SearchState) -> tuple[tuple[Stage, StageEnd], ...]:
 
 @keeps_state
 def loosen(state: SearchState, stage: Stage, nodes: Array, z: Array) -> SearchState:
-    """The optimum with a stage's gaps as noise of the states, or with tight gaps where it leads.
-
-    Where there is none, nothing moves.
-    """
+    """The optimum with a stage's gaps as noise of the states, or tight ones if it leads there; else nothing moves."""
     last, noisy = state.method.stages[-1], replace(state, noisy_gaps=True)
     trial = enter_stage(noisy, replace(stage, iterations=last.iterations, refine=last.refine), nodes, z)
     trial = repeat_last_stage(finish_stage(trial, last.iterations))
@@ -944,11 +894,7 @@ def loosen(state: SearchState, stage: Stage, nodes: Array, z: Array) -> SearchSt
 
 @keeps_state
 def tighten(state: SearchState) -> SearchState:
-    """The optimum with tight gaps, where one with noise of the states leads to it; else that one.
-
-    The nodes of a first stage may lie across kinks, and its equations then foresee a misfit that a right model has
-    not; at an optimum that is nearer they are right.
-    """
+    """The optimum with tight gaps, where one with noise of the states, whose equations are nearer, leads to it."""
     last, trial = state.method.stages[-1], replace(state, noisy_gaps=False)
     if state.promised_squares(last) > MAX_JUMP_MISFIT * state.iterate.equations.count:
         return state
@@ -986,8 +932,7 @@ def refine_steps(state: SearchState) -> SearchState:
 def choose_finer_steps(state: SearchState) -> int:
     """The steps a sample that show what the integration still changes at an optimum; 0 where none are to be tried.
 
-    They are half as long; as long as they are where those that the last stage has taken have moved no estimate, for
-    still finer ones would move it less, and where the user gave the steps.
+    They are half as long; as they are where the last refinement moved no estimate, and where the user gave the steps.
     """
     if state.end is not SearchEnd.OPTIMUM or not state.method.checks_steps:
         return 0
@@ -1011,10 +956,7 @@ class LevenbergMarquardt:
         self.node_damping = np.zeros(objective.segments.count)
 
     def step(self, current: Iterate) -> Iterate | None:
-        """The next iterate; None if no damping lowers the cost, or the step would be negligible.
-
-        After the first try the damping rises only at the nodes that have overshot, if there are any.
-        """
+        """The next iterate; None if no damping lowers the cost, or the step would be negligible."""
         raise_by, scaling = 10.0, self.objective.scaling
         for k in range(MAX_TRIES):
             reduced = current.equations.arrow.eliminate(self.damping, self.node_damping)
@@ -1028,7 +970,9 @@ class LevenbergMarquardt:
                 trial = self._trial(current, reduced, step)
                 is_lower = trial.cost < current.cost
                 if self.damps_nodes and (not is_lower or self.node_damping.any()):
-                    self.node_damping = self._missed_curvature(current, trial)
+                    shift = (trial.nodes - current.nodes) / self.objective.segments.nominal
+                    given = shift, trial.z - current.z, trial.equations, self.objective.sigma
+                    self.node_damping = missed_curvature(current.equations, *given)
                 if is_lower:
                     self.damping = self.damping * 0.1 if self.damping > MIN_DAMPING else 0.0
                     return trial
@@ -1038,10 +982,9 @@ class LevenbergMarquardt:
         return None
 
     def undamped_steps(self, current: Iterate) -> tuple[Iterate, int]:
-        """Take undamped steps, which may raise the cost for a while: the best iterate among them, and their number.
+        """Take undamped steps over a kink at which a descent creeps: the best iterate among them, and their number.
 
-        Over a kink of the model, at which a descent creeps, this is the way (the watchdog technique: Chamberlain et
-        al., Mathematical Programming Study 16, 1982).
+        It is the watchdog technique (Chamberlain et al., Mathematical Programming Study 16, 1982).
         """
         trial: Iterate | None = current
         best, taken = current, 0
@@ -1063,9 +1006,7 @@ class LevenbergMarquardt:
     def _trial(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> Iterate:
         """The iterate after a step; where its gaps let the cost fall too little, with the nodes settled.
 
-        Tight gaps make a narrow valley of what the parameters and the whole trajectory do together, and its bend turns
-        a long step into gaps. A Gauss-Newton step of the nodes alone, from the trial's own derivatives, closes them
-        again without the log being left, as shooting on from the first node would.
+        The bend of the valley that tight gaps make turns a long step into gaps; a step of the nodes alone closes them.
         """
         z = self.objective.scaling.project_to_bounds(current.z + step.parameters)
         moved = z - current.z
@@ -1086,13 +1027,6 @@ class LevenbergMarquardt:
                 break
             trial = settled
         return trial
-
-    def _missed_curvature(self, current: Iterate, trial: Iterate) -> Array:
-        """The curvature that a trial shows and the model has missed, by node; none of a trial that is not finite."""
-        if not math.isfinite(trial.cost):
-            return np.zeros(len(current.nodes))
-        step, moved = (trial.nodes - current.nodes) / self.objective.segments.nominal, trial.z - current.z
-        return missed_curvature(current.equations, step, moved, trial.equations, self.objective.sigma)
 
 
 def assess_convergence(
@@ -1170,10 +1104,7 @@ def _least_certain(positions: Indices, spread: Array, space: ParameterScaling, z
 
 
 def largest_parameter_step(equations: NormalEquations, keep: Mask, reduced: ReducedEquations, step: Array) -> float:
-    """The largest step of a kept parameter, of shape (k,) in all, in its standard deviations.
-
-    It is infinite where the data do not determine all of them.
-    """
+    """The largest step (k,) of a kept parameter, in its deviations; infinite where the data do not determine all."""
     if equations.unidentifiable_parameters(reduced, keep).size:
         return math.inf
     spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
@@ -1226,10 +1157,9 @@ def end_search(state: SearchState, seconds: float) -> Fit:
 def unsettled_covariance(state: SearchState) -> Array:
     """The covariance (own units) of the step that kinks still ask for. Shape (k, k)."""
     equations, z = state.iterate.equations, state.iterate.z
-    asked, reduced = np.zeros(len(z)), equations.arrow.eliminate(0.0)
-    solved = None if reduced is None else reduced.step(state.setup.scaling.movable(z, equations, reduced))
-    if solved is not None:
-        asked = equations.linearisation.chain * solved.parameters
+    reduced = equations.arrow.eliminate(0.0)
+    solved = reduced and reduced.step(state.setup.scaling.movable(z, equations, reduced))
+    asked = equations.linearisation.chain * solved.parameters if solved else np.zeros(len(z))
     return np.outer(asked, asked)
 
 

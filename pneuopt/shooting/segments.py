@@ -123,11 +123,6 @@ class Segments:
         return np.asarray(np.isfinite(self.measured).sum(axis=(0, 1)))
 
     @cached_property
-    def jacobian(self) -> ca.Function:
-        """The Jacobian of the states' rates: ``(t, x, u, p) -> d(xdot)/dx``, shape (n_states, n_states)."""
-        return _rate_jacobian(self.system)
-
-    @cached_property
     def sensitivities(self) -> Rollout:
         """The compiled run with sensitivities to start states and free parameters."""
         return Rollout(self._pieces, wrt=self.columns.tolist(), start=True)
@@ -314,11 +309,7 @@ def fine_steps(segments: Segments, steps: int, refine: int) -> int:
 
 
 def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
-    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78.
-
-    The stiffness is taken at nodes all along the start and at the extremes of every state and input; the result is
-    `SUBSTEPS_CAP` at most, for a start may be absurd.
-    """
+    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78."""
     return substeps_for(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
 
 
@@ -350,12 +341,17 @@ def stiffness_jacobians(segments: Segments, nodes: Array, q: Array, speeds: tupl
         np.concatenate([a] * (len(points) // len(rows)))
         for a in (q[segments.parameter_positions[rows]], segments.inputs[rows, 0], segments.t[rows, 0])
     )
-    J = np.array(segments.jacobian.map(len(t))(t[None], points.T, u.T, p.T)).reshape(n, -1, n).transpose(1, 0, 2)
+    J = (
+        np.array(_rate_jacobian(segments.system).map(len(t))(t[None], points.T, u.T, p.T))
+        .reshape(n, -1, n)
+        .transpose(1, 0, 2)
+    )
     return np.asarray(J[np.isfinite(J).all(axis=(1, 2))])
 
 
 @functools.lru_cache(maxsize=64)
 def _rate_jacobian(system: DiscreteSystem) -> ca.Function:
+    """The Jacobian of the states' rates: ``(t, x, u, p) -> d(xdot)/dx``, shape (n_states, n_states)."""
     slope, s = _state_rate(system)
     return ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
 

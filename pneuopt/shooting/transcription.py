@@ -143,10 +143,6 @@ class Transcription:
 def regular_nodes(n: int, samples: int, breaks: Sequence[int] | Indices = ()) -> Indices:
     """Nodes at every `samples`-th of n samples, counted anew from each break; the last segment takes the rest.
 
-    Examples
-    --------
-    >>> regular_nodes(10, 4).tolist()
-    [0, 4, 8]
     >>> regular_nodes(10, 4, [5]).tolist()
     [0, 4, 5, 9]
     """

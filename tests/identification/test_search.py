@@ -156,16 +156,31 @@ def test_a_start_explains_the_log_by_tight_gaps_only(
     assert search._settle_start(problem, problem.candidates[candidate], stages)[2] == explains
 
 
-def test_the_others_settle_by_no_more_stages_than_the_first_start_had() -> None:
-    problem = posed(Stribeck())
-    fit = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
-    left = [
-        replace(
-            fit, end=SearchEnd.ABANDONED, status=SearchEnd.ABANDONED.status, stats={**fit.stats, "gap_deviation": gap}
-        )
-        for gap in (1e-2, 1e-4)
-    ]
-    assert [search._stages_before_left(problem, each) for each in (*left, fit)] == [1, 5, 0]
+def left_after(problem: EstimationProblem, gap: float, *costs: float) -> tuple[EstimationProblem, Fit, str]:
+    """The first start, left for others after a stage, with what it cost at the ends of stages."""
+    start = problem.candidates[0]
+    fit, stages = solve_least_squares(problem.transcription(start), problem.method), problem.method.stages
+    ends = tuple((stage.gap, cost) for stage, cost in zip(stages, costs, strict=False))
+    end, stats = SearchEnd.ABANDONED, {**fit.stats, "gap_deviation": gap}
+    return problem, replace(fit, end=end, status=end.status, stats=stats, stage_costs=ends), start.label
+
+
+def test_the_others_settle_by_no_more_stages_than_the_first_start_had(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, given = posed(Stribeck()), list[int]()
+
+    def settle(_: EstimationProblem, start: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
+        given.append(stages)
+        return (1e-3, 1.0), start, False
+
+    monkeypatch.setattr(search, "_settle_start", settle)
+    for fits, stages in (
+        ([left_after(problem, 1e-2)], 1),
+        ([left_after(problem, 1e-4)], GUESS_STAGES),
+        ((), GUESS_STAGES),
+    ):
+        given.clear()
+        list(search.starts_by_cost(problem, fits))
+        assert set(given) == {stages}
 
 
 def test_without_guesses_the_candidates_are_tried_as_they_are() -> None:
@@ -422,18 +437,10 @@ def test_no_more_guesses_settle_where_another_one_costs_the_same(
         return (gap, cost), start, False
 
     monkeypatch.setattr(search, "_settle_start", settle)
-    starts = list(search.starts_by_cost(problem, left_after=lambda: 5, left_cost=lambda: 100.0))
+    first = left_after(problem, 1e-4, 0.0, 0.0, 100.0, 1e9)  # at the ends of its stages; the third counts
+    starts = list(search.starts_by_cost(problem, [first]))
     assert len(settled) == settles
     assert {s.label for s in starts} == {s.label for s in problem.candidates}  # the others are tried as they are
-
-
-def test_the_cost_that_others_are_held_to_is_that_after_as_many_stages() -> None:
-    problem = posed(Stribeck())
-    fit = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
-    costs = tuple((stage.gap, float(i)) for i, stage in enumerate(problem.method.stages))
-    found = [search._cost_after_guesses(problem, [(problem, replace(fit, stage_costs=c), "")]) for c in (costs, ())]
-    assert found[0] == GUESS_STAGES - 1
-    assert math.isnan(found[1])
 
 
 @pytest.mark.parametrize(("excess", "starts"), [(0.4, 1), (0.001, 2), (-0.2, 2)])

@@ -61,10 +61,9 @@ class CValue(NamedTuple):
 
 
 def write_c(c_function: CFunction, rates: Mapping[str, int]) -> tuple[str, int]:
-    """C functions ``NAME_segment``, ``NAME_sample``, ``NAME_call`` on a struct ``Segment *s``; and their storage size.
+    """C functions ``NAME_segment``, ``NAME_sample``, ``NAME_call`` on a struct ``Segment *s``; size of ``NAME_kept``.
 
-    `rates` says how often each input changes, an index into `RATES`; the storage is the struct's member ``NAME_kept``.
-    An operation of CasADi that has no C here is a `NotImplementedError`.
+    `rates` are indices into `RATES`; `NotImplementedError` for an operation of CasADi that has no C here.
     """
     writer = _CWriter(c_function, rates)
     functions = []

@@ -67,11 +67,7 @@ class Compiler:
 
 
 def find_compiler() -> Compiler | None:
-    """The C compiler: of ``$PNEUOPT_CC`` (empty: none), ``$CC``, on the path, or of the extra ``compiler``; or None.
-
-    Both variables hold a program, or a command with arguments (``"python -m ziglang cc"``). On the path are sought
-    gcc, clang and cc; the extra is the package ziglang, which holds a clang.
-    """
+    """The C compiler: of ``$PNEUOPT_CC`` (empty: none), ``$CC``, on the path, or of the extra ``compiler``; or None."""
     chosen = os.environ.get("PNEUOPT_CC")
     if chosen is not None:
         return _parse_command(chosen)
@@ -142,8 +138,7 @@ logger = logging.getLogger("pneuopt")
 def compile_library(source: str, *definitions: str) -> ctypes.CDLL | None:
     """Compile a source, or load its product from the cache; None where that cannot be done, which is said once.
 
-    The same source is answered from memory. Each definition, a macro as ``LANES=1``, is tried after the one before it
-    failed.
+    Each definition, a macro as ``LANES=1``, is tried after the one before it failed.
     """
     cc = find_compiler()
     if cc is None:

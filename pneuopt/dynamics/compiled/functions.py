@@ -4,7 +4,7 @@
 """
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,10 +70,9 @@ def compile_rate(ode: ca.Function) -> Callable[[float, Array, Array, Array], Arr
 
 
 def compile_held_rate(ode: ca.Function) -> Callable[[float, Array, Array], Callable[[float, Array], Array]]:
-    """``hold(origin, u, p) -> f``, ``f(t, x) -> xdot`` at ``origin + t``: `compile_rate` under inputs that are held.
+    """``hold(origin, u, p) -> f``, ``f(t, x) -> xdot`` at ``origin + t``: `compile_rate` in two thirds of its time.
 
-    It takes two thirds of the time: LSODA asks for it 10,000 times a second. The next call of any f overwrites its
-    array; the inputs are those of the last `hold`. Not thread-safe.
+    The next call of any f overwrites its array; the inputs are those of the last `hold`. Not thread-safe.
     """
     code = _BoundCode.of(_with_dense_outputs(ode, "system_function"), wanted=1)
     (at, states, inputs, parameters), (rate,), call, pointers = code.buffers, code.results, code.call, code.pointers
@@ -107,7 +106,13 @@ def compile_rows(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
                 raise ModelError(f"argument {i} has shape {rows.shape}, expected rows of {buffer.size} numbers")
         results = tuple(np.empty((count, result.size)) for result in code.results)
         if code.library is not None:
-            _run_rows(code, given, results, count)
+            library, arg, res, work = code.keep_alive
+            sources = (ctypes.c_void_p * len(arg))(*(rows.ctypes.data for rows in given))
+            targets = (ctypes.c_void_p * len(res))(*(rows.ctypes.data for rows in results))
+            steps = [[a.shape[1] if a.ndim == 2 else 0 for a in arrays] for arrays in (given, results)]
+            sizes = [np.array(each, dtype=np.int64) for each in (*steps, [len(given), len(results), count])]
+            library.system_rows.restype = None
+            library.system_rows(sources, targets, *(ctypes.c_void_p(a.ctypes.data) for a in (*sizes, work)))
             return results
         for k in range(count):
             for buffer, rows in zip(code.buffers, given, strict=True):
@@ -118,21 +123,6 @@ def compile_rows(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
         return results
 
     return call_rows
-
-
-def _run_rows(code: "_BoundCode", given: Sequence[Array], results: Sequence[Array], count: int) -> None:
-    """Evaluate every row by machine code."""
-    library, arg, res, work = code.keep_alive
-    sources = (ctypes.c_void_p * len(arg))(*(rows.ctypes.data for rows in given))
-    targets = (ctypes.c_void_p * len(res))(*(rows.ctypes.data for rows in results))
-    steps = [
-        np.array([a.shape[1] if a.ndim == 2 else 0 for a in arrays], dtype=np.int64) for arrays in (given, results)
-    ]
-    sizes = np.array([len(given), len(results), count], dtype=np.int64)
-    library.system_rows.restype = None
-    library.system_rows(
-        sources, targets, *(ctypes.c_void_p(a.ctypes.data) for a in (*steps, sizes)), ctypes.c_void_p(work.ctypes.data)
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,23 +97,10 @@ def race(rollout: Rollout, course: RaceCourse, merit: RaceMerit, candidates: Rac
         for n, a in given.items()
         if n not in ("substeps", "every")
     }
-    kept |= {
-        "y": y,
-        "x": kept_states,
-        "x_end": outcome.x_end,
-        "loser": outcome.loser,
-        "worst": np.zeros((m, len(RACE_VALUES))),
-    }
-    sizes = (
-        cases,
-        course.t.shape[1],
-        len(merit.bands),
-        course.every,
-        course.substeps,
-        merit.worst,
-        merit.penalty,
-        merit.runaway,
-    )
+    kept |= {"y": y, "x": kept_states, "x_end": outcome.x_end, "loser": outcome.loser}
+    kept["worst"] = np.zeros((m, len(RACE_VALUES)))
+    counts = cases, course.t.shape[1], len(merit.bands), course.every, course.substeps
+    sizes = *counts, merit.worst, merit.penalty, merit.runaway
     work = m * cases * course.t.shape[1] * course.substeps
     rollout.race(_RaceStruct(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, work, list(kept.values()))
     return outcome

@@ -1,11 +1,7 @@
 """`Rollout`: a sampled system over many segments at once, each in a SIMD lane, with forward sensitivities.
 
-It is cached machine code, or runs in the CasADi VM where there is no compiler. Both give the same answers. Binaries
-are cached by content (source, flags, compiler, CPU); logs, values and step sizes are arguments, so one binary serves
-every log and every continuation step. Below `Rollout` stand the pieces of a system with their sensitivities,
-symbolically and as the C of a run (`prepare_rollout`).
-
-`check_machine_code`: compiled models against the VM, their derivatives against differences, and their speed.
+It is cached machine code, or runs in the CasADi VM where there is no compiler, with the same answers. Logs, values and
+step sizes are arguments, so one binary serves every log and every continuation step.
 """
 
 import ctypes
@@ -94,8 +90,7 @@ class Gram:
 class Rollout:
     """Run a sampled system over many segments at once, with sensitivities to parameters `wrt` and to the `start` state.
 
-    Defaults: as many threads as processors, and as many `lanes` (segments that one processor runs at once, a power of
-    2) as pay on the CPU: 4 with AVX, one where the compiler knows no vectors; 0 is the CasADi VM.
+    `lanes` are segments that a processor runs at once, a power of 2, by default what pays; 0 is the CasADi VM.
     """
 
     def __init__(
@@ -135,8 +130,7 @@ class Rollout:
     ) -> RolloutResult:
         """Integrate m segments from x0 (m, n_states) over n samples at t with steps h [s], (m, n) or (n,) for all.
 
-        Inputs u, (m, n, n_inputs) or (n, n_inputs) for all, are held over each sample; p is (m, n_parameters) or one
-        for all; h = 0 pads a short segment. The state is returned at each so many samples (`states`), or at none (0).
+        So are u (m, n, n_inputs), which is held, and p (m, n_parameters); h = 0 pads; `states`: each so many samples.
         """
         _check.get()()
         x, us, ps, ts, hs = self._check_arrays(x0, u, p, t, h, substeps)
@@ -150,9 +144,8 @@ class Rollout:
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         kept = np.empty((m, -(-n // states), nx)) if states else None
-        self._call_library(
-            (x, us, ps, ts, hs), substeps, states, (None, None, y, dy, kept, x_end, dx_end, None, None, None)
-        )
+        others = None, None, y, dy, kept, x_end, dx_end, None, None, None
+        self._call_library((x, us, ps, ts, hs), substeps, states, others)
         return RolloutResult(y, x_end, kept, _swap_last_axes(dy), _swap_last_axes(dx_end))
 
     def gram(
@@ -215,12 +208,8 @@ class Rollout:
             e = np.concatenate([dy, (run.y - y)[..., None]], axis=-1) * w[..., None]
             e = np.where(np.isfinite(y)[..., None], e, 0.0)
             flat = e.reshape(len(y), -1, e.shape[-1])
-            grams, squares, sums = (
-                np.swapaxes(flat, 1, 2) @ flat,
-                np.sum(e[..., -1] ** 2, axis=1),
-                e[..., :-1].sum(axis=1),
-            )
-            parts.append((grams, squares, sums, run.y, run.x_end, dx_end))
+            squares, sums = np.sum(e[..., -1] ** 2, axis=1), e[..., :-1].sum(axis=1)
+            parts.append((np.swapaxes(flat, 1, 2) @ flat, squares, sums, run.y, run.x_end, dx_end))
         return Gram(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _call_library(
@@ -309,13 +298,7 @@ def _swap_last_axes(array: Array | None) -> Array | None:
 
 
 C_SOURCE_FOLDER = Path(__file__).parent
-INPUT_RATES = {
-    "t": 1,
-    "u": 1,
-    "p": 0,
-    "x": 2,
-    "S": 2,
-}  # how often the inputs of a piece change: an index into `c_writer.RATES`
+INPUT_RATES = {"t": 1, "u": 1, "p": 0, "x": 2, "S": 2}  # how often inputs change: an index into `c_writer.RATES`
 PIECE_OUTPUTS = {"step": ("x_next", "S_next"), "output": ("y", "dy"), "update": ("x_next", "S_next")}
 STEP_INPUT_RATES = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
 
@@ -328,11 +311,9 @@ def prepare_rollout(
     start: bool,
     implicit: int | None = None,
 ) -> tuple[dict[str, ca.Function], str]:
-    """The pieces of a sampled system (see `Pieces`) with sensitivities to parameters `wrt` and `start`, and their C.
+    """The pieces of a sampled system, ``(..., x, u, p, S) -> (value, its sensitivity)``, and their C, "" if none.
 
-    Each is ``(..., x, u, p, S) -> (value, its sensitivity)``; of an ODE in RK4 steps "rate", too: ``(t, x, u, p) ->
-    (xdot, its Jacobians to x and to the chosen parameters)``. The C is empty where an operation has none, which is said
-    once.
+    Of an ODE in RK4 steps "rate", too: ``(t, x, u, p) -> (xdot, its Jacobians to x and to the chosen parameters)``.
     """
     return prepare_by_content(str(step.serialize()), _serialize(update), _serialize(ode), tuple(wrt), start, implicit)
 

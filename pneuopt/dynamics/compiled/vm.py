@@ -13,18 +13,13 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy.special import erf
 
 from pneuopt.dynamics.compiled.c_writer import Instruction, read_instructions
 from pneuopt.dynamics.tolerances import ARRAY_SEGMENTS, BLOCK_SEGMENTS, FOLDED_STEPS, OPERATIONS_A_THREAD
 from pneuopt.quantities.arrays import Array
 
 Operation = Callable[..., Any]
-
-
-def _erf(value: Array, out: Array) -> None:
-    from scipy.special import erf
-
-    erf(value, out)
 
 
 OPERATIONS: dict[int, Operation] = {
@@ -44,7 +39,7 @@ OPERATIONS: dict[int, Operation] = {
     ca.OP_LOG: np.log,
     ca.OP_LOG1P: np.log1p,
     ca.OP_EXPM1: np.expm1,
-    ca.OP_ERF: _erf,
+    ca.OP_ERF: erf,
     ca.OP_SIN: np.sin,
     ca.OP_COS: np.cos,
     ca.OP_TAN: np.tan,
@@ -191,11 +186,7 @@ def run_in_vm(
     states: int,
     threads: int = 1,
 ) -> VmRun:
-    """Integrate m segments of n samples each, as `Rollout.run` does with x0, u, p, t and h.
-
-    `functions` are those of `prepare_rollout`; the first `start_columns` of the sensitivity's columns are the start
-    state's.
-    """
+    """Integrate as `Rollout.run` does by `prepare_rollout`'s functions; the first `start_columns` are the start's."""
     (m, n), nx = given[3].shape, given[0].shape[1]
     if nx == 0 and n > 1:  # a model without a state: each of its samples is a segment
         x0, u, p, t, h = given
@@ -349,8 +340,7 @@ def bind_array_step(
 ) -> Callable[[], None]:
     """A call without arguments that takes a step of all segments from inputs (t, h, x, u, p, S) to results (x, S).
 
-    Their shapes are (numbers, segments), S column by column; `program` is that of `rate`, ``(t, x, u, p) -> (xdot,
-    d(xdot)/dx, d(xdot)/d(chosen parameters))`` with sparse slopes.
+    Their shapes are (numbers, segments), S column by column; `program` is that of `rate` (`prepare_rollout`).
     """
     at, size, x, u, p, flat = inputs
     nx, m = x.shape
