@@ -50,13 +50,7 @@ class FileLocations:
         return str(self.path)
 
     def location(self, section: str, key: str = "") -> str:
-        r"""File and line of a section's head or of one of its keys: "drive.toml:14"; the file where it has no such.
-
-        Examples
-        --------
-        >>> FileLocations("drive.toml", '[valve]\nleak = 0.01  # tight').location("valve", "leak")
-        'drive.toml:2'
-        """
+        r"""File and line of a section's head or of one of its keys: "drive.toml:14"; the file where it has no such."""
         head: tuple[str, ...] = ()
         wanted = (section, key) if key else (section,)
         for number, line in enumerate(self.text.splitlines(), 1):

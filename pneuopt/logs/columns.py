@@ -277,12 +277,10 @@ class Plant(Protocol):
     @property
     def inputs(self) -> tuple[Quantity, ...]:
         """Signals that drive it."""
-        ...
 
     @property
     def outputs(self) -> tuple[Quantity, ...]:
         """Signals that sensors show."""
-        ...
 
 
 def plant_channels(plant: Plant) -> dict[str, str]:
@@ -359,13 +357,7 @@ Ask = Callable[[Question], str]
 
 
 def guess_channels(names: Sequence[str], channels: Mapping[str, str]) -> dict[str, list[str]]:
-    """By channel the columns whose names may mean it, the surest first.
-
-    Examples
-    --------
-    >>> guess_channels(["t_ms", "U valve", "x [mm]", "x soll"], {"time": "s", "valve_voltage": "V", "position": "m"})
-    {'time': ['t_ms'], 'valve_voltage': ['U valve'], 'position': ['x [mm]']}
-    """
+    """By channel the columns whose names may mean it, the surest first."""
     found: dict[str, list[tuple[int, str]]] = {}
     for name in filter(None, names):
         channel, doubt = _guess_channel(name, channels)

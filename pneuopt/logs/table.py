@@ -72,13 +72,7 @@ def check_cells(path: Path | str, rows: int, columns: int) -> None:
 
 
 def list_rows(rows: Sequence[int], most: int = 8) -> str:
-    """List rows in at most so many runs, as in "row 14", or "rows 14 to 20, 31, ... (57 in all)".
-
-    Examples
-    --------
-    >>> list_rows([14]), list_rows([14, 15, 16, 31])
-    ('row 14', 'rows 14 to 16, 31 (4 in all)')
-    """
+    """List rows in at most so many runs, as in "row 14", or "rows 14 to 20, 31, ... (57 in all)"."""
     if len(rows) == 1:
         return f"row {rows[0]}"
     ends = np.flatnonzero(np.diff(rows) > 1).tolist()

@@ -252,31 +252,25 @@ class FrictionModel(Protocol):
     @property
     def states(self) -> tuple[Quantity, ...]:
         """Internal states; none for a static map."""
-        ...
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
         """Signals that friction depends on beside the speed: gauge pressures [Pa(g)], the driving force [N]."""
-        ...
 
     @property
     def parameters(self) -> ParameterSet:
         """Defaults, with units and bounds."""
-        ...
 
     @property
     def identification_hints(self) -> IdentificationHints:
         """Motion that a log must show for each parameter to be identifiable, by the law's parameter names."""
-        ...
 
     @property
     def start(self) -> FrictionStart:
         """How an identification of its parameters starts from logs."""
-        ...
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """Force at speed v [m/s] with internal states z, inputs u and parameters p."""
-        ...
 
 
 @dataclass(frozen=True)

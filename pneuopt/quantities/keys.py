@@ -120,12 +120,6 @@ def read_table(
     `where` begins an error's message, as file and section, or says so of a key; `units` are what the words in braces of
     the keys' units stand for; with `partial` the table has keys of another reader. A key that is unknown or missing, or
     has a value that it does not take, is an `InputError`.
-
-    Examples
-    --------
-    >>> keys = {"speed": Key("how fast", unit="m/s", least=0.0), "softly": flag("whether it brakes softly")}
-    >>> read_table(keys, {"speed": "20 mm/s"}, "move.toml: [move]")
-    {'speed': 0.02, 'softly': False}
     """
 
     def place(key: str) -> str:

@@ -36,20 +36,16 @@ class ChamberModel(Protocol):
     @property
     def states(self) -> tuple[Quantity, ...]:
         """States of the air: the pressure, and others if the model has them."""
-        ...
 
     @property
     def parameters(self) -> ParameterSet:
         """Parameters, which a drive's chambers share."""
-        ...
 
     def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:
         """Temperature of the air inside [K]."""
-        ...
 
     def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
         """Rates of the states."""
-        ...
 
 
 @dataclass(frozen=True)

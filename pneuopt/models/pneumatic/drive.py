@@ -29,7 +29,7 @@ from pneuopt.dynamics.hooks import (
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.logs.tolerances import MAX_POSITION_ZERO_ERROR
 from pneuopt.models.declaration import Alias, DriveKind, DriveSections, FirstFiles
-from pneuopt.models.drives import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
+from pneuopt.models.drives import AMBIENT_PARAMETERS, POSITION, SPEED
 from pneuopt.models.friction import (
     FRICTION_KEYS,
     LOAD_HINTS,
@@ -131,9 +131,9 @@ class PneumaticDrive:
     @property
     def states(self) -> tuple[Quantity, ...]:
         """States of load, chambers, valve and friction, in this order."""
-        air = tuple(rename_quantity(q, f"{q.name}_{side}") for q in self.chamber.states for side in SIDES)
-        spool = tuple(rename_quantity(q, f"valve.{q.name}") for q in self.valve.states)
-        return POSITION, SPEED, *air, *spool, *(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
+        air = tuple(replace(q, name=f"{q.name}_{side}") for q in self.chamber.states for side in SIDES)
+        spool = tuple(replace(q, name=f"valve.{q.name}") for q in self.valve.states)
+        return POSITION, SPEED, *air, *spool, *(replace(q, name=f"friction.{q.name}") for q in self.friction.states)
 
     def system(self) -> System:
         """Build the equations; states, input and outputs as in the class."""

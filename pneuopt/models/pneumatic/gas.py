@@ -40,11 +40,9 @@ class FlowLaw(Protocol):
     @property
     def parameters(self) -> ParameterSet:
         """Parameters of the law beside the conductance."""
-        ...
 
     def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:
         """Mass flow over conductance, reference density and sqrt(T0/T) [Pa]; it changes sign with the pressures."""
-        ...
 
 
 @dataclass(frozen=True)
