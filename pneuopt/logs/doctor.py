@@ -163,30 +163,27 @@ def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFindi
 
     The log's noise, where given, separates motion from noise.
     """
+    from scipy.interpolate import CubicSpline
+
     log = experiment.trajectory
     moved = (n for n in (axis.position, axis.speed) if n in log and n not in experiment.noise)
     noise = {n: noise_level(log[n], log.t) for n in moved}  # which several checks need
     experiment = experiment.with_noise({n: level for n, level in noise.items() if level > 0})
-    # each channel at every instant, as recorders that give each its own rate do not write it
-    known = {n: np.isfinite(log[n]) for n in log}
-    lacking = [n for n, there in known.items() if 4 <= there.sum() < there.size]  # as a cubic spline needs
-    whole = replace(experiment, trajectory=log.with_columns({n: _spline(log.t, log[n], known[n]) for n in lacking}))
+    # each channel at every instant, as recorders that give each its own rate do not write it: by a cubic spline, but
+    # not across a hole
+    splines = dict[str, Array]()
+    for n, known in ((n, np.isfinite(log[n])) for n in log):
+        if 4 <= known.sum() < known.size:  # as a spline needs
+            at, steps = log.t[known], np.diff(log.t[known])
+            before = np.clip(np.searchsorted(at, log.t, side="right") - 1, 0, steps.size - 1)
+            splines[n] = np.asarray(CubicSpline(at, log[n][known], extrapolate=False)(log.t))
+            splines[n][steps[before] > MAX_STEPS_BETWEEN * float(np.median(steps))] = np.nan
+            splines[n][known] = log[n][known]
+    whole = replace(experiment, trajectory=log.with_columns(splines))
     logs = {name: experiment if name in SINGLE_SAMPLE_CHECKS else whole for name in CHECKS}
     named = ((name, finding) for name, check in CHECKS.items() for finding in check(logs[name], axis))
     found = [replace(finding, check=name, log=experiment.name) for name, finding in named]
     return tuple(sorted(found, key=lambda f: not f.fault))
-
-
-def _spline(t: Array, column: Array, known: Mask) -> Array:
-    """A column at every instant by a cubic spline through its samples, but not across a hole."""
-    from scipy.interpolate import CubicSpline
-
-    at, steps = t[known], np.diff(t[known])
-    out = np.asarray(CubicSpline(at, column[known], extrapolate=False)(t))
-    before = np.clip(np.searchsorted(at, t, side="right") - 1, 0, steps.size - 1)
-    out[steps[before] > MAX_STEPS_BETWEEN * float(np.median(steps))] = np.nan
-    out[known] = column[known]
-    return out
 
 
 def evidence(
@@ -731,29 +728,24 @@ def check_work_sign(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
     log, motion = experiment.trajectory, motion_speed(experiment, axis)
     if motion is None:
         return
-    drives = {axis.push: (f"the {axis.push} brakes", f"'{axis.push}'")}
+    drives = {axis.push: (f"the {axis.push} brakes", f"'{axis.push}'")} if axis.push in log else {}
     if "pressure_a" in log and "pressure_b" in log:
         drives["pressures"] = ("the pressures brake", "the position, or exchange pressure_a and pressure_b")
     for name, (message, remedy) in drives.items():
-        if name == axis.push and name not in log:
-            continue
         if name == axis.push:
-            pushes = [log[name]]
+            pushes, unit, shown = [log[name]], experiment.unit(name), Panel(experiment.unit(name), {name: log[name]})
         else:
+            unit, shown = "Pa", Panel("Pa(a)", {n: log[n] for n in ("pressure_a", "pressure_b")})
             pushes = [log["pressure_a"] - ratio * log["pressure_b"] for ratio in ROD_AREA_RATIOS]
             pushes = [push - np.nanmean(push) for push in pushes]
         shares = np.stack([_work_shares(log.t, np.stack(pushes), motion, lag) for lag in sensor_lags(log.t)], axis=1)
         share = max(shares.ravel().tolist())
         if share < MIN_WORK_SHARE:
             at = int(np.nanargmin(pushes[-1] * motion))
-            unit = experiment.unit(axis.push) if name == axis.push else "Pa"
             fast = f"{motion[at]:.3g} {experiment.unit(axis.speed)}"
             seen = f"most at {log.t[at]:.4g} s, where {pushes[-1][at]:.3g} {unit} pushes and the speed is {fast}"
             why = f"{message} the motion on balance ({100 * share:.0f} % of its power, {seen}), which no drive does"
             speed = speed_panel(experiment, axis, motion)
-            shown = Panel(experiment.unit(axis.push), {axis.push: pushes[0]})
-            if name != axis.push:
-                shown = Panel("Pa(a)", {n: log[n] for n in ("pressure_a", "pressure_b")})
             brakes = is_opposed(pushes[-1], motion)
             found = evidence(experiment, shown, speed, where=brakes, at=at, motion=motion, label="it brakes")
             yield LogFinding(name, f"{why}: change the sign of {remedy}", True, evidence=found)

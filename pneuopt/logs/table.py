@@ -1,8 +1,4 @@
-"""A log as its file has it: named columns of numbers that have no meaning yet, within a budget of bytes and cells.
-
-What readers share follows `LogTable`: the budget, columns that a file holds as arrays, and how to run the libraries
-that read some formats.
-"""
+"""A log as its file has it: named columns of numbers that have no meaning yet, within a budget of bytes and cells."""
 
 import importlib
 import logging

@@ -1,7 +1,4 @@
-"""Reader of logs as text: columns apart by comma, semicolon, tab or white space, with decimal point or comma.
-
-First where a log's samples begin, then cells of text as numbers, and time stamps as loggers write them.
-"""
+"""Reader of logs as text: columns apart by comma, semicolon, tab or white space, with decimal point or comma."""
 
 import csv
 import io
@@ -101,10 +98,8 @@ class Layout(NamedTuple):
 def find_layout(rows: Sequence[Sequence[str]], where: str) -> Layout:
     """Find the names, the units and the first sample in the cells of a file's rows, at least of its first ones.
 
-    The samples begin with the first row of the usual width whose first cell is a number or a time stamp. The nearest
-    row above it without a number names the columns. Between them may stand a row of units, empty rows and comments.
-    Where another row stands there, or none begins with a number, the samples begin below the first row that may be
-    names: no row that may be a sample is skipped.
+    The samples begin with the first row of the usual width whose first cell is a number or a time stamp, below names,
+    units, empty rows and comments; else below the first row that may be names: none that may be a sample is skipped.
     """
     width = _usual_width(rows)
     first = next((i for i, row in enumerate(rows) if _is_sample(row, width)), None)

@@ -3,11 +3,9 @@
 Signs: the force opposes positive speed when positive. Every map is smooth; `smoothing` is the speed over which the
 Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre holds it.
 
-First stand the declarations that a law makes (`FrictionStart`: its start from logs, see `starts`) and what a log must
-show for its parameters; then `FrictionModel`, the laws, the wrappers, and the formulas that they share. `Karnopp` is
-dry friction for simulations: `simulate` switches its "friction.direction" and locates each break-away and standstill;
-a solver that leaves the direction at zero simulates no dry friction at all. At the end stands the registry of the laws,
-a row each, for files, model selection (`friction_ladder`) and the table test, with the keys of section [friction].
+`Karnopp` is dry friction for simulations: `simulate` switches its "friction.direction" and locates each break-away and
+standstill; a solver that leaves the direction at zero simulates no dry friction at all. The registry of the laws, a row
+each, stands at the end.
 """
 
 import math

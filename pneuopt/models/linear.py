@@ -72,11 +72,10 @@ class FirstOrder:
         def dynamics(u: ca.SX, x: Symbols, p: Symbols) -> dict[str, ca.SX]:
             return {y: (p["plant.gain"] * u - x[y]) / p["plant.time_constant"]}
 
-        shaping = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True, meaning="time constant")}
+        constant = Parameter(0.1, "s", 1e-5, 1e4, log=True, meaning="time constant")
         shape = ResponseShape(("plant.time_constant",), _first_order_polynomials)
-        return _assemble_plant(
-            self, (self.output,), _gain_parameter(self.input, self.output, ""), ParameterSet(shaping), dynamics, shape
-        )
+        shaping = ParameterSet({"plant.time_constant": constant})
+        return _assemble_plant(self, (self.output,), shaping, dynamics, shape)
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,7 @@ class SecondOrder:
         shape = ResponseShape(
             tuple(shaping)[:2], _second_order_polynomials, None if friction is None else _friction_polynomials
         )
-        plant = _assemble_plant(self, states, _gain_parameter(self.input, self.output, ""), shaping, dynamics, shape)
+        plant = _assemble_plant(self, states, shaping, dynamics, shape)
         if friction is None:
             return plant
         return replace(plant, identification_hints=friction.identification_hints.with_prefix("friction"))
@@ -187,9 +186,7 @@ class Integrator:
             return {y: p["plant.gain"] * u}
 
         shape = ResponseShape((), _integrator_polynomials)
-        return _assemble_plant(
-            self, (self.output,), _gain_parameter(self.input, self.output, "*s"), ParameterSet(), dynamics, shape
-        )
+        return _assemble_plant(self, (self.output,), ParameterSet(), dynamics, shape, per="*s")
 
 
 Plant = FirstOrder | SecondOrder | Integrator
@@ -277,28 +274,19 @@ class ResponseShape:
 def _assemble_plant(
     plant: Plant,
     states: tuple[Quantity, ...],
-    gain: Parameter,
     shaping: ParameterSet,
     dynamics: Dynamics,
     shape: ResponseShape,
+    per: str = "",
 ) -> System:
-    """Assemble a plant from its dynamics, its gain and its dead time."""
-    order, source = plant.pade_order, plant.input
-    line = delay_line(source, order)
+    """Assemble a plant from its dynamics, its gain, whose unit is also per `per`, and its dead time."""
+    order, source, unit = plant.pade_order, plant.input, difference_unit(plant.input.unit)
+    line, gain_unit = delay_line(source, order), _quotient_unit(plant.output, f"({unit}{per})" if per else unit)
+    gain = Parameter(1.0, gain_unit, meaning="steady output, or of an integrator its rate, per input")
     parameters = ParameterSet({"plant.gain": gain}) | shaping
     if order:
-        parameters = parameters | ParameterSet(
-            {
-                "plant.dead_time": Parameter(
-                    0.01,
-                    "s",
-                    1e-3,
-                    10.0,
-                    log=True,
-                    meaning="delay from the input to its effect; none where it is left out",
-                )
-            }
-        )
+        meaning = "delay from the input to its effect; none where it is left out"
+        parameters |= ParameterSet({"plant.dead_time": Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)})
 
     def rhs(_: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
         late, rates = pade_delay(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
@@ -326,11 +314,6 @@ def _friction_polynomials(w: float, damping: float) -> Polynomials:
 
 def _integrator_polynomials() -> Polynomials:
     return [1.0], [1.0, 0.0]
-
-
-def _gain_parameter(source: Quantity, output: Quantity, per: str) -> Parameter:
-    unit = _quotient_unit(output, f"({difference_unit(source.unit)}{per})" if per else difference_unit(source.unit))
-    return Parameter(1.0, unit, meaning="steady output, or of an integrator its rate, per input")
 
 
 def _quotient_unit(output: Quantity, unit: str) -> str:

@@ -1,8 +1,4 @@
-"""Files written whole or not at all, and refused before the work where they could not be written after it.
-
-Files that are read: only regular ones, once, within a budget; TOML within one for its nesting, too. And linear algebra
-in the thread that calls it.
-"""
+"""Files written whole or not at all, or refused before the work; files read once, within a budget; one BLAS thread."""
 
 import contextlib
 import functools

@@ -1,9 +1,4 @@
-"""`PneumaticDrive`: supply, proportional valve, cylinder and load in one ODE.
-
-Below the drive stand its sections and keys in a file, with a catalogue's nominal flow in place of a conductance; its
-rest and steady motion, the spool position and pressures at which only the position changes; impossible hardware; and
-the limits where the model ends, end stops and empty chambers.
-"""
+"""`PneumaticDrive`: supply, proportional valve, cylinder and load in one ODE, its file, its rest and its limits."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
