@@ -247,7 +247,8 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: i
     if kind is _PATH:
         table = file.parent / known.pop("path")
         known = {"dwell": Move.dwell, **known}
-        return construct_at(lambda: read_path_of(loop.feedback.name, table, **known), f"{where} path")
+        channels = f"{loop.feedback.name}_reference", loop.feedback.name
+        return construct_at(lambda: _make_path(table, read_log(table).trajectory, channels, known), f"{where} path")
     if kind is _MOVE:
         each = known.pop("moves", None) or [{"distance": known.pop("move")}]
         return construct_at(lambda: _chain_moves(each, known), where)
@@ -295,11 +296,6 @@ def read_path(path: str | Path, *, channel: str | None = None, **settings: Any) 
     if channel is not None:
         check_names("channel", [channel], log.names, str(path))
     return _make_path(path, log, PATH_CHANNELS if channel is None else (channel,), settings)
-
-
-def read_path_of(measured: str, path: str | Path, **settings: Any) -> MotionPath:
-    """The path that a loop shall follow: the column of its measured signal's reference, or of the signal itself."""
-    return _make_path(path, read_log(path).trajectory, (f"{measured}_reference", measured), settings)
 
 
 def _make_path(path: str | Path, log: Trajectory, channels: Sequence[str], settings: Mapping[str, Any]) -> MotionPath:

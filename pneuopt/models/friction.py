@@ -24,9 +24,9 @@ from pneuopt.models.tolerances import (
     BRISTLE_STIFFNESS_RANGE,
     MIN_COULOMB_SHARE,
     MIN_DIRECTION_SHARE,
+    MIN_FIT_SAMPLES,
     MIN_INERTIA_SHARE,
     MIN_REVERSALS,
-    MIN_SAMPLES,
     MIN_SPEED_RATIO,
     SMOOTHING_FACTOR,
     STICKING_SPEED,
@@ -99,7 +99,7 @@ def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
     if seen.fast < MIN_SPEED_RATIO * seen.slow:
         speeds = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}"
         return Lack(f"{speeds}, where friction is one level", f"log {run}")
-    if below < MIN_SAMPLES:
+    if below < MIN_FIT_SAMPLES:
         message = f"only {below} samples are slower than the Stribeck velocity, {stribeck:.2g} {unit}"
         return Lack(message, f"log {run}")
     return None
@@ -701,17 +701,13 @@ class Karnopp:
         If the base has internal states (LuGre has no standstill to locate) or no Coulomb level.
     """
 
+    states: ClassVar[tuple[Quantity, ...]] = ()
     base: FrictionModel
 
     def __post_init__(self) -> None:
         suited = not self.base.states and "smoothing" in self.base.parameters
         message = f"Karnopp needs a static map with a Coulomb level, Coulomb() or Stribeck(); {self.base} is not one"
         require(suited, message, ModelError)
-
-    @property
-    def states(self) -> tuple[Quantity, ...]:
-        """No states."""
-        return ()
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:

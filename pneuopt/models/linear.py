@@ -28,7 +28,7 @@ from pneuopt.models.tolerances import (
     MAX_REFINEMENT_SAMPLES,
     MAX_STARTS,
     MIN_DEAD_TIME,
-    MIN_SAMPLES,
+    MIN_FIT_SAMPLES,
     USUAL_PADE_ORDER,
 )
 from pneuopt.quantities.arrays import Array
@@ -481,8 +481,8 @@ def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
     measured, gain = log.measured, log.parameters[PLANT_GAIN]
     finite = np.isfinite(measured[source]) & np.isfinite(measured[output])
     t, u, y = (a[finite] for a in (measured.t, measured[source], measured[output]))
-    few = f"{name}: {len(t)} samples of {source} and {output} are too few to start from; give {MIN_SAMPLES} or more"
-    require(len(t) >= MIN_SAMPLES, few, LogError)
+    few = f"{name}: {len(t)} samples of {source} and {output} are too few to start from; give {MIN_FIT_SAMPLES} or more"
+    require(len(t) >= MIN_FIT_SAMPLES, few, LogError)
     step = float(np.median(np.diff(t)))
     grid = t[0] + step * np.arange(int((t[-1] - t[0]) / step + 1e-6) + 1)
     linear = log.intersample.get(source) is Intersample.LINEAR
@@ -495,7 +495,7 @@ def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
 
 
 def _thin_log(record: _EvenLog, most: int) -> _EvenLog:
-    every = max(1, len(record.t) // max(most, 5 * MIN_SAMPLES))
+    every = max(1, len(record.t) // max(most, 5 * MIN_FIT_SAMPLES))
     starts = np.arange(0, len(record.u), every)
     u = np.add.reduceat(record.u, starts) / np.diff(starts, append=len(record.u))
     return _EvenLog(record.t[::every], u, record.y[::every], record.sign[::every], record.gain, record.start_time)

@@ -32,11 +32,6 @@ class Takes(Enum):
     AXIS = "a list of values, or a range"
     COLUMN = "a column's name, a table, or false"
 
-    @property
-    def types(self) -> tuple[type, ...]:
-        """Python types of such an entry."""
-        return _TYPES[self]
-
 
 _TYPES: Mapping[Takes, tuple[type, ...]] = {
     Takes.FLAG: (bool,),
@@ -155,7 +150,7 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
         message = f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"'
         require(match is not None or type(entry) is int, message)
         return int(match[1]) if match else int(entry)
-    proper = type(entry) in key.takes.types
+    proper = type(entry) in _TYPES[key.takes]
     require(proper, f"{where} must be {key.takes.value}, got {repr(entry)[:MAX_SHOWN]}{_remedy(key, where)}")
     if key.takes is Takes.COUNT:
         return _in_bounds(key, entry, entry, where)

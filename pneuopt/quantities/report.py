@@ -87,9 +87,6 @@ class Report:
     def __bool__(self) -> bool:
         return bool(self.parts)
 
-    def __str__(self) -> str:
-        return self.to_text()
-
     def __repr__(self) -> str:
         return self.to_text()
 
