@@ -113,16 +113,13 @@ class MotionDrive:
         )
         bias = Parameter(0.0, "1", lower=-0.5, upper=0.5, meaning="error of the area, a fraction of it")
         rig = {"rig.area": area, "rig.area_bias": bias} if self.chamber else {}
-        offset = ParameterSet(
-            {
-                **rig,
-                "rig.force_offset": Parameter(
-                    0.0, "N", lower=-1e4, upper=1e4, meaning="reading of the force sensor without force"
-                ),
-            }
-        )
+        offset = Parameter(0.0, "N", lower=-1e4, upper=1e4, meaning="reading of the force sensor without force")
         ambient = AMBIENT_PARAMETERS if self.chamber else _ambient_parameters(self.friction)
-        return offset | self.friction.parameters.with_prefix("friction") | ambient
+        return (
+            ParameterSet({**rig, "rig.force_offset": offset})
+            | self.friction.parameters.with_prefix("friction")
+            | ambient
+        )
 
     def system(self) -> System:
         """Build the equations: the states are those of friction; output force."""

@@ -134,16 +134,11 @@ class SecondOrder:
             rates[y] -= gain * w / (2 * zeta) * force.value
             return rates | {f"friction.{n}": rate for n, rate in force.rates.items()}
 
-        shaping = ParameterSet(
-            {
-                "plant.natural_frequency": Parameter(
-                    10.0, "rad/s", 1e-3, 1e5, log=True, meaning="natural frequency without damping"
-                ),
-                "plant.damping": Parameter(0.7, "1", 1e-3, 1e3, log=True, meaning="damping ratio"),
-            }
-        )
+        frequency = Parameter(10.0, "rad/s", 1e-3, 1e5, log=True, meaning="natural frequency without damping")
+        damping = Parameter(0.7, "1", 1e-3, 1e3, log=True, meaning="damping ratio")
+        shaping = ParameterSet({"plant.natural_frequency": frequency, "plant.damping": damping})
         if friction is not None:
-            shaping = shaping | _in_input_unit(friction.parameters, self.input).with_prefix("friction")
+            shaping |= _in_input_unit(friction.parameters, self.input).with_prefix("friction")
         inner = friction.states if friction is not None else ()
         drive = Quantity("drive", _quotient_unit(self.output, "s"), 10 * self.output.nominal)
         states = (self.output, drive, *(replace(s, name=f"friction.{s.name}") for s in inner))

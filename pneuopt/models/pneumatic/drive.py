@@ -551,7 +551,7 @@ def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float,
 
     def pressures(spool: float) -> tuple[float, float]:
         def pressure_b_at(a: float) -> float:
-            return _zero_crossing_or_end(lambda pressure_b_at: rates(spool, a, pressure_b_at)[1], low, high)
+            return _zero_crossing_or_end(lambda b: rates(spool, a, b)[1], low, high)
 
         if p.value("cylinder.leak") == 0:
             return _zero_crossing_or_end(lambda a: rates(spool, a, low)[0], low, high), pressure_b_at(low)
@@ -571,13 +571,10 @@ def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float,
         f"lower the {'speed or the ' if glide.speed else ''}load, raise the supply or the bore",
     )
     spool = 0.0 if abs(acceleration_at(0.0)) * mass < 1e-9 else _brent_root(acceleration_at, -1.0, 1.0)
-    a, pressure_b_at = pressures(spool)
-    inside = not glide.speed or (low < min(a, pressure_b_at) and max(a, pressure_b_at) < high)
-    require(
-        inside,
-        f"{what}: a chamber would need {a if low < pressure_b_at < high else pressure_b_at:g} Pa(a); lower the speed",
-    )
-    return spool, a, pressure_b_at
+    a, b = pressures(spool)
+    inside = not glide.speed or (low < min(a, b) and max(a, b) < high)
+    require(inside, f"{what}: a chamber would need {a if low < b < high else b:g} Pa(a); lower the speed")
+    return spool, a, b
 
 
 def _zero_crossing_or_end(rate: Callable[[float], float], low: float, high: float) -> float:
