@@ -92,7 +92,10 @@ def finish(
     written, failures = write_files(writers, beside=interrupted)
     if figures is not None and outputs.plot is not None and not interrupted:
         with suppress(KeyboardInterrupt):  # Ctrl-C leaves out those that are not drawn yet
-            drawn, missed = write_files(figure_writers(outputs.plot, figures()))
+            plot, named = outputs.plot, figures()
+            drawn, missed = write_files(
+                {add_to_stem(plot, n) if n else plot: partial(save_figure, f) for n, f in named.items()}
+            )
             written, failures = written + drawn, failures + missed
     if page is not None and outputs.report is not None:
         writers = {outputs.report: lambda path: write_page(path, page(), draws=not interrupted)}
@@ -104,7 +107,8 @@ def finish(
     if failures:
         raise InputError("; ".join(map(str, failures)))
     if status is None or status.code in (Code.CONVERGED, Code.PARTIAL):
-        show_hints(make_console(), hints)
+        for k, hint in enumerate(hints):
+            make_console().print(Text(f"{'' if k else 'Next:':<5} {hint}"), soft_wrap=True)
         return ExitStatus.SUCCESS
     return ExitStatus.INTERRUPTED if interrupted else ExitStatus.FAILURE
 
@@ -155,12 +159,6 @@ def describe_status(file: StoredFit | Path) -> tuple[str, ...]:
 def warn(message: str) -> None:
     """Say on standard error what does not stop the command."""
     show_sentence(make_console(error=True), f"warning: {message}")
-
-
-def figure_writers(path: Path, figures: Mapping[str, "Figure"]) -> Writers:
-    """Each figure in a file of its own, the one without a name at the path itself."""
-    places = {name: add_to_stem(path, name) if name else path for name in figures}
-    return {places[name]: partial(save_figure, figure) for name, figure in figures.items()}
 
 
 def add_to_stem(path: Path, name: str) -> Path:
@@ -277,12 +275,6 @@ def show_output_files(console: Console, paths: Sequence[Any]) -> None:
     """The files that were written."""
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
-
-
-def show_hints(console: Console, hints: Sequence[str]) -> None:
-    """Commands that may come next, a line each."""
-    for k, hint in enumerate(hints):
-        console.print(Text(f"{'' if k else 'Next:':<5} {hint}"), soft_wrap=True)
 
 
 def show_pairs(console: Console, pairs: Mapping[str, object]) -> None:

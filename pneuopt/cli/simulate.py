@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pneuopt.cli.shared import (
     Outputs,
@@ -26,6 +27,9 @@ from pneuopt.report.fit_page import PageHead
 from pneuopt.report.page import Page, simulate_responses
 from pneuopt.report.tuning_page import LoopView, simulation_page
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     """Simulate the closed loop of a tuning's file; returns the exit status."""
@@ -33,16 +37,7 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     stored, task, parameters = read_fit_and_tuning(fit, tuning)
     found = check_certificate(stored, tuning)
     standing = Report() if found is None else found.report(tuning)
-    scenarios = task.scenarios(parameters)
-    metrics = evaluate(
-        task.loop,
-        task.references,
-        parameters,
-        scenarios=scenarios,
-        band=task.specification.band,
-        envelope=task.specification.envelope,
-        max_steps=task.max_steps,
-    )
+    metrics = task_metrics(task, parameters)
     writers: Writers = {}
     if outputs.output is not None:
         loop, runs = task.loop, list[Trajectory]()
@@ -62,6 +57,19 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     report = standing + report_metrics(metrics, relevant_units(task.loop), title="simulated", limits=limits)
     page = partial(_simulation_page, stored, tuning, task, view, parameters, standing)
     return finish(outputs, writers, tables, None, figures=view.figures, report=report, page=page)
+
+
+def task_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame":
+    """The metrics of a tuning's loop with these parameters."""
+    return evaluate(
+        task.loop,
+        task.references,
+        parameters,
+        scenarios=task.scenarios(parameters),
+        band=task.specification.band,
+        envelope=task.specification.envelope,
+        max_steps=task.max_steps,
+    )
 
 
 def loop_view(task: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> LoopView:

@@ -1,7 +1,4 @@
-"""`pneuopt study`: a loop over a grid or other cases, a front between two requirements, or which tolerances matter.
-
-`run_study` chooses; then how cases are computed and kept, the three kinds of study, and what they share on the screen.
-"""
+"""`pneuopt study`: a loop over a grid or other cases, a front between two requirements, or which tolerances matter."""
 
 import math
 import re
@@ -25,7 +22,6 @@ from pneuopt.cli.shared import (
     warn,
     warn_of_status,
 )
-from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate, metric_cell, metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import (
@@ -71,8 +67,6 @@ from pneuopt.studies.batch import LANE_METRICS, evaluate_batch
 from pneuopt.studies.executors import INTERRUPTED_CASE, Processes, open_executor
 from pneuopt.studies.journal import PARQUET, Journal, RowFile, parquet_bytes
 from pneuopt.studies.sensitivity import (
-    LocalSensitivity,
-    Sensitivity,
     local_sensitivity,
     sensitivity,
     sweep_from_neighbours,
@@ -223,11 +217,12 @@ def run_cases(job: _Job, computing: Computing) -> int:
         parameters = with_sample_time(task.loop, parameters)
         job = replace(job, parameters=parameters)
     check_names("metric", study.show, units, f"{study.path}: [metrics] show")
-    column_units = partial(_column_unit, {axis.name: parameters[axis.name].unit for axis in axes}, task.loop)
+    metric_unit = {n: m.shown_unit(task.loop.command.unit, task.loop.feedback.unit) for n, m in METRICS.items()}
+    column_units = {axis.name: parameters[axis.name].unit for axis in axes} | metric_unit | {"seconds": "s"}
 
     def heads(column: str) -> str:  # a gain that was found has its own name in the table
         name = column.removeprefix(f"{FOUND} ")
-        return heading(name, column_units(name))
+        return heading(name, column_units.get(_metric_name(name), ""))
 
     with keep_cases(study, job.outputs, len(cases), computing.resume, heads) as journal, computing.open() as executor:
         table, checks = _compute_cases(job, (cases, axes), journal, executor)
@@ -247,7 +242,7 @@ def run_cases(job: _Job, computing: Computing) -> int:
         status,
         report,
         tables,
-        (table, {str(c): column_units(str(c)) for c in table}),
+        (table, {str(c): column_units.get(_metric_name(c), "") for c in table}),
         partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics),
         ("Cases", alt),
         is_drawn=bool(study.cases) or len(axes) <= STYLE.map_axes,
@@ -397,13 +392,6 @@ def _metric_name(column: Hashable) -> str:
     return str(column).partition("[")[0]
 
 
-def _column_unit(axes: Mapping[str, str], loop: ClosedLoop, column: str) -> str:
-    """The unit of a column of the table; empty for a name or a reason."""
-    own = (loop.command.unit, loop.feedback.unit)
-    known = {**axes, **{n: metric.shown_unit(*own) for n, metric in METRICS.items()}, "seconds": "s"}
-    return known.get(_metric_name(column), "")
-
-
 def run_sensitivity(job: _Job, computing: Computing) -> int:
     """Tell which tolerances matter for a design; returns the exit status."""
     study, task, parameters = job.study, job.task, job.parameters
@@ -431,14 +419,6 @@ def run_sensitivity(job: _Job, computing: Computing) -> int:
             progress=report_progress,
             journal=journal,
         )
-    status = _finish_sensitivity(job, found, slopes)
-    if journal is not None and status != ExitStatus.INTERRUPTED:
-        journal.delete()
-    return status
-
-
-def _finish_sensitivity(job: _Job, found: Sensitivity, slopes: LocalSensitivity | None) -> int:
-    """Show and write which tolerances matter; returns the exit status."""
     parts, status = _count_failures(found.cases["error"], "failed")
     verdict = f"{len(found.cases)} points: {', '.join(parts) or 'all certified'}"
     report, table = found.summary(), found.table
@@ -449,7 +429,10 @@ def _finish_sensitivity(job: _Job, found: Sensitivity, slopes: LocalSensitivity 
         tables["slopes"] = records(slopes.table)
     alt = "Share of a metric's variance that each parameter brings, by itself and with others, as bars with intervals."
     written, draw = (table.reset_index(), dict[str, str]()), partial(plot_sensitivity, found, slopes)
-    return job.finish(verdict, status, report, tables, written, draw, ("Sensitivity", alt))
+    job.finish(verdict, status, report, tables, written, draw, ("Sensitivity", alt))
+    if journal is not None and status != ExitStatus.INTERRUPTED:
+        journal.delete()
+    return status
 
 
 def run_front(job: _Job) -> int:

@@ -24,10 +24,9 @@ from pneuopt.cli.shared import (
     stats_and_provenance,
     write_files,
 )
-from pneuopt.cli.simulate import loop_view
+from pneuopt.cli.simulate import loop_view, task_metrics
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.evaluation.dither import judge_dither
-from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.plants import expected_plants
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.rig import read_rig
@@ -45,7 +44,6 @@ from pneuopt.tuning.result import report_tuning
 from pneuopt.tuning.tune import TuningResult, certify, tune, tune_without_dither
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.console import Console
 
 
@@ -64,7 +62,7 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     was = None
     if result.status.converged and result.on_rig is None and interruption_status() is None:
         with suppress(ConvergenceError, InputError, KeyboardInterrupt):  # the loop as given may not be simulated
-            was = job.evaluate()
+            was = task_metrics(task, parameters)
     console = make_console()
     show_report(console, report_tuning(result, was=was, source=f"the gains of {tuning}"))
     dither, compared = Report(), dict[str, Any]()
@@ -123,19 +121,6 @@ class _Job:
             "accept": task.accept,
             "throw": False,
         }
-
-    def evaluate(self) -> "pd.DataFrame":
-        """The metrics with the gains as given."""
-        task, parameters = self.task, self.parameters
-        return evaluate(
-            task.loop,
-            task.references,
-            parameters,
-            scenarios=task.scenarios(parameters),
-            band=task.specification.band,
-            envelope=task.specification.envelope,
-            max_steps=task.max_steps,
-        )
 
     def place(self, result: TuningResult) -> Path | None:
         """Where a certified design is written; the best candidate beside it, which is no input; else nowhere."""

@@ -166,13 +166,7 @@ Naming Files), a header of C99 (7.1.2)."""
 
 
 def reserved_as(name: str) -> str | None:
-    """What a name is in one of the languages, in words; None for one that is free in all of them.
-
-    Examples
-    --------
-    >>> reserved_as("Integral"), reserved_as("INT_TO_REAL"), reserved_as("speed")
-    ('a function block of IEC 61131-3', 'a conversion of IEC 61131-3', None)
-    """
+    """What a name is in one of the languages, in words; None for one that is free in all of them."""
     plain = name.casefold()
     listed = (what for what, words in RESERVED.items() if plain in words)
     return next(listed, None) or next((what for what, kind in PATTERNS.items() if kind.fullmatch(plain)), None)
@@ -185,12 +179,6 @@ class Identifiers:
     ----------
     taken : iterable of str
         Names that are not to be given.
-
-    Examples
-    --------
-    >>> names = Identifiers(["v1"])
-    >>> names.claim("integral", "pid.integral"), names.claim("Kd"), names.claim("kd"), names.claim_next("v")
-    ('pid_integral', 'Kd', 'kd_2', 'v2')
     """
 
     def __init__(self, taken: Iterable[str] = ()) -> None:

@@ -122,11 +122,9 @@ class MakerBlock(Protocol):
 
     def settings(self, d: BlockNumbers) -> list[Setting]:
         """What is typed in; refuses gains that the block cannot have."""
-        ...
 
     def states(self, d: BlockNumbers) -> list[str]:
         """What the output is at rest, at a fault and while stopped."""
-        ...
 
     def sum_input(self, _d: BlockNumbers) -> str | None:
         """Where a signal in the command's unit is added before the limits; None: there is no such input."""

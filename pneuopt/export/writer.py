@@ -133,17 +133,7 @@ class Names(NamedTuple):
 
 
 def write_expressions(function: ca.Function, names: Names, syntax: Syntax) -> Written:
-    """Write an SX Function with dense results in a language that has a word for each of its operations.
-
-    Examples
-    --------
-    >>> from pneuopt.export.languages import PYTHON
-    >>> x, T = ca.SX.sym("x"), ca.SX.sym("T")
-    >>> f = ca.Function("f", [x, T], [2 / T * (x - 1)])
-    >>> found = write_expressions(f, Names([["x"], ["T"]], ["y"], parameters=frozenset({"T"})), PYTHON)
-    >>> found.coefficients, found.results
-    ([Assignment(name='k1', text='2.0 / T')], {'y': 'k1 * (x - 1.0)'})
-    """
+    """Write an SX Function with dense results in a language that has a word for each of its operations."""
     instructions = list(read_instructions(function))
     made = {i.target[0]: i for i in instructions if i.operation != ca.OP_OUTPUT}
     needed: set[int] = set()
@@ -362,11 +352,6 @@ def comment_text(text: str, longest: int = 200) -> str:
     r"""A text that cannot end a comment: one line of printable ASCII, without the marks of comments.
 
     `longest` [characters] is what counts of it: more of a text from a file would fill the header with words of another.
-
-    Examples
-    --------
-    >>> comment_text("a */ system(1); *) b \\\n c")
-    'a * / system(1); * ) b c'
     """
     plain = "".join(c if c.isprintable() and c.isascii() else " " for c in text[:longest])
     while _COMMENT_MARKS.search(plain):

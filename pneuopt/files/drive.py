@@ -68,9 +68,9 @@ def drive_keys(name: str) -> Mapping[str, Key]:
     return {"drive": table("the kind of drive", {"kind": KIND_KEY}, required=True), **tables}
 
 
-def default_parameters(kind: DriveKind, sections: Sections) -> ParameterSet:
-    """The parameters of a drive that a file's sections describe."""
-    return kind.build(DriveSections(sections, kind.sections, lambda *_: "")).system().parameters
+def usual_plant(kind: DriveKind, sections: Sections) -> System:
+    """The plant of a drive that a file's sections describe, with the usual parameters."""
+    return kind.build(DriveSections(sections, kind.sections, lambda *_: "")).system()
 
 
 class _DriveOptions(NamedTuple):
@@ -101,7 +101,7 @@ def _build_variants(kind: DriveKind) -> Iterator[_DriveOptions]:
             try:
                 options = base if option is None else {**base, option: value}
                 sections = {s: {k: v for (own, k), v in options.items() if own == s} for s, _ in options}
-                yield _DriveOptions(base, option, value, default_parameters(kind, sections))
+                yield _DriveOptions(base, option, value, usual_plant(kind, sections).parameters)
             except ModelError:  # options that exclude each other
                 continue
 

@@ -11,7 +11,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.moves import ExcitationRun
-from pneuopt.files.drive import FIT_SECTIONS, default_parameters, drive_keys
+from pneuopt.files.drive import FIT_SECTIONS, drive_keys, usual_plant
 from pneuopt.files.keys import Template, comment_lines, json_schema
 from pneuopt.files.loop import signal_units_of, tuning_keys
 from pneuopt.files.outputs import output_schema
@@ -22,7 +22,7 @@ from pneuopt.files.tuning import TUNED_SECTIONS
 from pneuopt.logs.columns import CHANNELS, plant_channels
 from pneuopt.logs.read_log import SIDECAR_KEYS
 from pneuopt.models.catalog import CATALOGUE_SOURCE
-from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
+from pneuopt.models.declaration import DriveKind, FirstFiles
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -63,9 +63,9 @@ def first_files(
     others = {sidecar_name(other) for other in _OTHER_FILES}
     require(sidecar_name(log) not in others, f"{log}: rename it; {sidecar_name(log)} is the name of another file")
     kind, first = DRIVE_KINDS[name], first_kinds()[name]
-    defaults = default_parameters(kind, first.options)
+    plant = usual_plant(kind, first.options)
+    defaults = plant.parameters
     values = defaults | defaults.with_values(first.values) | known.select(n for n in known if n in defaults)
-    plant = kind.build(DriveSections(first.options, kind.sections, lambda *_: "")).system()
     loop, output = ClosedLoop(plant, PID(sample_time)), plant.outputs[0]
     sensor = f'{output.name} = {{ lag = "0 s", noise = "0 {output.unit}", resolution = "0 {output.unit}" }}'
     rig = Template(_RIG_TITLE, RIG_KEYS, names={"sensors": sensor}, schema=_schema_path("rig"))
@@ -96,8 +96,7 @@ def unused_channels(name: str) -> frozenset[str]:
 
 
 def _first_plant(name: str) -> System:
-    kind, first = DRIVE_KINDS[name], first_kinds()[name]
-    return kind.build(DriveSections(first.options, kind.sections, lambda *_: "")).system()
+    return usual_plant(DRIVE_KINDS[name], first_kinds()[name].options)
 
 
 def sidecar_name(log: str) -> str:

@@ -61,17 +61,7 @@ NORMAL_VOLUME = "(ANR)"  # what a volume of air is followed by that counts at IS
 
 
 def bound_units(loop: ClosedLoop) -> dict[str, str]:
-    """The unit of each requirement's bound, by key; "1" of what is a number alone.
-
-    Examples
-    --------
-    >>> from pneuopt.control.pid import PID
-    >>> from pneuopt.models.drives import ForceDrive
-    >>> from pneuopt.models.friction import Viscous
-    >>> units = bound_units(ClosedLoop(ForceDrive(Viscous()).system(), PID()))
-    >>> units["peak_control"], units["ripple"], units["overshoot"]
-    ('N', 'm/s', '1')
-    """
+    """The unit of each requirement's bound, by key; "1" of what is a number alone."""
     command, measured = loop.command.unit, loop.feedback.unit.partition("(")[0]
     units = {key: kind.metric.unit_in(command, measured) for key, kind in REQUIREMENTS_BY_KEY.items()}
     return {key: unit.removesuffix(NORMAL_VOLUME) for key, unit in units.items()}
@@ -304,13 +294,7 @@ METHOD_SECTION = table(
 
 
 def read_method(entries: Mapping[str, Any], where: str) -> Method | None:
-    """Read a tuning method; None, so that the loop decides, of an empty section.
-
-    Examples
-    --------
-    >>> read_method({"kind": "racing", "members": 12, "margin": "2 %"}, "[method]").margin
-    0.02
-    """
+    """Read a tuning method; None, so that the loop decides, of an empty section."""
     if not entries:
         return None
     name = str(entries.get("kind"))
@@ -399,14 +383,7 @@ def _read_band(entry: Any, where: str, units: Mapping[str, str]) -> Band:
         raise UnitError(f'{error}, or as a fraction of the step, band = "2 %"') from None
 
 
-_ENVELOPE_ROW = Key(
-    "an instant, its lower and its upper bound",
-    Takes.LIST,
-    read=lambda row, where, _: _read_envelope_row(row, where),
-)
-
-
-def _read_envelope_row(row: Any, where: str) -> tuple[float, float, float]:
+def _read_envelope_row(row: Any, where: str, _: Mapping[str, str]) -> tuple[float, float, float]:
     proper = isinstance(row, list) and len(row) == 3
     require(proper, f'{where}: write instants with a lower and an upper bound, [["0 s", "-10 %", "110 %"], ...]')
     instant, low, up = (read_value(v, unit, where=where) for v, unit in zip(row, ("s", "1", "1"), strict=True))
@@ -419,7 +396,7 @@ _ENVELOPE = Key(
     Takes.LIST,
     example='[["0 s", "-10 %", "110 %"]]',
     required=True,
-    of=_ENVELOPE_ROW,
+    of=Key("an instant, its lower and its upper bound", Takes.LIST, read=_read_envelope_row),
     counts=(1, float("inf")),
 )
 _BAND_MEANING = 'half width of the band, a fraction of the step or as "0.1 mm"'
@@ -576,7 +553,6 @@ TuningSections = Mapping[str, Any]
 
 TUNABLE_SECTIONS = ("pid", PositionLoop.section, "dither", "feedforward", *COMPENSATORS, GainSchedule.section)
 """Sections whose values may be free."""
-LOOP_SECTIONS = tuple(LOOP_KEYS)
 
 _SHARED_PID_KEYS = ("b", "c", "Tt")
 _GAIN_CORRECTIONS: Mapping[Form, Mapping[str, str]] = {

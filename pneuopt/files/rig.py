@@ -1,17 +1,6 @@
 """rig.toml: the hardware around a loop that its model does not have, on which `tune` certifies a design once more.
 
-[actuator]                       # all sections are optional: without any, the plant sticks and slips, and no more
-hysteresis = "0.04 V"            # width of the loop, as catalogues give it
-dead_zone = "0.1 V"              # of an amplifier; a valve's overlap belongs into drive.toml
-
-[sensors.position]               # by the plant's output
-resolution = "10 um"
-noise = "5 um"
-lag = "1 ms"
-
-[encoder]                        # by which the controller gets a speed out of the measured position
-resolution = "10 um"
-filter = "5 ms"
+All sections are optional: without any, the plant sticks and slips, and no more.
 """
 
 from collections.abc import Mapping

@@ -50,13 +50,7 @@ class FileLocations:
         return str(self.path)
 
     def location(self, section: str, key: str = "") -> str:
-        r"""File and line of a section's head or of one of its keys: "drive.toml:14"; the file where it has no such.
-
-        Examples
-        --------
-        >>> FileLocations("drive.toml", '[valve]\nleak = 0.01  # tight').location("valve", "leak")
-        'drive.toml:2'
-        """
+        r"""File and line of a section's head or of one of its keys: "drive.toml:14"; the file where it has no such."""
         head: tuple[str, ...] = ()
         wanted = (section, key) if key else (section,)
         for number, line in enumerate(self.text.splitlines(), 1):
@@ -87,10 +81,9 @@ def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter,
     if section not in document:
         document[section] = tomlkit.table()
     entries: Any = document[section]
-    fields: dict[str, Any] = {
-        f: _format_value(getattr(found, f), found) for f in _PARAMETER_NUMBERS if _field_differs(f, found, given)
-    }
-    fields |= {f: getattr(found, f) for f in _PARAMETER_WORDS if _field_differs(f, found, given)}
+    named = {f: getattr(found, f) for f in (*_PARAMETER_NUMBERS, *_PARAMETER_WORDS)}
+    changed = {f: value for f, value in named.items() if value != getattr(given, f)}
+    fields = {f: _format_value(value, found) if f in _PARAMETER_NUMBERS else value for f, value in changed.items()}
     entry = entries.get(key)
     if isinstance(entry, InlineTable | Table):
         entry.update(fields)
@@ -125,10 +118,6 @@ def inline_table(entries: Mapping[Any, Any]) -> InlineTable:
 def _key_parts(dotted: str) -> tuple[str, ...]:
     """The parts of a dotted key, unquoted."""
     return tuple(part.strip().strip("\"'") for part in dotted.split("."))
-
-
-def _field_differs(field: str, found: Parameter, given: Parameter) -> bool:
-    return bool(getattr(found, field) != getattr(given, field))
 
 
 def _format_value(value: float, parameter: Parameter) -> str:

@@ -156,29 +156,24 @@ def _read_kinds(
     for kind, given in table.items():
         spot = f"{where}: [scenarios.{kind}]"
         require(isinstance(given, dict), f'{spot} must be a section, with "load.mass" = "30 %" in it')
-        yield _read_kind(kind, given, spot, parameters, new_count)
-
-
-def _read_kind(
-    kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet, new_count: int | None
-) -> Scenarios:
-    entries = dict(given)
-    draw = read_draw({key: entries.pop(key) for key in SCENARIO_KEYS[kind].keys if key in entries}, where)
-    seed = draw.seed if new_count is None else further(draw.seed, "validation", kind)
-    try:
-        if kind == "samples":
-            own = read_sample_spreads(entries, where, parameters)
-            return samples(parameters, own, new_count or draw.count, seed=seed, sampling=draw.sampling)
-        if kind == "corners":
-            box = read_corner_spreads(entries, where, parameters)
-            return corners(parameters, box) if new_count is None else samples(parameters, box, new_count, seed=seed)
-        spreads = read_spreads(entries, where, parameters)
-        pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
-        require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
-        shares = {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)}
-        return tolerances(parameters, shares, new_count, seed=seed)
-    except InputError as error:
-        raise error if where in str(error) else InputError(f"{where} {error}") from None
+        entries = dict(given)
+        draw = read_draw({key: entries.pop(key) for key in SCENARIO_KEYS[kind].keys if key in entries}, spot)
+        seed = draw.seed if new_count is None else further(draw.seed, "validation", kind)
+        try:
+            if kind == "samples":
+                own = read_sample_spreads(entries, spot, parameters)
+                yield samples(parameters, own, new_count or draw.count, seed=seed, sampling=draw.sampling)
+            elif kind == "corners":
+                box = read_corner_spreads(entries, spot, parameters)
+                yield corners(parameters, box) if new_count is None else samples(parameters, box, new_count, seed=seed)
+            else:
+                spreads = read_spreads(entries, spot, parameters)
+                pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
+                require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
+                shares = {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)}
+                yield tolerances(parameters, shares, new_count, seed=seed)
+        except InputError as error:
+            raise error if spot in str(error) else InputError(f"{spot} {error}") from None
 
 
 def read_references(entries: Any, loop: ClosedLoop, path: str | Path) -> tuple[Reference, ...]:
@@ -252,7 +247,8 @@ def _reference(entry: Mapping[str, Any], loop: ClosedLoop, file: Path, number: i
     if kind is _PATH:
         table = file.parent / known.pop("path")
         known = {"dwell": Move.dwell, **known}
-        return construct_at(lambda: read_path_of(loop.feedback.name, table, **known), f"{where} path")
+        channels = f"{loop.feedback.name}_reference", loop.feedback.name
+        return construct_at(lambda: _make_path(table, read_log(table).trajectory, channels, known), f"{where} path")
     if kind is _MOVE:
         each = known.pop("moves", None) or [{"distance": known.pop("move")}]
         return construct_at(lambda: _chain_moves(each, known), where)
@@ -300,11 +296,6 @@ def read_path(path: str | Path, *, channel: str | None = None, **settings: Any) 
     if channel is not None:
         check_names("channel", [channel], log.names, str(path))
     return _make_path(path, log, PATH_CHANNELS if channel is None else (channel,), settings)
-
-
-def read_path_of(measured: str, path: str | Path, **settings: Any) -> MotionPath:
-    """The path that a loop shall follow: the column of its measured signal's reference, or of the signal itself."""
-    return _make_path(path, read_log(path).trajectory, (f"{measured}_reference", measured), settings)
 
 
 def _make_path(path: str | Path, log: Trajectory, channels: Sequence[str], settings: Mapping[str, Any]) -> MotionPath:

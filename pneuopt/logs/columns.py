@@ -24,7 +24,7 @@ from pneuopt.logs.tolerances import (
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_names, require
-from pneuopt.quantities.keys import Key, Takes, read_entry, read_table
+from pneuopt.quantities.keys import Key, Takes, read_table
 from pneuopt.quantities.parameters import COMMAND_SUFFIX, Quantity
 from pneuopt.quantities.units import read_value, si_conversion
 
@@ -206,13 +206,10 @@ def _resolve_column(
     }
     unit_from, unit = next(((place, str(said)) for place, said in places.items() if said), ("", ""))
     require(bool(unit), f'{where}: no unit; write "{bare} [{channels[channel]}]", or unit = "..."', UnitError)
-    raw_centre = (
-        read_entry(COLUMN_KEYS["centre"], column["centre"], f"{where} centre", {"column": unit})
-        if "centre" in column
-        else COLUMN_KEYS["centre"].usual
-    )
+    counted = {"centre": COLUMN_KEYS["centre"]}
+    centre = read_table(counted, column, where, units={"column": unit}, partial=True)["centre"]
     factor, offset = _column_scaling(unit, column.get("scale"), channels[channel], where)
-    return ChannelColumn(name, factor, offset - factor * raw_centre, unit, unit_from, entry_from)
+    return ChannelColumn(name, factor, offset - factor * centre, unit, unit_from, entry_from)
 
 
 def _column_scaling(unit: str, scale: str | float | None, target: str, where: str) -> tuple[float, float]:
@@ -277,12 +274,10 @@ class Plant(Protocol):
     @property
     def inputs(self) -> tuple[Quantity, ...]:
         """Signals that drive it."""
-        ...
 
     @property
     def outputs(self) -> tuple[Quantity, ...]:
         """Signals that sensors show."""
-        ...
 
 
 def plant_channels(plant: Plant) -> dict[str, str]:
@@ -359,13 +354,7 @@ Ask = Callable[[Question], str]
 
 
 def guess_channels(names: Sequence[str], channels: Mapping[str, str]) -> dict[str, list[str]]:
-    """By channel the columns whose names may mean it, the surest first.
-
-    Examples
-    --------
-    >>> guess_channels(["t_ms", "U valve", "x [mm]", "x soll"], {"time": "s", "valve_voltage": "V", "position": "m"})
-    {'time': ['t_ms'], 'valve_voltage': ['U valve'], 'position': ['x [mm]']}
-    """
+    """By channel the columns whose names may mean it, the surest first."""
     found: dict[str, list[tuple[int, str]]] = {}
     for name in filter(None, names):
         channel, doubt = _guess_channel(name, channels)

@@ -1,8 +1,7 @@
 """Faults that a log shows without a model: units, signs, zero points, sampling, missing motion, a wrong mass.
 
 `examine` runs the checks of `CHECKS`, at the end of the file: each takes a log and what is known of its axis, and
-yields findings with the signals that show them. Behind it stand what the figures need, the motion of a log as closely
-as its noise allows, and the checks in their order.
+yields findings with the signals that show them.
 """
 
 import math
@@ -160,50 +159,31 @@ class LogFinding:
 
 
 def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFinding, ...]:
-    """Find faults of a log before any model is fitted to it; its noise, where given, separates motion from noise.
+    """Find what `CHECKS` see in a log before any model is fitted to it, faults first.
 
-    Faults come first: nothing moves; a channel is constant; position and speed disagree in sign or unit; the force, or
-    the pressures, brake the motion on balance, which no drive does; the piston runs against the valve's command, or to
-    and fro without one; it jumps, or rests at a stop that the model lacks; force and acceleration are those of another
-    mass than is stated; a pressure is a vacuum, or above the supply. Then notes: a constant force that is not stated;
-    jitter, a clipped sensor, a coarse resolution; of an axis that stands still most of the time, which share is motion.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pneuopt.quantities.trajectories import Trajectory
-    >>> t = np.arange(2000) * 1e-3
-    >>> swing = {"position": 0.1 * np.sin(6 * t), "force": 5.0 * np.cos(6 * t)}
-    >>> examine(Experiment(Trajectory(t, swing)))
-    ()
-    >>> finding = examine(Experiment(Trajectory(t, {**swing, "force": -swing["force"]})))[0]
-    >>> print(finding.check, finding.message.partition("(")[0], finding.message.partition(": ")[2], sep="; ")
-    work; the force brakes the motion on balance ; change the sign of 'force'
+    The log's noise, where given, separates motion from noise.
     """
+    from scipy.interpolate import CubicSpline
+
     log = experiment.trajectory
     moved = (n for n in (axis.position, axis.speed) if n in log and n not in experiment.noise)
     noise = {n: noise_level(log[n], log.t) for n in moved}  # which several checks need
     experiment = experiment.with_noise({n: level for n, level in noise.items() if level > 0})
-    # each channel at every instant, as recorders that give each its own rate do not write it
-    known = {n: np.isfinite(log[n]) for n in log}
-    lacking = [n for n, there in known.items() if 4 <= there.sum() < there.size]  # as a cubic spline needs
-    whole = replace(experiment, trajectory=log.with_columns({n: _spline(log.t, log[n], known[n]) for n in lacking}))
+    # each channel at every instant, as recorders that give each its own rate do not write it: by a cubic spline, but
+    # not across a hole
+    splines = dict[str, Array]()
+    for n, known in ((n, np.isfinite(log[n])) for n in log):
+        if 4 <= known.sum() < known.size:  # as a spline needs
+            at, steps = log.t[known], np.diff(log.t[known])
+            before = np.clip(np.searchsorted(at, log.t, side="right") - 1, 0, steps.size - 1)
+            splines[n] = np.asarray(CubicSpline(at, log[n][known], extrapolate=False)(log.t))
+            splines[n][steps[before] > MAX_STEPS_BETWEEN * float(np.median(steps))] = np.nan
+            splines[n][known] = log[n][known]
+    whole = replace(experiment, trajectory=log.with_columns(splines))
     logs = {name: experiment if name in SINGLE_SAMPLE_CHECKS else whole for name in CHECKS}
     named = ((name, finding) for name, check in CHECKS.items() for finding in check(logs[name], axis))
     found = [replace(finding, check=name, log=experiment.name) for name, finding in named]
     return tuple(sorted(found, key=lambda f: not f.fault))
-
-
-def _spline(t: Array, column: Array, known: Mask) -> Array:
-    """A column at every instant by a cubic spline through its samples, but not across a hole."""
-    from scipy.interpolate import CubicSpline
-
-    at, steps = t[known], np.diff(t[known])
-    out = np.asarray(CubicSpline(at, column[known], extrapolate=False)(t))
-    before = np.clip(np.searchsorted(at, t, side="right") - 1, 0, steps.size - 1)
-    out[steps[before] > MAX_STEPS_BETWEEN * float(np.median(steps))] = np.nan
-    out[known] = column[known]
-    return out
 
 
 def evidence(
@@ -221,7 +201,13 @@ def evidence(
     log = experiment.trajectory
     panels = [c if isinstance(c, Panel) else Panel(experiment.unit(c), {c: log[c]}) for c in channels if c]
     everywhere = np.ones(len(log), dtype=bool)
-    view = (float(log.t[0]), float(log.t[-1])) if at is None else view_about(log.t, at, motion)
+    view = float(log.t[0]), float(log.t[-1])
+    if at is not None:  # a few strokes of the motion about it; an eighth of the log without motion
+        duration, strokes = view[1] - view[0], 16
+        if motion is not None and np.isfinite(motion).any():
+            level = LARGE_SHARE * float(np.nanmax(np.abs(motion)))
+            strokes = 1 + int(np.count_nonzero(np.diff(np.sign(motion[np.abs(motion) > level]))))
+        view = _view_around(log.t, float(log.t[at]), float(log.t[at]), duration / strokes)
     return Evidence(log.t, tuple(panels), everywhere if where is None else where, view, label)
 
 
@@ -232,17 +218,6 @@ def is_opposed(a: Array, b: Array) -> Mask:
 
 def _is_large(a: Array) -> Mask:
     return np.asarray(np.abs(a) > LARGE_SHARE * np.nanmax(np.abs(a), initial=0.0))
-
-
-def view_about(t: Array, at: int, motion: Array | None = None) -> tuple[float, float]:
-    """Begin and end of a few strokes of the motion about a sample [s]; of an eighth of the log without motion."""
-    duration = float(t[-1] - t[0])
-    half = duration / 16
-    if motion is not None and np.isfinite(motion).any():
-        level = LARGE_SHARE * float(np.nanmax(np.abs(motion)))
-        side = np.sign(motion[np.abs(motion) > level])
-        half = duration / (1 + int(np.count_nonzero(np.diff(side))))
-    return _view_around(t, float(t[at]), float(t[at]), half)
 
 
 def _view_around(t: Array, begin: float, end: float, margin: float, least: int = 25) -> tuple[float, float]:
@@ -651,12 +626,6 @@ def lagged_correlation(a: Array, b: Array, lag: int) -> float:
     return float(a @ b) / power if power > 0 else 0.0
 
 
-def lagged_ratio(a: Array, b: Array, lag: int) -> float:
-    """The size of the second column over that of the first, by regression at a lag."""
-    a, b = shift(a, b, lag)
-    return float(a @ b) / float(a @ a)
-
-
 def check_pressures(experiment: Experiment, _: StatedAxis) -> Iterator[LogFinding]:
     """Find wrong zero points: gauge pressures taken for absolute ones, or the reverse."""
     log = experiment.trajectory
@@ -737,7 +706,8 @@ def check_position_speed(experiment: Experiment, axis: StatedAxis) -> Iterator[L
         shown = _speeds(experiment, axis, slope, is_opposed(slope, means[0]), i)
         yield LogFinding(axis.speed, message, True, evidence=shown)
     elif found[best] > MIN_SPEED_CORRELATION:
-        ratios = [lagged_ratio(slope, mean, best) for mean in means]
+        pairs = [shift(slope, mean, best) for mean in means]
+        ratios = [float(a @ b) / float(a @ a) for a, b in pairs]  # of their sizes, by regression
         # trapezoids and parabolas through the speed err in opposite directions where its samples are far apart
         if max(ratios) < SPEED_SLOPE_RATIOS[0] or min(ratios) > SPEED_SLOPE_RATIOS[1]:
             message = f"{axis.speed} is {ratios[0]:.3g} times the slope of the {axis.position}: check both units"
@@ -758,29 +728,24 @@ def check_work_sign(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
     log, motion = experiment.trajectory, motion_speed(experiment, axis)
     if motion is None:
         return
-    drives = {axis.push: (f"the {axis.push} brakes", f"'{axis.push}'")}
+    drives = {axis.push: (f"the {axis.push} brakes", f"'{axis.push}'")} if axis.push in log else {}
     if "pressure_a" in log and "pressure_b" in log:
         drives["pressures"] = ("the pressures brake", "the position, or exchange pressure_a and pressure_b")
     for name, (message, remedy) in drives.items():
-        if name == axis.push and name not in log:
-            continue
         if name == axis.push:
-            pushes = [log[name]]
+            pushes, unit, shown = [log[name]], experiment.unit(name), Panel(experiment.unit(name), {name: log[name]})
         else:
+            unit, shown = "Pa", Panel("Pa(a)", {n: log[n] for n in ("pressure_a", "pressure_b")})
             pushes = [log["pressure_a"] - ratio * log["pressure_b"] for ratio in ROD_AREA_RATIOS]
             pushes = [push - np.nanmean(push) for push in pushes]
         shares = np.stack([_work_shares(log.t, np.stack(pushes), motion, lag) for lag in sensor_lags(log.t)], axis=1)
         share = max(shares.ravel().tolist())
         if share < MIN_WORK_SHARE:
             at = int(np.nanargmin(pushes[-1] * motion))
-            unit = experiment.unit(axis.push) if name == axis.push else "Pa"
             fast = f"{motion[at]:.3g} {experiment.unit(axis.speed)}"
             seen = f"most at {log.t[at]:.4g} s, where {pushes[-1][at]:.3g} {unit} pushes and the speed is {fast}"
             why = f"{message} the motion on balance ({100 * share:.0f} % of its power, {seen}), which no drive does"
             speed = speed_panel(experiment, axis, motion)
-            shown = Panel(experiment.unit(axis.push), {axis.push: pushes[0]})
-            if name != axis.push:
-                shown = Panel("Pa(a)", {n: log[n] for n in ("pressure_a", "pressure_b")})
             brakes = is_opposed(pushes[-1], motion)
             found = evidence(experiment, shown, speed, where=brakes, at=at, motion=motion, label="it brakes")
             yield LogFinding(name, f"{why}: change the sign of {remedy}", True, evidence=found)

@@ -9,7 +9,6 @@ import numpy as np
 
 from pneuopt.logs.columns import CHANNELS, ChannelColumn, Plant, plant_channels, read_channels
 from pneuopt.logs.table import LogTable, array_table, check_columns
-from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.parameters import Intersample, as_tuple, check_argument, usual_intersample
 from pneuopt.quantities.trajectories import Trajectory
@@ -319,12 +318,7 @@ def differentiate(experiment: Experiment, *, window: float, position: str = "pos
     require("speed" not in old, "the log has a speed already; select the other channels first")
     step = _median_step(old)
     require(window >= 2 * step, f"a window of {window:g} s holds fewer than 3 samples; take {4 * step:g} s or more")
-    speed = _local_slope(old.t, old[position], window / 2)
-    return replace(experiment, trajectory=old.with_columns({"speed": speed}))
-
-
-def _local_slope(t: Array, x: Array, reach: float) -> Array:
-    """Slope at each sample of the least-squares parabola through the samples no farther than `reach`."""
+    t, x, reach = old.t, old[position], window / 2  # of the samples no farther than this from each
     known, n = np.isfinite(x), t.size
     first, last = np.searchsorted(t, t - reach * (1 + 1e-9)), np.searchsorted(t, t + reach * (1 + 1e-9), side="right")
     moments, loads = np.zeros((5, n)), np.zeros((3, n))
@@ -342,7 +336,7 @@ def _local_slope(t: Array, x: Array, reach: float) -> Array:
     normal = moments[np.add.outer(np.arange(3), np.arange(3))].transpose(2, 0, 1)[enough]
     slope = np.full(n, np.nan)
     slope[enough] = np.linalg.solve(normal, loads.T[enough][..., None])[:, 1, 0] / reach
-    return slope
+    return replace(experiment, trajectory=old.with_columns({"speed": slope}))
 
 
 def _median_step(trajectory: Trajectory) -> float:

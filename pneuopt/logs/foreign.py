@@ -497,7 +497,7 @@ def read_xlsx(path: Path, raw: bytes) -> LogTable:
     rows = [*sheets[title][layout.start :]]
     first = shown[title][layout.start] if layout.start < len(shown[title]) else []
     stamps = frozenset(name for name, cell in zip(layout.names, first, strict=False) if name and is_stamp(cell))
-    read = partial(_xlsx_columns, _Sheet(path, layout.names, rows, layout.start + 1, stamps))
+    read = _Sheet(path, layout.names, rows, layout.start + 1, stamps).columns
     others = (f"sheet {title!r} is read, of {len(sheets)}",) if len(sheets) > 1 else ()
     return LogTable(path, layout.names, layout.start + 1, read, layout.units, stamps, layout.remarks + others)
 
@@ -510,6 +510,44 @@ class _Sheet(NamedTuple):
     rows: Sequence[Sequence[Any]]
     first_row: int
     stamps: frozenset[str]
+
+    def columns(self, names: Sequence[str]) -> dict[str, Array]:
+        """Read the named columns (n,); stamps as seconds from the first."""
+        width = len(self.names)
+        for i, row in enumerate(self.rows, self.first_row):
+            require(
+                len(row) <= width, f"{self.path}: row {i} has {len(row)} cells, the header {width}; mend it", LogError
+            )
+        columns = {}
+        for name in names:
+            i = self.names.index(name)
+            cells = [row[i] if i < len(row) else None for row in self.rows]
+            if name in self.stamps and not isinstance(cells[0], _Date):
+                columns[name] = seconds_from_first([_show(cell) for cell in cells], self.path, name, self.first_row)
+                continue
+            numbers = np.full(len(cells), np.nan)
+            for k, cell in enumerate(cells):
+                if cell is None or (isinstance(cell, str) and cell.strip() in MISSING):
+                    continue
+                is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
+                place = f"{self.path}: row {k + self.first_row}, column {name!r}"
+                require(is_number, f"{place}: {str(cell)[:40]!r} is not a number; {EMPTY_CELL}", LogError)
+                numbers[k] = float(cell) if not abs(cell) > MAX_MAGNITUDE else np.inf  # which is refused
+            columns[name] = numbers
+            if name not in self.stamps:
+                continue
+            # days become seconds from the first; a time of day leaps back at midnight; a double holds a date to 0.6 us
+            wrong = np.flatnonzero(np.abs(numbers) > _MAX_DAYS)
+            if wrong.size:
+                place = f"{self.path}: row {wrong[0] + self.first_row}, column {name!r}"
+                remedy = "write a date with its time, or a number"
+                raise LogError(f"{place}: {numbers[wrong[0]]:.6g} is no date of Excel; {remedy}")
+            known = numbers[np.isfinite(numbers)]
+            days = numbers
+            if known.max(initial=0.0) <= 1:
+                days = numbers + np.cumsum(np.diff(numbers, prepend=numbers[:1]) < -0.5)
+            columns[name] = np.asarray(np.round((days - (known[0] if known.size else 0.0)) * 86400, 6))
+        return columns
 
 
 def _read_cells(path: Path, sheet: Any, date_styles: Set[int]) -> list[list[Any]]:
@@ -538,42 +576,6 @@ def _show(cell: Any) -> str:
     if isinstance(cell, _Date):
         return _SHOWN_DATE
     return "" if cell is None else str(cell).strip()
-
-
-def _xlsx_columns(sheet: _Sheet, names: Sequence[str]) -> dict[str, Array]:
-    width = len(sheet.names)
-    for i, row in enumerate(sheet.rows, sheet.first_row):
-        require(len(row) <= width, f"{sheet.path}: row {i} has {len(row)} cells, the header {width}; mend it", LogError)
-    columns = {}
-    for name in names:
-        i = sheet.names.index(name)
-        cells = [row[i] if i < len(row) else None for row in sheet.rows]
-        if name in sheet.stamps and not isinstance(cells[0], _Date):
-            columns[name] = seconds_from_first([_show(cell) for cell in cells], sheet.path, name, sheet.first_row)
-            continue
-        numbers = np.full(len(cells), np.nan)
-        for k, cell in enumerate(cells):
-            if cell is None or (isinstance(cell, str) and cell.strip() in MISSING):
-                continue
-            is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
-            place = f"{sheet.path}: row {k + sheet.first_row}, column {name!r}"
-            require(is_number, f"{place}: {str(cell)[:40]!r} is not a number; {EMPTY_CELL}", LogError)
-            numbers[k] = float(cell) if not abs(cell) > MAX_MAGNITUDE else np.inf  # which is refused
-        columns[name] = numbers
-        if name not in sheet.stamps:
-            continue
-        # days become seconds from the first; a time of day leaps back at midnight, and a double holds a date to 0.6 us
-        wrong = np.flatnonzero(np.abs(numbers) > _MAX_DAYS)
-        if wrong.size:
-            place = f"{sheet.path}: row {wrong[0] + sheet.first_row}, column {name!r}"
-            remedy = "write a date with its time, or a number"
-            raise LogError(f"{place}: {numbers[wrong[0]]:.6g} is no date of Excel; {remedy}")
-        known = numbers[np.isfinite(numbers)]
-        days = numbers
-        if known.max(initial=0.0) <= 1:
-            days = numbers + np.cumsum(np.diff(numbers, prepend=numbers[:1]) < -0.5)
-        columns[name] = np.asarray(np.round((days - (known[0] if known.size else 0.0)) * 86400, 6))
-    return columns
 
 
 READERS: Mapping[str, Callable[[Path, bytes], LogTable]] = {

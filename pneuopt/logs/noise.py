@@ -41,14 +41,7 @@ class NoiseEstimate(NamedTuple):
 
 
 def noise_level(column: ArrayLike, t: ArrayLike | None = None) -> float:
-    """The standard deviation of a channel's white noise or of its rounding, the larger one; see `estimate_noise`.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> round(noise_level(np.sin(np.linspace(0, 6, 4000)) + 0.01 * rng.standard_normal(4000)), 3)
-    0.01
-    """
+    """The standard deviation of a channel's white noise or of its rounding, the larger one; see `estimate_noise`."""
     return estimate_noise(column, t).level
 
 
@@ -86,14 +79,7 @@ def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstima
 
 
 def find_resolution(values: ArrayLike) -> float:
-    """The step of the lattice on which all values (n,) lie, as an encoder's do; 0 where there is none.
-
-    Examples
-    --------
-    >>> x = np.sqrt(np.arange(50.0))
-    >>> round(find_resolution(np.round(x / 0.02) * 0.02), 9), find_resolution(x)
-    (0.02, 0.0)
-    """
+    """The step of the lattice on which all values (n,) lie, as an encoder's do; 0 where there is none."""
     values = np.asarray(values, dtype=float)
     smallest = ROUNDING * float(np.max(np.abs(values), initial=0.0))
     # second differences are on the same lattice, and small however fast the motion is; of a perfect ramp there are none

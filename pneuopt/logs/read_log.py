@@ -123,24 +123,9 @@ def assemble_log(
 
 
 def find_date(path: str | Path) -> datetime:
-    """When a log was taken.
+    """When a log was taken: by its sidecar, by its first time stamp with a date, or by its name, in this order.
 
-    Parameters
-    ----------
-    path : str or Path
-        The `date` of its sidecar counts, "run_01.toml" of "run_01.tdms"; else its first time stamp with a date, ISO
-        8601, where it is a text; else the date in its name, "run_2026-03-12.csv" or "20260312_1030.csv". When the file
-        was changed is not asked: that is often the time of a copy.
-
-    Raises
-    ------
-    LogError
-        If none of them says it, or the sidecar's is no date.
-
-    Examples
-    --------
-    >>> find_date("run_2026-03-12.csv"), find_date("20260312_1030.csv")
-    (datetime.datetime(2026, 3, 12, 0, 0), datetime.datetime(2026, 3, 12, 10, 30))
+    When the file was changed is not asked: that is often the time of a copy.
     """
     path = Path(path)
     found = _date_in_sidecar(path.with_suffix(".toml")) or _stamp(path) or _date_in_name(path.stem)

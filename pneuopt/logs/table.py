@@ -1,8 +1,4 @@
-"""A log as its file has it: named columns of numbers that have no meaning yet, within a budget of bytes and cells.
-
-What readers share follows `LogTable`: the budget, columns that a file holds as arrays, and how to run the libraries
-that read some formats.
-"""
+"""A log as its file has it: named columns of numbers that have no meaning yet, within a budget of bytes and cells."""
 
 import importlib
 import logging
@@ -72,13 +68,7 @@ def check_cells(path: Path | str, rows: int, columns: int) -> None:
 
 
 def list_rows(rows: Sequence[int], most: int = 8) -> str:
-    """List rows in at most so many runs, as in "row 14", or "rows 14 to 20, 31, ... (57 in all)".
-
-    Examples
-    --------
-    >>> list_rows([14]), list_rows([14, 15, 16, 31])
-    ('row 14', 'rows 14 to 16, 31 (4 in all)')
-    """
+    """List rows in at most so many runs, as in "row 14", or "rows 14 to 20, 31, ... (57 in all)"."""
     if len(rows) == 1:
         return f"row {rows[0]}"
     ends = np.flatnonzero(np.diff(rows) > 1).tolist()

@@ -1,7 +1,4 @@
-"""Reader of logs as text: columns apart by comma, semicolon, tab or white space, with decimal point or comma.
-
-First where a log's samples begin, then cells of text as numbers, and time stamps as loggers write them.
-"""
+"""Reader of logs as text: columns apart by comma, semicolon, tab or white space, with decimal point or comma."""
 
 import csv
 import io
@@ -101,10 +98,8 @@ class Layout(NamedTuple):
 def find_layout(rows: Sequence[Sequence[str]], where: str) -> Layout:
     """Find the names, the units and the first sample in the cells of a file's rows, at least of its first ones.
 
-    The samples begin with the first row of the usual width whose first cell is a number or a time stamp. The nearest
-    row above it without a number names the columns. Between them may stand a row of units, empty rows and comments.
-    Where another row stands there, or none begins with a number, the samples begin below the first row that may be
-    names: no row that may be a sample is skipped.
+    The samples begin with the first row of the usual width whose first cell is a number or a time stamp, below names,
+    units, empty rows and comments; else below the first row that may be names: none that may be a sample is skipped.
     """
     width = _usual_width(rows)
     first = next((i for i, row in enumerate(rows) if _is_sample(row, width)), None)
@@ -136,26 +131,14 @@ def has_table(rows: Sequence[Sequence[str]]) -> bool:
 
 
 def is_unit_row(row: Sequence[str], width: int) -> bool:
-    """Whether at least half of the cells, which are as many as the names, are units, in brackets or without.
-
-    Examples
-    --------
-    >>> is_unit_row(["(s)", "Volt", "", "-"], 4), is_unit_row(["time", "valve"], 2)
-    (True, False)
-    """
+    """Whether at least half of the cells, which are as many as the names, are units, in brackets or without."""
     cells = [cell for cell in row if cell]
     known = sum(plain_unit(cell) is not None for cell in cells)
     return abs(len(row) - width) < 2 and known > 0 and 2 * known >= len(cells)
 
 
 def plain_unit(cell: str) -> str | None:
-    """The unit that a cell holds: "[mm]" is "mm", "Seconds" is "second"; None where it is none.
-
-    Examples
-    --------
-    >>> plain_unit("[mm]"), plain_unit("Seconds"), plain_unit("valve")
-    ('mm', 'second', None)
-    """
+    """The unit that a cell holds: "[mm]" is "mm", "Seconds" is "second"; None where it is none."""
     match = _BRACKETS.fullmatch(cell)
     bare = (match[1] or match[2] or "") if match else cell
     word = bare.casefold().rstrip("s.")
@@ -264,19 +247,16 @@ class TextBlock:
         """Read the named columns (n,); time stamps as seconds from the first."""
         check_cells(self.path, len(self.lines), len(names))
         even = _equal_rows(self)
-        found = {name: even.stamp_column(name) for name in names if name in self.stamps}
+        found = dict[str, Array]()
+        for name in (name for name in names if name in self.stamps):
+            cells = [_row_cells(even, k)[self.names.index(name)] for k in range(len(self.lines))]
+            found[name] = seconds_from_first(cells, self.path, name, self.first_row)
         used = [self.names.index(name) for name in names if name not in found]
         parsed = (_parse_with_decimal(even, used, decimal) for decimal in ".,") if used else iter([{}])
         numbers = next((columns for columns in parsed if columns is not None), None)
         if numbers is None:
             raise _number_error(even, used)
         return {name: found[name] if name in found else numbers[self.names.index(name)] for name in names}
-
-    def stamp_column(self, name: str) -> Array:
-        """Seconds from the first stamp."""
-        i = self.names.index(name)
-        cells = [_row_cells(self, k)[i] for k in range(len(self.lines))]
-        return seconds_from_first(cells, self.path, name, self.first_row)
 
 
 def mend_cells(block: TextBlock, used: Sequence[str]) -> tuple[TextBlock, dict[str, list[int]]]:
@@ -303,13 +283,7 @@ def mend_cells(block: TextBlock, used: Sequence[str]) -> tuple[TextBlock, dict[s
 
 
 def split_cells(line: str, delimiter: str, where: str = "") -> list[str]:
-    """The cells of one line, without quotes and white space around them.
-
-    Examples
-    --------
-    >>> split_cells('0,1; "a;b" ;3" pipe', ";")
-    ['0,1', 'a;b', '3" pipe']
-    """
+    """The cells of one line, without quotes and white space around them."""
     if delimiter == " ":
         return [match[0] for match in _WORD.finditer(line)] or [""]
     if '"' not in line:
@@ -408,13 +382,7 @@ _EXAMPLE = "2026-03-12T10:00:00.000"
 
 
 def is_stamp(cell: str) -> bool:
-    """Whether a cell is a time of day, with its date or without.
-
-    Examples
-    --------
-    >>> is_stamp("2026-03-12T10:00:00.25Z"), is_stamp("10:00:00,5"), is_stamp("12.5")
-    (True, True, False)
-    """
+    """Whether a cell is a time of day, with its date or without."""
     return _STAMP.fullmatch(cell) is not None
 
 
@@ -422,11 +390,6 @@ def seconds_from_first(cells: Sequence[str], path: Path | str, name: str, first_
     """Read a column of stamps as seconds from the first (n,), exact to 1 ns; NaN where one is empty.
 
     Without dates, a leap back by more than half a day is midnight.
-
-    Examples
-    --------
-    >>> seconds_from_first(["23:59:59.5", "00:00:00.25"], "run.csv", "time", 2).tolist()
-    [0.0, 0.75]
     """
     matches = [_STAMP.fullmatch(cell) for cell in cells]
     places = [f"{path}: row {first_row + k}, column {name!r}" for k in range(len(cells))]

@@ -54,23 +54,7 @@ VALVES: Mapping[str, str] = {"350": "s25", "700": "s32", "1400": "s40"}
 
 
 def catalogue_values(size: str, cylinder: str | None = None, valve: str | None = None) -> ParameterSet:
-    """Parameters of a size with the cylinder or the valve of another.
-
-    Parameters
-    ----------
-    size, cylinder, valve : str
-        Of `SIZES`, `CYLINDERS`, `VALVES`.
-
-    Returns
-    -------
-    ParameterSet
-        Those of the catalogue, each with its source.
-
-    Raises
-    ------
-    UnknownNameError
-        If the catalogue has no such part.
-    """
+    """Parameters, each with its source, of one of `SIZES` with a cylinder of `CYLINDERS` or a valve of `VALVES`."""
     values = ParameterSet()
     for what, name, known, sections in (
         ("size", size, {n: n for n in SIZES}, ""),

@@ -23,7 +23,6 @@ class Drive(Protocol):
 
     def system(self) -> System:
         """Equations of the drive, with every parameter's default."""
-        ...
 
 
 @dataclass(frozen=True)

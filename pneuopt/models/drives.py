@@ -57,7 +57,7 @@ class ForceDrive:
 
     def system(self) -> System:
         """Build the equations: states position, speed and those of friction; outputs position, speed."""
-        inner = tuple(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
+        inner = tuple(replace(q, name=f"friction.{q.name}") for q in self.friction.states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             v, y = x["speed"], x["position"]
@@ -113,20 +113,17 @@ class MotionDrive:
         )
         bias = Parameter(0.0, "1", lower=-0.5, upper=0.5, meaning="error of the area, a fraction of it")
         rig = {"rig.area": area, "rig.area_bias": bias} if self.chamber else {}
-        offset = ParameterSet(
-            {
-                **rig,
-                "rig.force_offset": Parameter(
-                    0.0, "N", lower=-1e4, upper=1e4, meaning="reading of the force sensor without force"
-                ),
-            }
-        )
+        offset = Parameter(0.0, "N", lower=-1e4, upper=1e4, meaning="reading of the force sensor without force")
         ambient = AMBIENT_PARAMETERS if self.chamber else _ambient_parameters(self.friction)
-        return offset | self.friction.parameters.with_prefix("friction") | ambient
+        return (
+            ParameterSet({**rig, "rig.force_offset": offset})
+            | self.friction.parameters.with_prefix("friction")
+            | ambient
+        )
 
     def system(self) -> System:
         """Build the equations: the states are those of friction; output force."""
-        inner = tuple(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
+        inner = tuple(replace(q, name=f"friction.{q.name}") for q in self.friction.states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             force = self.friction.force(
@@ -196,11 +193,6 @@ def _ambient_parameters(friction: FrictionModel) -> ParameterSet:
 def _pressure_inputs(friction: FrictionModel) -> tuple[Quantity, ...]:
     """Absolute pressures that pressure-dependent friction needs as inputs."""
     return tuple(Quantity(q.name, "Pa(a)", nominal=5e5) for q in friction.inputs if q.unit == "Pa(g)")
-
-
-def rename_quantity(quantity: Quantity, name: str) -> Quantity:
-    """Copy of a signal with another name."""
-    return Quantity(name, quantity.unit, quantity.nominal, quantity.lower, quantity.upper)
 
 
 # Radius [m] on which a friction law's defaults, bounds and slow speeds, made for sliding, are those of a turning shaft:
@@ -315,13 +307,7 @@ class _RotaryStarts:
 
 
 def _turning_unit(unit: str) -> tuple[str, float]:
-    """Unit of a sliding friction's parameter on a shaft, and the factor on its values.
-
-    Examples
-    --------
-    >>> _turning_unit("N*s/m"), _turning_unit("m/s")
-    (('N*m*s/rad', 0.0001), ('rad/s', 100.0))
-    """
+    """Unit of a sliding friction's parameter on a shaft, and the factor on its values."""
     over, slash, under = (part.split("*") for part in unit.partition("/"))
     forces, lengths = over.count("N") - under.count("N"), over.count("m") - under.count("m")
     words = {"N": "N*m", "m": "rad"}
@@ -352,16 +338,7 @@ ROTARY_KIND = DriveKind(
 
 
 def with_rest(system: System, push: Quantity, axis: Axis) -> System:
-    """The system with its axis and a `rest_hook`: the push (an input) that balances friction and load, at a speed too.
-
-    Examples
-    --------
-    >>> from pneuopt.models.drives import ForceDrive
-    >>> from pneuopt.models.friction import Viscous
-    >>> drive = ForceDrive(Viscous()).system()
-    >>> drive.rest_hook(drive.parameters.with_values({"friction.viscous": 80.0}), {"speed": 0.1}).inputs
-    {'force': 8.0}
-    """
+    """The system with its axis and a `rest_hook`: the push that balances friction and load, at a speed too."""
     return replace(system, axis=axis, rest_hook=_PushedBodyRest(system, push, axis))
 
 

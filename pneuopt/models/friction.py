@@ -3,11 +3,9 @@
 Signs: the force opposes positive speed when positive. Every map is smooth; `smoothing` is the speed over which the
 Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre holds it.
 
-First stand the declarations that a law makes (`FrictionStart`: its start from logs, see `starts`) and what a log must
-show for its parameters; then `FrictionModel`, the laws, the wrappers, and the formulas that they share. `Karnopp` is
-dry friction for simulations: `simulate` switches its "friction.direction" and locates each break-away and standstill;
-a solver that leaves the direction at zero simulates no dry friction at all. At the end stands the registry of the laws,
-a row each, for files, model selection (`friction_ladder`) and the table test, with the keys of section [friction].
+`Karnopp` is dry friction for simulations: `simulate` switches its "friction.direction" and locates each break-away and
+standstill; a solver that leaves the direction at zero simulates no dry friction at all. The registry of the laws, a row
+each, stands at the end.
 """
 
 import math
@@ -26,6 +24,7 @@ from pneuopt.models.tolerances import (
     BRISTLE_STIFFNESS_RANGE,
     MIN_COULOMB_SHARE,
     MIN_DIRECTION_SHARE,
+    MIN_FIT_SAMPLES,
     MIN_INERTIA_SHARE,
     MIN_REVERSALS,
     MIN_SPEED_RATIO,
@@ -101,7 +100,7 @@ def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
     if seen.fast < MIN_SPEED_RATIO * seen.slow:
         speeds = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}"
         return Lack(f"{speeds}, where friction is one level", f"log {run}")
-    if below < MIN_START_SAMPLES:
+    if below < MIN_FIT_SAMPLES:
         message = f"only {below} samples are slower than the Stribeck velocity, {stribeck:.2g} {unit}"
         return Lack(message, f"log {run}")
     return None
@@ -252,31 +251,25 @@ class FrictionModel(Protocol):
     @property
     def states(self) -> tuple[Quantity, ...]:
         """Internal states; none for a static map."""
-        ...
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
         """Signals that friction depends on beside the speed: gauge pressures [Pa(g)], the driving force [N]."""
-        ...
 
     @property
     def parameters(self) -> ParameterSet:
         """Defaults, with units and bounds."""
-        ...
 
     @property
     def identification_hints(self) -> IdentificationHints:
         """Motion that a log must show for each parameter to be identifiable, by the law's parameter names."""
-        ...
 
     @property
     def start(self) -> FrictionStart:
         """How an identification of its parameters starts from logs."""
-        ...
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """Force at speed v [m/s] with internal states z, inputs u and parameters p."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -709,17 +702,13 @@ class Karnopp:
         If the base has internal states (LuGre has no standstill to locate) or no Coulomb level.
     """
 
+    states: ClassVar[tuple[Quantity, ...]] = ()
     base: FrictionModel
 
     def __post_init__(self) -> None:
         suited = not self.base.states and "smoothing" in self.base.parameters
         message = f"Karnopp needs a static map with a Coulomb level, Coulomb() or Stribeck(); {self.base} is not one"
         require(suited, message, ModelError)
-
-    @property
-    def states(self) -> tuple[Quantity, ...]:
-        """No states."""
-        return ()
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:

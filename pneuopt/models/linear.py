@@ -28,7 +28,7 @@ from pneuopt.models.tolerances import (
     MAX_REFINEMENT_SAMPLES,
     MAX_STARTS,
     MIN_DEAD_TIME,
-    MIN_START_SAMPLES,
+    MIN_FIT_SAMPLES,
     USUAL_PADE_ORDER,
 )
 from pneuopt.quantities.arrays import Array
@@ -72,11 +72,10 @@ class FirstOrder:
         def dynamics(u: ca.SX, x: Symbols, p: Symbols) -> dict[str, ca.SX]:
             return {y: (p["plant.gain"] * u - x[y]) / p["plant.time_constant"]}
 
-        shaping = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True, meaning="time constant")}
+        constant = Parameter(0.1, "s", 1e-5, 1e4, log=True, meaning="time constant")
         shape = ResponseShape(("plant.time_constant",), _first_order_polynomials)
-        return _assemble_plant(
-            self, (self.output,), _gain_parameter(self.input, self.output, ""), ParameterSet(shaping), dynamics, shape
-        )
+        shaping = ParameterSet({"plant.time_constant": constant})
+        return _assemble_plant(self, (self.output,), shaping, dynamics, shape)
 
 
 @dataclass(frozen=True)
@@ -135,23 +134,18 @@ class SecondOrder:
             rates[y] -= gain * w / (2 * zeta) * force.value
             return rates | {f"friction.{n}": rate for n, rate in force.rates.items()}
 
-        shaping = ParameterSet(
-            {
-                "plant.natural_frequency": Parameter(
-                    10.0, "rad/s", 1e-3, 1e5, log=True, meaning="natural frequency without damping"
-                ),
-                "plant.damping": Parameter(0.7, "1", 1e-3, 1e3, log=True, meaning="damping ratio"),
-            }
-        )
+        frequency = Parameter(10.0, "rad/s", 1e-3, 1e5, log=True, meaning="natural frequency without damping")
+        damping = Parameter(0.7, "1", 1e-3, 1e3, log=True, meaning="damping ratio")
+        shaping = ParameterSet({"plant.natural_frequency": frequency, "plant.damping": damping})
         if friction is not None:
-            shaping = shaping | _in_input_unit(friction.parameters, self.input).with_prefix("friction")
+            shaping |= _in_input_unit(friction.parameters, self.input).with_prefix("friction")
         inner = friction.states if friction is not None else ()
         drive = Quantity("drive", _quotient_unit(self.output, "s"), 10 * self.output.nominal)
         states = (self.output, drive, *(replace(s, name=f"friction.{s.name}") for s in inner))
         shape = ResponseShape(
             tuple(shaping)[:2], _second_order_polynomials, None if friction is None else _friction_polynomials
         )
-        plant = _assemble_plant(self, states, _gain_parameter(self.input, self.output, ""), shaping, dynamics, shape)
+        plant = _assemble_plant(self, states, shaping, dynamics, shape)
         if friction is None:
             return plant
         return replace(plant, identification_hints=friction.identification_hints.with_prefix("friction"))
@@ -187,9 +181,7 @@ class Integrator:
             return {y: p["plant.gain"] * u}
 
         shape = ResponseShape((), _integrator_polynomials)
-        return _assemble_plant(
-            self, (self.output,), _gain_parameter(self.input, self.output, "*s"), ParameterSet(), dynamics, shape
-        )
+        return _assemble_plant(self, (self.output,), ParameterSet(), dynamics, shape, per="*s")
 
 
 Plant = FirstOrder | SecondOrder | Integrator
@@ -277,28 +269,19 @@ class ResponseShape:
 def _assemble_plant(
     plant: Plant,
     states: tuple[Quantity, ...],
-    gain: Parameter,
     shaping: ParameterSet,
     dynamics: Dynamics,
     shape: ResponseShape,
+    per: str = "",
 ) -> System:
-    """Assemble a plant from its dynamics, its gain and its dead time."""
-    order, source = plant.pade_order, plant.input
-    line = delay_line(source, order)
+    """Assemble a plant from its dynamics, its gain, whose unit is also per `per`, and its dead time."""
+    order, source, unit = plant.pade_order, plant.input, difference_unit(plant.input.unit)
+    line, gain_unit = delay_line(source, order), _quotient_unit(plant.output, f"({unit}{per})" if per else unit)
+    gain = Parameter(1.0, gain_unit, meaning="steady output, or of an integrator its rate, per input")
     parameters = ParameterSet({"plant.gain": gain}) | shaping
     if order:
-        parameters = parameters | ParameterSet(
-            {
-                "plant.dead_time": Parameter(
-                    0.01,
-                    "s",
-                    1e-3,
-                    10.0,
-                    log=True,
-                    meaning="delay from the input to its effect; none where it is left out",
-                )
-            }
-        )
+        meaning = "delay from the input to its effect; none where it is left out"
+        parameters |= ParameterSet({"plant.dead_time": Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)})
 
     def rhs(_: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
         late, rates = pade_delay(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
@@ -326,11 +309,6 @@ def _friction_polynomials(w: float, damping: float) -> Polynomials:
 
 def _integrator_polynomials() -> Polynomials:
     return [1.0], [1.0, 0.0]
-
-
-def _gain_parameter(source: Quantity, output: Quantity, per: str) -> Parameter:
-    unit = _quotient_unit(output, f"({difference_unit(source.unit)}{per})" if per else difference_unit(source.unit))
-    return Parameter(1.0, unit, meaning="steady output, or of an integrator its rate, per input")
 
 
 def _quotient_unit(output: Quantity, unit: str) -> str:
@@ -498,9 +476,8 @@ def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
     measured, gain = log.measured, log.parameters[PLANT_GAIN]
     finite = np.isfinite(measured[source]) & np.isfinite(measured[output])
     t, u, y = (a[finite] for a in (measured.t, measured[source], measured[output]))
-    few = f"{name}: {len(t)} samples of {source} and {output} are too few to start from"
-    few = f"{few}; give {MIN_START_SAMPLES} or more"
-    require(len(t) >= MIN_START_SAMPLES, few, LogError)
+    few = f"{name}: {len(t)} samples of {source} and {output} are too few to start from; give {MIN_FIT_SAMPLES} or more"
+    require(len(t) >= MIN_FIT_SAMPLES, few, LogError)
     step = float(np.median(np.diff(t)))
     grid = t[0] + step * np.arange(int((t[-1] - t[0]) / step + 1e-6) + 1)
     linear = log.intersample.get(source) is Intersample.LINEAR
@@ -513,7 +490,7 @@ def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
 
 
 def _thin_log(record: _EvenLog, most: int) -> _EvenLog:
-    every = max(1, len(record.t) // max(most, 5 * MIN_START_SAMPLES))
+    every = max(1, len(record.t) // max(most, 5 * MIN_FIT_SAMPLES))
     starts = np.arange(0, len(record.u), every)
     u = np.add.reduceat(record.u, starts) / np.diff(starts, append=len(record.u))
     return _EvenLog(record.t[::every], u, record.y[::every], record.sign[::every], record.gain, record.start_time)

@@ -8,7 +8,9 @@ Constants of physics and of standards stand beside their formulas.
 STICKING_SPEED = 1e-6  # rounding of |v| in LuGre [m/s]: a larger one creeps visibly, a smaller one needs finer steps
 MIN_SPEED_RATIO = 3.0  # fast over slow speed [1]: less shows one point of the curve, a larger bound refuses good logs
 VISCOUS_SPEED_RATIO = 5.0  # speed over the Stribeck velocity [1] beyond which the static peak hides no viscous friction
-MIN_START_SAMPLES = 20  # samples of a log, or below its Stribeck velocity: fewer are noise, more refuse good logs
+MIN_FIT_SAMPLES = (
+    20  # samples of a log, or below its Stribeck velocity: fewer are noise, a larger bound refuses good logs
+)
 MIN_DIRECTION_SHARE = 0.05  # share of the moving samples in the rarer direction [1]: fewer are accidental
 MIN_REVERSALS = 2  # reversals of the motion: one alone does not show that presliding repeats
 MIN_INERTIA_SHARE = 0.02  # inertia force over the friction level [1]: less is lost in the model's error

@@ -32,11 +32,6 @@ class Takes(Enum):
     AXIS = "a list of values, or a range"
     COLUMN = "a column's name, a table, or false"
 
-    @property
-    def types(self) -> tuple[type, ...]:
-        """Python types of such an entry."""
-        return _TYPES[self]
-
 
 _TYPES: Mapping[Takes, tuple[type, ...]] = {
     Takes.FLAG: (bool,),
@@ -120,12 +115,6 @@ def read_table(
     `where` begins an error's message, as file and section, or says so of a key; `units` are what the words in braces of
     the keys' units stand for; with `partial` the table has keys of another reader. A key that is unknown or missing, or
     has a value that it does not take, is an `InputError`.
-
-    Examples
-    --------
-    >>> keys = {"speed": Key("how fast", unit="m/s", least=0.0), "softly": flag("whether it brakes softly")}
-    >>> read_table(keys, {"speed": "20 mm/s"}, "move.toml: [move]")
-    {'speed': 0.02, 'softly': False}
     """
 
     def place(key: str) -> str:
@@ -161,7 +150,7 @@ def read_entry(key: Key, entry: Any, where: str, units: Mapping[str, str] | None
         message = f'{where}: {entry!r} is no number of samples; write {where.rpartition(" ")[2]} = "1 sample"'
         require(match is not None or type(entry) is int, message)
         return int(match[1]) if match else int(entry)
-    proper = type(entry) in key.takes.types
+    proper = type(entry) in _TYPES[key.takes]
     require(proper, f"{where} must be {key.takes.value}, got {repr(entry)[:MAX_SHOWN]}{_remedy(key, where)}")
     if key.takes is Takes.COUNT:
         return _in_bounds(key, entry, entry, where)

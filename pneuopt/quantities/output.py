@@ -1,8 +1,4 @@
-"""Files written whole or not at all, and refused before the work where they could not be written after it.
-
-Files that are read: only regular ones, once, within a budget; TOML within one for its nesting, too. And linear algebra
-in the thread that calls it.
-"""
+"""Files written whole or not at all, or refused before the work; files read once, within a budget; one BLAS thread."""
 
 import contextlib
 import functools
@@ -67,40 +63,20 @@ def write_bytes(path: str | Path, content: bytes) -> None:
             part.unlink(missing_ok=True)
 
 
-def write_records(path: str | Path, frame: "pd.DataFrame") -> None:
-    """Write a table as JSON: a list of `records`; what is not finite becomes null."""
-    write_text(path, _to_json(records(frame)))
-
-
 def write_json(path: str | Path, document: Mapping[str, Any]) -> None:
     """Write a mapping as JSON; what is not finite becomes null, a list of records is a table (`records`)."""
-    write_text(path, _to_json(plain_value(document)))
+    text = json.dumps(_null_nonfinite(plain_value(document)), indent=1, ensure_ascii=False, allow_nan=False)
+    write_text(path, f"{text}\n")
 
 
 def format_table(frame: "pd.DataFrame") -> str:
-    """A table as CSV, without its index; text that a spreadsheet would take for a formula has an apostrophe before it.
-
-    Examples
-    --------
-    >>> import pandas as pd
-    >>> print(format_table(pd.DataFrame({"=name": ["=1+1", "run"], "value": [-0.5, 2.0]})))
-    '=name,value
-    '=1+1,-0.5
-    run,2
-    <BLANKLINE>
-    """
+    """A table as CSV, without its index; text that a spreadsheet takes for a formula has an apostrophe before it."""
     shown = frame.rename(columns=_quote_formula).map(_quote_formula)
     return str(shown.to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 
 def format_cell(value: Any) -> str:
-    """A value as a cell of such a CSV.
-
-    Examples
-    --------
-    >>> [format_cell(v) for v in (1 / 3, float("nan"), True, "=1+1", None)]
-    ['0.333333333', '', 'True', "'=1+1", '']
-    """
+    """A value as a cell of such a CSV."""
     if isinstance(value, float):
         return "" if math.isnan(value) else f"{value:.9g}"
     return "" if value is None else str(_quote_formula(value))
@@ -124,13 +100,7 @@ def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
 
 
 def plain_value(value: Any) -> Any:
-    """Convert to what TOML and JSON can hold: NumPy's scalars to Python's, other objects to text; None is left out.
-
-    Examples
-    --------
-    >>> plain_value({"a": (1, None, Path("b"))})
-    {'a': [1, 'b']}
-    """
+    """Convert to what TOML and JSON can hold: NumPy's scalars to Python's, other objects to text; None is left out."""
     if isinstance(value, Mapping):
         return {str(k): plain_value(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):
@@ -175,10 +145,6 @@ def _stat_if_there(place: Path) -> os.stat_result | None:
         return place.lstat()
     except FileNotFoundError:
         return None
-
-
-def _to_json(value: Any) -> str:
-    return json.dumps(_null_nonfinite(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _null_nonfinite(value: Any) -> Any:

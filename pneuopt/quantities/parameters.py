@@ -224,13 +224,7 @@ class ParameterSet(Mapping[str, Parameter]):
 
 
 def without_prefix(values: Mapping[str, T], prefix: str) -> dict[str, T]:
-    """The entries ``prefix.name`` by their own name.
-
-    Examples
-    --------
-    >>> without_prefix({"pid.Kp": 2.0, "load.mass": 5.0}, "pid")
-    {'Kp': 2.0}
-    """
+    """The entries ``prefix.name`` by their own name."""
     return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
 
 
@@ -257,24 +251,13 @@ def usual_intersample(name: str, unit: str) -> Intersample:
 
     A measured force, torque, pressure, motion or temperature is linear, and so is what has no unit; a set-point, and a
     command in any other unit, is held by the controller that gives it.
-
-    Examples
-    --------
-    >>> usual_intersample("force", "N"), usual_intersample("valve_voltage", "V")
-    (<Intersample.LINEAR: 'linear'>, <Intersample.HELD: 'held'>)
     """
     measured = (not unit or unit in MEASURED_UNITS) and not name.endswith(COMMAND_SUFFIX)
     return Intersample.LINEAR if measured else Intersample.HELD
 
 
 def as_tuple(argument: str, given: T | Iterable[T], kind: type[T], meant: str) -> tuple[T, ...]:
-    """Make a tuple of one or several objects of a kind; an `InputError` says what the argument takes, as `meant`.
-
-    Examples
-    --------
-    >>> as_tuple("sizes", 2.0, float, "a float or several"), as_tuple("sizes", [1.0, 2.0], float, "a float or several")
-    ((2.0,), (1.0, 2.0))
-    """
+    """Make a tuple of one or several objects of a kind; an `InputError` says what the argument takes, as `meant`."""
     if isinstance(given, kind):
         return (given,)
     if isinstance(given, str | PurePath) or not isinstance(given, Iterable):
@@ -295,16 +278,7 @@ def check_argument(argument: str, given: object, kind: type | tuple[type, ...], 
 def check_number(
     argument: str, given: object, meant: str, *, least: float = -inf, most: float = inf, whole: bool = False
 ) -> None:
-    """Raise `InputError` where an argument is no number from `least` to `most`, NaN among them, or not whole.
-
-    Examples
-    --------
-    >>> check_number("members", 40, "a whole number of at least 5", least=5, whole=True)
-    >>> check_number("members", 4, "a whole number of at least 5", least=5, whole=True)
-    Traceback (most recent call last):
-    ...
-    pneuopt.quantities.errors.InputError: members takes a whole number of at least 5; got 4
-    """
+    """Raise `InputError` where an argument is no number from `least` to `most`, NaN among them, or not whole."""
     if not isinstance(given, Integral if whole else Real) or isinstance(given, bool):
         is_number = isinstance(given, Real) and not isinstance(given, bool)
         raise (

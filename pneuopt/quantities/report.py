@@ -87,9 +87,6 @@ class Report:
     def __bool__(self) -> bool:
         return bool(self.parts)
 
-    def __str__(self) -> str:
-        return self.to_text()
-
     def __repr__(self) -> str:
         return self.to_text()
 
@@ -178,7 +175,13 @@ def _table_lines(table: Table, width: int | None) -> Iterator[tuple[str, Tone]]:
     if beside is not None and (below is None or _height(table, beside) <= _height(apart, below) + len(table.rows)):
         yield from _beside_lines(table, beside)
     elif below is not None:
-        yield from _below_lines(table, apart, below, width)
+        heading = table.columns[0].heading.replace("\n", " ")
+        yield from ((_plain(text), Tone.HEADING) for text in wrap_words(heading, width))
+        yield from ((_INDENT + text, Tone.HEADING) for text in _heading_lines(apart, below))
+        yield "─" * (len(_INDENT) + _total(below)), Tone.PLAIN
+        for named, row in zip(table.rows, apart.rows, strict=True):
+            yield from ((_plain(text), Tone.PLAIN) for text in wrap_words(named[0], width))
+            yield from ((_INDENT + text, Tone.PLAIN) for text in _row_lines(apart, row, below))
     else:
         least = _least_widths(table)
         panels: list[list[int]] = [[0]]
@@ -198,17 +201,6 @@ def _beside_lines(table: Table, widths: Sequence[int]) -> Iterator[tuple[str, To
     yield "─" * _total(widths), Tone.PLAIN
     for row in table.rows:
         yield from ((text, Tone.PLAIN) for text in _row_lines(table, row, widths))
-
-
-def _below_lines(table: Table, apart: Table, widths: Sequence[int], width: int) -> Iterator[tuple[str, Tone]]:
-    """Each row's name on a line of its own, the other cells below it."""
-    heading = table.columns[0].heading.replace("\n", " ")
-    yield from ((_plain(text), Tone.HEADING) for text in wrap_words(heading, width))
-    yield from ((_INDENT + text, Tone.HEADING) for text in _heading_lines(apart, widths))
-    yield "─" * (len(_INDENT) + _total(widths)), Tone.PLAIN
-    for named, row in zip(table.rows, apart.rows, strict=True):
-        yield from ((_plain(text), Tone.PLAIN) for text in wrap_words(named[0], width))
-        yield from ((_INDENT + text, Tone.PLAIN) for text in _row_lines(apart, row, widths))
 
 
 def _select_columns(table: Table, chosen: Sequence[int]) -> Table:

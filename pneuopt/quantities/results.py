@@ -65,15 +65,10 @@ class Result(Shown):
         InputError
             If the file cannot be written.
         """
-        write_result(path, self)
-
-
-def write_result(path: str | Path, result: object) -> None:
-    """Write a result's file."""
-    content: dict[str, Any] = encode(result)
-    members = ",\n  ".join(f"{_to_json(name)}: {_to_json(value)}" for name, value in content.items())
-    head = f'"pneuopt": "{type(result).__name__}", "format": {FORMAT}, "sha256": "{_hash(content)}"'
-    write_text(path, f'{{{head}, "result": {{\n  {members}\n}}}}\n')
+        content: dict[str, Any] = encode(self)
+        members = ",\n  ".join(f"{_to_json(name)}: {_to_json(value)}" for name, value in content.items())
+        head = f'"pneuopt": "{type(self).__name__}", "format": {FORMAT}, "sha256": "{_hash(content)}"'
+        write_text(path, f'{{{head}, "result": {{\n  {members}\n}}}}\n')
 
 
 def read_result(path: str | Path, kinds: dict[str, type]) -> Any:

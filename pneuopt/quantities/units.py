@@ -80,13 +80,7 @@ def read_value(text: str | float, unit: str, *, where: str = "") -> float:
 
 
 def read_si(text: str | float, *, where: str = "") -> float:
-    """Read one number in the SI unit of its own dimension; a pressure has to be a level, and gauge becomes absolute.
-
-    Examples
-    --------
-    >>> read_si("5000 g"), read_si("6.3 bar(g)"), read_si(0.3)
-    (5.0, 731325.0, 0.3)
-    """
+    """Read one number in the SI unit of its own dimension; a pressure has to be a level, and gauge becomes absolute."""
     unit_text = _split_number(text, where)[1]
     base = _split_level(unit_text or "1")[0]
     if _parse_unit(base, where).dimension == _parse_unit("Pa").dimension:
@@ -97,14 +91,7 @@ def read_si(text: str | float, *, where: str = "") -> float:
 
 @contextmanager
 def count_gauge_from(pressure: float) -> Iterator[None]:
-    """Count gauge pressures from this absolute one [Pa], a drive's ambient pressure say, in what is read within.
-
-    Examples
-    --------
-    >>> with count_gauge_from(95000.0):
-    ...     read_value("6 bar(g)", "Pa(a)")
-    695000.0
-    """
+    """Count gauge pressures from this absolute one [Pa], a drive's ambient pressure say, in what is read within."""
     token = _gauge_zero.set(pressure)
     try:
         yield
@@ -113,36 +100,18 @@ def count_gauge_from(pressure: float) -> Iterator[None]:
 
 
 def si_conversion(unit_text: str, unit: str, *, where: str = "") -> tuple[float, float]:
-    """Find factor and offset that bring a column of raw numbers to SI: ``si = factor * raw + offset``.
-
-    Examples
-    --------
-    >>> si_conversion("mm", "m"), si_conversion("bar(g)", "Pa(a)")
-    ((0.001, 0.0), (100000.0, 101325.0))
-    """
+    """Find factor and offset that bring a column of raw numbers to SI: ``si = factor * raw + offset``."""
     factor, offset = _exact_conversion(unit_text, unit, where)
     return float(factor), float(offset)
 
 
 def read_unit(text: str | float, unit: str) -> str:
-    """The unit in which a value is written; `unit` where it stands alone.
-
-    Examples
-    --------
-    >>> read_unit("6 bar(g)", "Pa(a)"), read_unit(0.3, "1")
-    ('bar(g)', '1')
-    """
+    """The unit in which a value is written; `unit` where it stands alone."""
     return _split_number(text, "")[1] or unit
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is a unit that `read_value` knows, a pressure's level among them.
-
-    Examples
-    --------
-    >>> is_unit("mm"), is_unit("bar(g)"), is_unit("valve"), is_unit("1")
-    (True, True, False, False)
-    """
+    """Whether a text is a unit that `read_value` knows, a pressure's level among them."""
     if not re.search(r"[^\W\d_]|[%‰°]", text):
         return False
     try:
@@ -153,13 +122,7 @@ def is_unit(text: str) -> bool:
 
 
 def write_value(value: float, unit: str, digits: int = 6) -> str:
-    """Write an SI number with a unit that reads well; `read_value` reads it back to the digits given.
-
-    Examples
-    --------
-    >>> write_value(0.032, "m"), write_value(701325.0, "Pa(a)"), write_value(0.3, "1")
-    ('32 mm', '7.01325 bar(a)', '0.3')
-    """
+    """Write an SI number with a unit that reads well; `read_value` reads it back to the digits given."""
     require(not math.isnan(value), f"a value of NaN {unit} cannot be written")
     readable = _READABLE_UNITS.get(unit, ()) if math.isfinite(value) else ()
     shown = next((name for name, below in readable if 0 < abs(value) < below), unit)
@@ -169,13 +132,7 @@ def write_value(value: float, unit: str, digits: int = 6) -> str:
 
 
 def unit_ratio(numerator: str, denominator: str) -> str:
-    """Divide two unit texts and simplify; a level such as "Pa(a)" counts as a difference.
-
-    Examples
-    --------
-    >>> unit_ratio("V", "m/s"), unit_ratio("V", "m/s*s"), unit_ratio("1", "Pa(g)")
-    ('V*s/m', 'V/m', '1/Pa')
-    """
+    """Divide two unit texts and simplify; a level such as "Pa(a)" counts as a difference."""
     powers = _unit_powers(difference_unit(numerator))
     for name, power in _unit_powers(difference_unit(denominator)).items():
         powers[name] = powers.get(name, 0) - power

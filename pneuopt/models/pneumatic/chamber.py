@@ -36,20 +36,16 @@ class ChamberModel(Protocol):
     @property
     def states(self) -> tuple[Quantity, ...]:
         """States of the air: the pressure, and others if the model has them."""
-        ...
 
     @property
     def parameters(self) -> ParameterSet:
         """Parameters, which a drive's chambers share."""
-        ...
 
     def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:
         """Temperature of the air inside [K]."""
-        ...
 
     def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
         """Rates of the states."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -80,9 +76,8 @@ class Polytropic:
     def parameters(self) -> ParameterSet:
         """Parameters: exponent [1], or if mixed inflow_exponent, outflow_exponent, volume_exponent."""
         if not self.mixed:
-            return ParameterSet(
-                {"exponent": Parameter(1.2, "1", 0.9, 1.5, meaning="polytropic exponent: 1 isothermal, 1.4 adiabatic")}
-            )
+            exponent = Parameter(1.2, "1", 0.9, 1.5, meaning="polytropic exponent: 1 isothermal, 1.4 adiabatic")
+            return ParameterSet({"exponent": exponent})
         values = {"inflow_exponent": 1.4, "outflow_exponent": 1.0, "volume_exponent": 1.2}
         source = "Richer & Hurmuzlu 2000"
         return ParameterSet(
@@ -127,13 +122,8 @@ class Thermal:
     @property
     def parameters(self) -> ParameterSet:
         """Parameter: wall_conductance [W/K], heat transfer coefficient times wall area."""
-        return ParameterSet(
-            {
-                "wall_conductance": Parameter(
-                    0.5, "W/K", 0.0, 1e3, meaning="heat transfer coefficient times area of the chamber's wall"
-                )
-            }
-        )
+        wall = Parameter(0.5, "W/K", 0.0, 1e3, meaning="heat transfer coefficient times area of the chamber's wall")
+        return ParameterSet({"wall_conductance": wall})
 
     def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:  # noqa: ARG002 - the protocol's arguments
         """Temperature of the air, a state."""

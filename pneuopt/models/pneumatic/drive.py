@@ -1,9 +1,4 @@
-"""`PneumaticDrive`: supply, proportional valve, cylinder and load in one ODE.
-
-Below the drive stand its sections and keys in a file, with a catalogue's nominal flow in place of a conductance; its
-rest and steady motion, the spool position and pressures at which only the position changes; impossible hardware; and
-the limits where the model ends, end stops and empty chambers.
-"""
+"""`PneumaticDrive`: supply, proportional valve, cylinder and load in one ODE, its file, its rest and its limits."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,7 +24,7 @@ from pneuopt.dynamics.hooks import (
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.logs.tolerances import MAX_POSITION_ZERO_ERROR
 from pneuopt.models.declaration import Alias, DriveKind, DriveSections, FirstFiles
-from pneuopt.models.drives import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
+from pneuopt.models.drives import AMBIENT_PARAMETERS, POSITION, SPEED
 from pneuopt.models.friction import (
     FRICTION_KEYS,
     LOAD_HINTS,
@@ -131,9 +126,9 @@ class PneumaticDrive:
     @property
     def states(self) -> tuple[Quantity, ...]:
         """States of load, chambers, valve and friction, in this order."""
-        air = tuple(rename_quantity(q, f"{q.name}_{side}") for q in self.chamber.states for side in SIDES)
-        spool = tuple(rename_quantity(q, f"valve.{q.name}") for q in self.valve.states)
-        return POSITION, SPEED, *air, *spool, *(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
+        air = tuple(replace(q, name=f"{q.name}_{side}") for q in self.chamber.states for side in SIDES)
+        spool = tuple(replace(q, name=f"valve.{q.name}") for q in self.valve.states)
+        return POSITION, SPEED, *air, *spool, *(replace(q, name=f"friction.{q.name}") for q in self.friction.states)
 
     def system(self) -> System:
         """Build the equations; states, input and outputs as in the class."""
@@ -556,7 +551,7 @@ def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float,
 
     def pressures(spool: float) -> tuple[float, float]:
         def pressure_b_at(a: float) -> float:
-            return _zero_crossing_or_end(lambda pressure_b_at: rates(spool, a, pressure_b_at)[1], low, high)
+            return _zero_crossing_or_end(lambda b: rates(spool, a, b)[1], low, high)
 
         if p.value("cylinder.leak") == 0:
             return _zero_crossing_or_end(lambda a: rates(spool, a, low)[0], low, high), pressure_b_at(low)
@@ -576,13 +571,10 @@ def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float,
         f"lower the {'speed or the ' if glide.speed else ''}load, raise the supply or the bore",
     )
     spool = 0.0 if abs(acceleration_at(0.0)) * mass < 1e-9 else _brent_root(acceleration_at, -1.0, 1.0)
-    a, pressure_b_at = pressures(spool)
-    inside = not glide.speed or (low < min(a, pressure_b_at) and max(a, pressure_b_at) < high)
-    require(
-        inside,
-        f"{what}: a chamber would need {a if low < pressure_b_at < high else pressure_b_at:g} Pa(a); lower the speed",
-    )
-    return spool, a, pressure_b_at
+    a, b = pressures(spool)
+    inside = not glide.speed or (low < min(a, b) and max(a, b) < high)
+    require(inside, f"{what}: a chamber would need {a if low < b < high else b:g} Pa(a); lower the speed")
+    return spool, a, b
 
 
 def _zero_crossing_or_end(rate: Callable[[float], float], low: float, high: float) -> float:

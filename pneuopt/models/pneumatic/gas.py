@@ -40,11 +40,9 @@ class FlowLaw(Protocol):
     @property
     def parameters(self) -> ParameterSet:
         """Parameters of the law beside the conductance."""
-        ...
 
     def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:
         """Mass flow over conductance, reference density and sqrt(T0/T) [Pa]; it changes sign with the pressures."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -62,13 +60,8 @@ class Iso6358:
     @property
     def parameters(self) -> ParameterSet:
         """Parameter: critical_ratio, b [1]."""
-        return ParameterSet(
-            {
-                "critical_ratio": Parameter(
-                    0.3, "1", 0.05, 0.6, meaning="ISO 6358 critical pressure ratio b of the valve"
-                )
-            }
-        )
+        ratio = Parameter(0.3, "1", 0.05, 0.6, meaning="ISO 6358 critical pressure ratio b of the valve")
+        return ParameterSet({"critical_ratio": ratio})
 
     def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:
         """See `FlowLaw`."""

@@ -134,6 +134,7 @@ class AirSimulator:
         return run.y if run.x is None else run.x
 
 
+_KNOWN_AIR = functools.lru_cache(maxsize=32)(AirSimulator)  # which the checks of a log and its starts ask for in turn
 ValveValues = Mapping[str, float]
 AirForce = Callable[[Mapping[str, Any], Any, Any], Any]
 VALVE_CONDUCTANCE, VALVE_LEAK = "valve.conductance", "valve.leak"
@@ -175,14 +176,8 @@ class PneumaticStarts:
 
     def prepare_logs(self, logs: Mapping[str, Log], window: float = FILTER_TIMES[0]) -> dict[str, "PneumaticLog"]:
         """Logs with the motion and the air of this drive, filtered with a window [s]."""
-        simulator_for = functools.partial(_air_simulator, self.system())
+        simulator_for = functools.partial(_KNOWN_AIR, self.system())
         return {name: PneumaticLog(log, simulator_for, self.air_force, window) for name, log in logs.items()}
-
-
-@functools.lru_cache(maxsize=32)
-def _air_simulator(system: System, given_states: tuple[str, ...]) -> AirSimulator:
-    """The air of a drive, which the checks of a log and its starts ask for in turn."""
-    return AirSimulator(system, given_states)
 
 
 class PneumaticLog:

@@ -85,15 +85,11 @@ class ProportionalValve:
             "centre": Parameter(0.0, "V", -100.0, 100.0, meaning="command at which the valve is closed, 5 V of 0-10 V"),
             "span": Parameter(5.0, "V", 0.1, 100.0, meaning="command from the centre to full opening"),
         }
-        conductance = ParameterSet(
-            {
-                "conductance": Parameter(
-                    2e-8, "m^3/(s*Pa)", 1e-12, 1e-4, log=True, meaning="ISO 6358 sonic conductance C of an open edge"
-                )
-            }
+        conductance = Parameter(
+            2e-8, "m^3/(s*Pa)", 1e-12, 1e-4, log=True, meaning="ISO 6358 sonic conductance C of an open edge"
         )
         moving = dict(list(lag.items())[: self.spool.value])
-        return conductance | self.law.parameters | ParameterSet({**geometry, **moving})
+        return ParameterSet({"conductance": conductance}) | self.law.parameters | ParameterSet({**geometry, **moving})
 
     def position(self, voltage: ca.SX, z: Symbols, p: Symbols) -> ca.SX:
         """Spool position [1] at a command [V] and the states z."""
