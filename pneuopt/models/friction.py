@@ -28,7 +28,6 @@ from pneuopt.models.tolerances import (
     MIN_INERTIA_SHARE,
     MIN_REVERSALS,
     MIN_SPEED_RATIO,
-    MIN_START_SAMPLES,
     SMOOTHING_FACTOR,
     STICKING_SPEED,
     STRIBECK_VELOCITIES,
