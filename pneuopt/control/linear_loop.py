@@ -141,8 +141,7 @@ class OpenLoops(NamedTuple):
 class ComposedLoops:
     """Function that linearises many loops of one kind; machine code of the plant's Jacobian pays for many plants.
 
-    Under dither the plant is the mean over its ripple, as in `AveragedPlant`, with a controller that does not react to
-    the ripple.
+    Under dither the plant is the mean over its ripple (`AveragedPlant`), to which the controller does not react.
     """
 
     loop: ClosedLoop

@@ -544,11 +544,6 @@ def plan_s_curve(distance: float, speed: float, acceleration: float, jerk: float
     """The fastest move from rest to rest within limits of speed, acceleration and jerk; without jerk's a trapezoid.
 
     L. Biagiotti and C. Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), sections 3.2 and 3.4.
-
-    Examples
-    --------
-    >>> plan_s_curve(0.2, speed=0.5, acceleration=5.0).duration, plan_s_curve(0.2, 0.5, 5.0, 100.0).duration
-    (0.5, 0.55)
     """
     ramp = acceleration / jerk  # [s], from no acceleration to the largest
     if speed >= acceleration * ramp:

@@ -7,26 +7,18 @@ A certificate without findings means, for the gains as printed and on every refe
   `Metric.resolution` of its terms where it is nearly zero.
 * The linear loop is stable, with the margins that are shown, at every operating point of `Certificate.margins`.
 * The response has come to rest, or to a periodic orbit inside the settling band, at the reference. A horizon can end
-  too early to tell. So the response is continued, its length doubled again and again, until signal and command stand,
-  to sixteen horizons, or to the end of the stroke, which a note then says. Growth, hunting and creep that begin beyond
-  the horizon are findings, and so is a response that a budget of simulated instants leaves undecided. The metrics stay
-  those of the horizon, but for a SettlingTime that the continuation refutes, which is NaN, and an Overshoot that it
-  exceeds.
+  too early to tell, so the response is continued, its length doubled again and again, until signal and command stand,
+  to sixteen horizons, or to the end of the stroke, which a note then says. The metrics stay those of the horizon, but
+  for a SettlingTime that the continuation refutes, which is NaN, and an Overshoot that it exceeds.
 
-A design with a finding is never "converged", whatever was asked, unless `tune(..., accept=...)` names the defect. A
-rest off the reference is none where a limit on SteadyStateError allows it.
-
-What it does not mean: other plants than the scenarios may behave otherwise, and the model may be wrong.
+A design with a finding is never "converged", unless `tune(..., accept=...)` names the defect. Other plants than the
+scenarios may behave otherwise, and the model may be wrong.
 
 The certificate shares the model with the search, its equations, parameters, rest, linearisation and compiled right-hand
-side; the definitions of the metrics, which read both responses; and the formulas of frequency responses and stability.
-It shares no step of the search: the search integrates by steps of RK4 on its own samples and reads the margins of many
-loops at once off a grid; the certificate integrates by SciPy's LSODA with step control on a closer grid, and refines
-each margin to machine precision. That what is shared is right is shown by tests against hand-written plants, SciPy and
-python-control.
-
-In this order: what is found (`Certificate`), how a response is continued beyond its horizon (`ContinuedResponse`), how
-it ends there (`Ending`), and settling bands that are narrower than what a sensor's counts show (`describe_counts`).
+side; the definitions of the metrics; and the formulas of frequency responses and stability. It shares no step of the
+search: the search integrates by steps of RK4 on its own samples and reads the margins of many loops at once off a grid;
+the certificate integrates by SciPy's LSODA with step control on a closer grid, and refines each margin to machine
+precision. That what is shared is right is shown by tests against hand-written plants, SciPy and python-control.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -189,10 +181,9 @@ def certificate(
 def judge_evaluations(
     evaluations: Sequence[CaseEvaluation], band: Band, rest_error: float = 0.0, *, continues: bool = True
 ) -> Certificate:
-    """The certificate of gains that have been evaluated on every case.
+    """The certificate of evaluated gains, whose loops may rest a fraction `rest_error` of the step off the reference.
 
-    Their loops may rest a fraction `rest_error` of the step off the reference. Without `continues`, for gains that are
-    refused already, the certificate is of the linear loop only.
+    Without `continues`, for gains that are refused already, it is of the linear loop only.
     """
     import pandas as pd
 

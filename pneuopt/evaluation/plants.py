@@ -167,24 +167,13 @@ GAIN_PREFIXES = ("pid.", "feedforward.")
 
 @dataclass(frozen=True, eq=False)
 class CorrelatedParameters:
-    """Parameters that vary together from plant to plant, on their own.
-
-    Attributes
-    ----------
-    names : tuple of str
-    share : float
-        By which fraction of the value they vary, either way.
-    low, high : mapping of str to float or Factor
-        The scenario in which they are at their low, and at their high end, and nothing else differs.
-    is_gain : bool
-        Whether it is the controller's.
-    """
+    """Parameters that vary together from plant to plant, on their own."""
 
     names: tuple[str, ...]
-    share: float
-    low: Mapping[str, float | Factor]
+    share: float  # by which fraction of the value they vary, either way
+    low: Mapping[str, float | Factor]  # the scenario in which they are at their low end, and nothing else differs
     high: Mapping[str, float | Factor]
-    is_gain: bool = False
+    is_gain: bool = False  # of the controller
 
     @property
     def label(self) -> str:

@@ -480,13 +480,7 @@ def upper_limit(requirement: Requirement) -> float:
 
 
 def describe_value(requirement: Requirement, value: float) -> tuple[str, str]:
-    """A value of `requirement_values` and its limit, written as the user writes them: ("1.8", "at least 2").
-
-    Examples
-    --------
-    >>> describe_value(GainMargin(min=2.0), 1 / 1.8), describe_value(Overshoot(max=0.05), 0.06)
-    (('1.8', 'at least 2'), ('0.06', 'allowed 0.05'))
-    """
+    """A value of `requirement_values` and its limit, written as the user writes them: ("1.8", "at least 2")."""
     words = "at least" if requirement.metric.sense is Sense.AT_LEAST else "allowed"
     return f"{user_value(requirement, value):.6g}", f"{words} {user_limit(requirement):.6g}"
 

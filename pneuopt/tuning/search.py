@@ -259,13 +259,6 @@ def objectives_agree(certified: float, claimed: float, optimum: float, resolutio
 
     A claim far above the certificate is as wrong as one far below: the search has then compared other figures than
     those of the response. Near zero, where no relative difference counts, `resolution` decides.
-
-    Examples
-    --------
-    >>> objectives_agree(4e-16, 0.0, 0.0, 1e-6)
-    True
-    >>> objectives_agree(0.3, 0.4, 0.4, 1e-6), objectives_agree(0.4, 0.3, 0.3, 1e-6)
-    (False, False)
     """
     lowest, highest = claimed, min(claimed, optimum)
     above = lowest - SAME_OBJECTIVE * abs(lowest) - resolution
@@ -354,10 +347,9 @@ class Search:
         return other
 
     def lengthen(self, *, rests: bool) -> "Search":
-        """A search over a longer horizon, in which a response that hunts or creeps later never settles.
+        """A search over the longest of `HORIZON_FACTORS` horizons with room for the piston; without any, this one.
 
-        With `rests` it has to settle within the horizon asked for, otherwise within the longer one, the longest of
-        `HORIZON_FACTORS` for which the piston has room; where there is none it is this search.
+        With `rests` a response has to settle within the horizon asked for, otherwise within the longer one.
         """
         for factor in HORIZON_FACTORS:
             steps = tuple(r.with_horizon(r.at + factor * (r.horizon - r.at)) for r in self.task.references)
@@ -724,11 +716,5 @@ def _describe_closest(excess: float) -> str:
 
 
 def describe_confirmation(simulations: int) -> str:
-    """Say in words by what an infeasible answer, or a refusal, is confirmed.
-
-    Examples
-    --------
-    >>> describe_confirmation(3600)
-    "a second search, SciPy's differential evolution over 3600 simulations"
-    """
+    """Say in words by what an infeasible answer, or a refusal, is confirmed."""
     return f"a second search, SciPy's differential evolution over {simulations} simulations"

@@ -62,8 +62,7 @@ from pneuopt.tuning.tolerances import (
 class ResponsePoints(NamedTuple):
     """Where m lanes begin, move fastest and end.
 
-    States (m, k, n_states) stand at every `KEPT_STATES`-th sample, `ends` (m, n_states) with the commands (m,) there;
-    `fastest` (m,) is the sample of the largest speed, under dither without its ripple.
+    States (m, k, n_states) are those of every `KEPT_STATES`-th sample, `fastest` (m,) is the one of the largest speed.
     """
 
     states: Array
@@ -163,8 +162,7 @@ class PointFinder:
     def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints) -> tuple[Array, Array]:
         """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.
 
-        Under dither one period more is run; half the change over it is subtracted from its mean, which so belongs to
-        the end.
+        Under dither one period more is run; half the change over it is subtracted from its mean, to belong to the end.
         """
         out = np.column_stack([own.ends[:, : len(self.loop.plant.states)], own.command])
         reach = np.zeros_like(out)
@@ -258,8 +256,7 @@ class Responses:
 class LaneMetrics:
     """The metrics (m,) of lanes, which of them do not run away, and the points of their responses.
 
-    Beside those of `step_metrics` there is "Excess", the mean error near the end, by which responses that never settle
-    are graded; infinite where the response runs away.
+    "Excess" is the mean error near the end, by which responses that never settle are graded.
     """
 
     metrics: dict[str, Array]
@@ -301,8 +298,7 @@ LaneRun = tuple[Array, Array, Array]  # states at every `KEPT_STATES`-th sample,
 class Simulator:
     """Simulate many candidates, compiled, on every reference and every scenario's plant, and read their metrics.
 
-    The plant's true signal counts, whatever a sensor shows the controller of it. The requirements of `spec` are read
-    beside the common ones; margins stand apart, for they cost a frequency response each.
+    The plant's true signal counts, whatever a sensor shows the controller of it; margins stand apart, for their cost.
     """
 
     def __init__(
@@ -340,8 +336,7 @@ class Simulator:
     def coarse(self, spec: Specification, bands: Sequence[Band] = ()) -> "Simulator":
         """A copy for use during a search, with half as many samples, which reads only what `spec` asks for.
 
-        With `bands` SettlingTime is the mean over those and the band asked for, `penalty_settling_time` where it does
-        not settle.
+        With `bands` SettlingTime is the mean over these and the band asked for (`penalty_settling_time`).
         """
         part = copy.copy(self)
         part._wider = tuple(bands)
