@@ -310,9 +310,15 @@ def continue_response(found: CaseEvaluation, band: float) -> ContinuedResponse:
         if not contact and np.any(limit.side * (limit.limit(found.parameters) - run[limit.state][1:]) <= 0):
             contact = f"{limit.event} within the horizon"
     continued = ContinuedResponse(loop, reference, period, t, y, u, contact=contact, is_stable=stable)
-    left = MAX_CONTINUATION_INSTANTS
-    while not continued.is_decided(band):
-        inputs, instants = _next_inputs(found, run.t[-1], continued)
+    left, spacing = MAX_CONTINUATION_INSTANTS, sample_spacing(loop, reference, found.parameters)
+    readings = 1 if loop.pid.sample_time is None else readings_a_sample(loop, reference)
+    held = {"reference": reference.final, **{disturbance_input(n): v for n, v in reference.disturbance.items()}}
+    while not continued.is_decided(band):  # the inputs stay as they were after the step
+        length = min(continued.t[-1], MAX_HORIZONS * continued.horizon - continued.t[-1])
+        count = max(1, int(np.ceil(length / spacing - 1e-9)))
+        at = run.t[-1] + spacing * np.arange(count + 1)
+        inputs = Trajectory(at, {q.name: np.full(len(at), held.get(q.name, 0.0)) for q in loop.inputs})
+        instants = np.linspace(at[0], at[-1], readings * count + 1)
         left -= len(instants)
         if left < 0:
             return replace(continued, is_cut=True)
@@ -327,19 +333,6 @@ def continue_response(found: CaseEvaluation, band: float) -> ContinuedResponse:
         t, y, u = (np.concatenate(parts) for parts in zip(known, (t, y, u), strict=True))
         continued = replace(continued, t=t, signal=y, command=u, contact=str(met[0]) if met else "")
     return continued
-
-
-def _next_inputs(found: CaseEvaluation, begin: float, continued: ContinuedResponse) -> tuple[Trajectory, Array]:
-    """Inputs that stay as they were after the step for once more the record's length, and instants to report."""
-    loop, reference, h = found.loop, found.case.reference, found.loop.pid.sample_time
-    length = min(continued.t[-1], MAX_HORIZONS * continued.horizon - continued.t[-1])
-    spacing = sample_spacing(loop, reference, found.parameters)
-    count = max(1, int(np.ceil(length / spacing - 1e-9)))
-    t = begin + spacing * np.arange(count + 1)
-    held = {"reference": reference.final, **{disturbance_input(n): v for n, v in reference.disturbance.items()}}
-    columns = {q.name: np.full(len(t), held.get(q.name, 0.0)) for q in loop.inputs}
-    readings = 1 if h is None else readings_a_sample(loop, reference)
-    return Trajectory(t, columns), np.linspace(t[0], t[-1], readings * count + 1)
 
 
 @dataclass(frozen=True, eq=False)

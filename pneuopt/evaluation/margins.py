@@ -345,13 +345,11 @@ def _has_stable_poles(A: Array) -> bool:
     return bool((poles.real <= POLE_ROUNDING * np.linalg.norm(balanced) * condition).all())
 
 
-def sensitivity_terms(
-    loop: ClosedLoop, omega: ArrayLike, parameters: ParameterSet, x: Array | None = None
-) -> ca.Function:
+def sensitivity_terms(loop: ClosedLoop, omega: ArrayLike, parameters: ParameterSet) -> ca.Function:
     """``|1 + L(jw)|^2`` as a smooth function of the PID's gains, which limits Ms by ``terms(p) >= 1 / Ms**2``.
 
-    The plant enters as numbers, its response at `parameters` and, where it is nonlinear, at the state x: each scenario
-    needs its own terms. A loop whose sensitivity is no such function of the gains is refused.
+    The plant enters as numbers, its response at `parameters`: each scenario needs its own terms. A loop whose
+    sensitivity is no such function of the gains is refused.
     """
     shaping = ", ".join(type(c).__name__ for c in loop.controller.acting_always)
     for fits, reason in (
@@ -363,7 +361,7 @@ def sensitivity_terms(
     free = ", ".join(n for n in parameters.free_names if n in loop.plant.parameters)
     require(not free, f"{free}: free, but the sensitivity needs a fixed plant; fix it", ModelError)
     w = np.asarray(omega, dtype=float)
-    P = frequency_response(linear_plant(loop, parameters, x), w) * pade_delay_response(w, loop.dead_time)
+    P = frequency_response(linear_plant(loop, parameters), w) * pade_delay_response(w, loop.dead_time)
     p = ca.SX.sym("p", len(loop.parameters))
     Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
     ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())

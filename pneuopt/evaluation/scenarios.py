@@ -482,6 +482,8 @@ def draws(
     InputError
         If the covariance names a parameter that the set lacks, or holds NaN: the logs could not identify that one.
     """
+    from scipy.stats import norm, t
+
     require(count >= 1, f"count must be at least 1, got {count}")
     names = [str(n) for n in covariance.index]
     check_names("parameter", names, parameters, "covariance")
@@ -497,11 +499,14 @@ def draws(
     variances, axes = np.linalg.eigh((scaled + scaled.T) / 2)
     factor = np.asarray(axes * np.sqrt(np.maximum(variances, 0.0)))  # rounding makes some variances negative
     rng = generator(seed, "draws", *names)
-    freedom = np.array([dof.get(n, math.inf) for n in names])
+    freedom, sizes = np.array([dof.get(n, math.inf) for n in names]), np.linalg.norm(factor, axis=1)
+    few = np.isfinite(freedom) & (sizes > 0)
 
     def draw_within_bounds() -> dict[str, float]:
         for _ in range(MAX_DRAWS_PER_SAMPLE):
-            z = mean + _by_student_t(factor @ rng.standard_normal(len(names)), np.linalg.norm(factor, axis=1), freedom)
+            z = factor @ rng.standard_normal(len(names))
+            z[few] = sizes[few] * t.ppf(norm.cdf(z[few] / sizes[few]), freedom[few])  # of Student's t
+            z += mean
             drawn = np.where(log, np.exp(np.where(log, z, 0.0)), z)
             values = dict(zip(names, drawn.tolist(), strict=True))
             if all(parameters[n].lower <= v <= parameters[n].upper for n, v in values.items()):
@@ -510,16 +515,6 @@ def draws(
         raise InputError(f"{message}; widen them, or give corners")
 
     return {f"draw {k}": draw_within_bounds() for k in range(1, count + 1)}
-
-
-def _by_student_t(normal: Array, deviations: Array, dof: Array) -> Array:
-    """Normal draws, moved to the same probability of Student's t where there are finite degrees of freedom."""
-    from scipy.stats import norm, t
-
-    few = np.isfinite(dof) & (deviations > 0)
-    out = normal.copy()
-    out[few] = deviations[few] * t.ppf(norm.cdf(normal[few] / deviations[few]), dof[few])
-    return out
 
 
 def _axis_names(

@@ -563,7 +563,4 @@ class _Task:
         return evaluate_cases(*_unpack(self._packed), cases)
 
 
-@functools.lru_cache(maxsize=2)
-def _unpack(packed: bytes) -> tuple[CaseFunction, ParameterSet]:
-    fn, parameters = pickle.loads(packed)
-    return fn, parameters
+_unpack: Callable[[bytes], tuple[CaseFunction, ParameterSet]] = functools.lru_cache(maxsize=2)(pickle.loads)

@@ -479,9 +479,8 @@ class Search:
                 break
         if tried:
             return
-        points = np.vstack(
-            [nearest, self.space.neighbourhood(nearest, digits)]
-        )  # no single last place keeps the limits
+        # no single last place keeps the limits
+        points = np.vstack([nearest, self.space.neighbourhood(nearest, digits)])
         rows = to_records(self.simulator.values(points, spec))
         costs = [np.inf if spec.violations(row) else spec.objective(row) for row in rows]
         best = [k for k in np.argsort(costs).tolist() if costs[k] <= most][:MAX_CERTIFIED_POINTS]
@@ -585,8 +584,7 @@ def confirm_refusal(search: Search, refused: TuningResult) -> tuple[TuningResult
                 best, is_stopped = _improve(search, longer, held)
                 return replace(best, status=best.status.with_details(words)), is_stopped
     except KeyboardInterrupt:
-        sentences = (f"nothing found so far: {refused.status.verdict}", "run again for an answer")
-        return replace(refused, status=Status(Code.INTERRUPTED, sentences)), False
+        return _interrupt(refused), False
     failed = f"of {len(points)} designs that it finds none is certified" if points else "finds none that comes to rest"
     words = f"{describe_confirmation(count)}, {failed}, either"
     stats = {**refused.stats, "confirmation.simulations": float(count)}
