@@ -487,14 +487,10 @@ class SCurve:
     jerk_time: float  # from no acceleration to the largest [s]; 0 makes it a trapezoid of speed
 
     @property
-    def cruise_time(self) -> float:
-        """At the peak speed [s]."""
-        return max(0.0, self.distance / self.peak_speed - self.acceleration_time)
-
-    @property
     def duration(self) -> float:
         """From rest to rest [s]."""
-        return 2 * self.acceleration_time + self.cruise_time
+        at_peak_speed = max(0.0, self.distance / self.peak_speed - self.acceleration_time)
+        return 2 * self.acceleration_time + at_peak_speed
 
     def motion(self, t: Array) -> tuple[Array, Array, Array]:
         """See `PlannedMotion`; the second half is the first, mirrored, so that the end is met exactly."""

@@ -270,11 +270,6 @@ class ContinuedResponse:
         """The mean signal's distance from the reference in steps, positive beyond it, at the instants `times`."""
         return (self._mean(self.signal, self.reference.initial) - self.reference.final) / self.reference.nominal_size
 
-    @cached_property
-    def mean_command(self) -> Array:
-        """The command's mean at the instants `times` [its unit]."""
-        return self._mean(self.command, float(self.command[0]))
-
     def since(self, share: float) -> slice:
         """The instants of `times` from this share of the record on."""
         return slice(int(np.searchsorted(self.times, share * self.times[-1])), None)
@@ -286,7 +281,7 @@ class ContinuedResponse:
     def is_decided(self, band: float) -> bool:
         """Whether signal and command stand and the linear loop is stable, or nothing is left to simulate."""
         ahead = 2 * (MAX_HORIZONS * self.horizon / self.t[-1] - 1)  # halves of the record still to come
-        drift = np.ptp(self.mean_command[self.since(0.5)]) * ahead
+        drift = np.ptp(self._mean(self.command, float(self.command[0]))[self.since(0.5)]) * ahead
         quiet = self.is_stable and self.stands(band) and drift <= COMMAND_DRIFT_SHARE * np.abs(self.command).max()
         return self.is_over or bool(quiet)
 
@@ -407,12 +402,6 @@ class Ending:
         inside = self.is_inside(self.response.error[self.response.since(share)])
         return int(np.sum(inside[:-1] & ~inside[1:]))
 
-    @property
-    def largest_overshoot(self) -> float:
-        """The mean's largest distance beyond the reference, in steps; on either side where only a disturbance steps."""
-        error = self.response.error
-        return float(max(0.0, (error if self.response.reference.changes else np.abs(error)).max()))
-
     def refutes(self, settling_time: float) -> bool:
         """Whether the mean leaves the band after this instant, beyond the horizon [s]."""
         beyond = self.response.error[self.response.times > self.response.horizon]
@@ -460,7 +449,8 @@ class Ending:
 
         SettlingTime is NaN where the mean leaves the band again; the overshoot is the continuation's if that is larger.
         """
-        largest = self.largest_overshoot
+        error = self.response.error
+        largest = float(max(0.0, (error if self.response.reference.changes else np.abs(error)).max()))
         times = [n for n in ("SettlingTime", "SettlingTimeRaw") if n in metrics]
         refuted = dict.fromkeys(times, nan) if self.refutes(metrics["SettlingTime"]) else {}
         higher = {"Overshoot": 100 * largest, "OvershootDistance": largest * abs(self.response.reference.nominal_size)}

@@ -69,7 +69,6 @@ class LimitPath(Protocol):
 
     def follow(self, start: Array, specs: Sequence[Specification]) -> list[Solution]:
         """Solve for one specification after the other, the first from gains of shape (n,), each from the one before."""
-        ...
 
 
 def check_method_options(method: "Method") -> None:
@@ -87,35 +86,28 @@ class Method(Protocol):
     @property
     def margin(self) -> float:
         """By what fraction its limits are tighter than those asked for."""
-        ...
 
     @property
     def peak_margin(self) -> float:
         """The share of `margin` by which limits on peaks of command and sensitivity are tightened."""
-        ...
 
     @property
     def digits(self) -> int | None:
         """To how many significant digits the gains are rounded; None: not at all."""
-        ...
 
     @property
     def parameters_without_effect(self) -> tuple[str, ...]:
         """Parameters on which its problem does not depend: they stay as given."""
-        ...
 
     @property
     def successor(self) -> "Method | None":
         """The method to try next where this one was chosen by default and fails; None: its answer is final."""
-        ...
 
     def check(self, task: TuningTask) -> None:
         """Refuse a task that it cannot tune: `InputError` names the reason and the remedy."""
-        ...
 
     def suits(self, task: TuningTask) -> bool:
         """Whether it is to be chosen before those that follow it in `METHODS`; it can tune any task that it suits."""
-        ...
 
     def find(
         self,
@@ -130,15 +122,12 @@ class Method(Protocol):
 
         `attempt` counts the certificates that have failed; from 1 on `start` is the point found with less margin.
         """
-        ...
 
     def shorten(self, margin: float) -> "Method":
         """The method for a short search from a point that is close."""
-        ...
 
     def limit_path(self, task: TuningTask, spec: Specification) -> LimitPath | None:
         """The problem prepared for moving limits, `spec` the first, tightened; None where each needs a new search."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -162,13 +162,9 @@ class Certifier:
         """Every case over its horizon, and the warnings of end stops and emptied chambers that the responses met."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
+            task, spec = self.task, self.task.spec
             found = evaluate_cases(
-                self.task.loop,
-                self.task.references,
-                parameters,
-                scenarios=self.task.scenarios,
-                band=self.task.spec.band,
-                envelope=self.task.spec.envelope,
+                task.loop, task.references, parameters, scenarios=task.scenarios, band=spec.band, envelope=spec.envelope
             )
             return tuple(found), [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
 

@@ -81,12 +81,6 @@ class ResponsePoints(NamedTuple):
         return ResponsePoints(self.states[rows], self.ends[rows], self.fastest[rows], self.command[rows])
 
 
-def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices:
-    """Samples (m,) of the largest of speeds (m, n) after the step, without a dither's ripple of this period [s]."""
-    first = grid.step_index
-    return np.asarray(first + first_largest(without_ripple(grid.t, speed, period)[:, first:]))
-
-
 @dataclass(frozen=True, eq=False)
 class PointFinder:
     """Function that gives the operating points of simulated lanes, by a second run up to the fastest sample.
@@ -524,9 +518,11 @@ class Simulator:
                 out.response_points.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
 
     def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float) -> Indices:
-        """Samples of the largest speed, as `ResponsePoints` has them; zeros for a plant without an axis."""
-        k = speed_output(self.loop, self.sampled.channels)
-        return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period)
+        """Samples (m,) of the largest speed after the step, without a dither's ripple; zeros without an axis."""
+        k, first = speed_output(self.loop, self.sampled.channels), grid.step_index
+        if k is None:
+            return np.zeros(len(y), dtype=np.intp)
+        return np.asarray(first + first_largest(without_ripple(grid.t, y[:, :, k], period)[:, first:]))
 
     def _fastest_eigenvalue(self, references: Sequence[Reference]) -> float:
         """The rate of the fastest mode over the gains' box and all plants [1/s].
