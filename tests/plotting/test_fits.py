@@ -182,6 +182,8 @@ def test_residuals_show_what_is_left_in_them() -> None:
         assert told.get_text().startswith("Ljung-Box p")
         assert ("< 1e-4" in told.get_text()) is expected
         assert (spread.get_xlabel(), spread.get_ylabel()) == ("residual / noise", "")
+        bars = [(b.get_x() + b.get_width() / 2, b.get_height() * b.get_width()) for b in spread.patches]
+        assert sum(share for centre, share in bars if abs(centre) < 1) < 0.75  # of a normal distribution 0.68
 
 
 def test_correlations_are_cells_and_never_a_rounded_one() -> None:
