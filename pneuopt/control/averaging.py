@@ -132,7 +132,24 @@ def ripple(
     else:
         check_names("state or input", at, [*states, *inputs], "average_dither: at")
         point = np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
-    return dict(zip(states, _first_harmonic(dithered, complete, point, nodes).tolist(), strict=True))
+    require(nodes >= 8, f"nodes must be at least 8, got {nodes}")
+    imbalance, full = dithered.imbalance(nodes), complete.value(DITHER_AMPLITUDE)
+    scale = np.tile([q.nominal for q in dithered.system.states], 2)
+
+    def solve_harmonic(fraction: float, start: Array) -> Array | None:
+        p = parameter_vector(dithered.parameters, complete.with_values({DITHER_AMPLITUDE: fraction * full}))
+        return _newton_root(lambda z: imbalance(z * scale, *point, p), scale, start)
+
+    found = solve_harmonic(1.0, np.zeros_like(scale))
+    if found is None:  # the amplitude is raised step by step
+        found, before = np.zeros_like(scale), AMPLITUDE_FRACTIONS[0]
+        for fraction in AMPLITUDE_FRACTIONS:
+            found, before = solve_harmonic(fraction, found * fraction / before), fraction
+            where = f"for a dither of {fraction * full:g} at {dithered.frequency:g} Hz"
+            if found is None:
+                raise ConvergenceError(f"no ripple found {where}; give another operating point, or more nodes")
+    a, b = np.split(found * scale, 2)
+    return dict(zip(states, (a + 1j * b).tolist(), strict=True))
 
 
 def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Array:
@@ -231,36 +248,26 @@ def _add_dither(
     for name in (DITHER_AMPLITUDE, DITHER_FREQUENCY):
         positive = name in parameters and parameters.value(name) > 0
         require(positive, f"averaging needs a dither: parameters with {name} > 0")
-    frequency = parameters.value(DITHER_FREQUENCY)
-    if model.loop is not None:
-        return _dithered_loop(model.loop, frequency, waveform)
-    return _dithered_plant(model.plant, frequency, actuated, waveform)
+    frequency, plant, loop = parameters.value(DITHER_FREQUENCY), model.plant, model.loop
+    if loop is not None:
+        sampled = "the controller is sampled; average the plant, ClosedLoop(average_dither(plant, parameters), pid)"
+        require(loop.dither is not None, "averaging needs a loop with dither: ClosedLoop(plant, pid, Dither())")
+        require(loop.pid.sample_time is None, sampled)
+        own = loop.dither.waveform if loop.dither else Waveform.SINE
+        require(waveform in (None, own), f"the loop's dither is a {own.value}; leave waveform= out")
 
+        def loop_motion(parameters: ParameterSet, reference: float) -> tuple[Array, Array]:
+            inputs = np.array([reference if n == "reference" else 0.0 for n in names(loop.inputs)])
+            return loop.initial(parameters, reference=reference), inputs
 
-def _dithered_loop(loop: ClosedLoop, frequency: float, waveform: Waveform | None) -> _DitheredSystem:
-    sampled = "the controller is sampled; average the plant, ClosedLoop(average_dither(plant, parameters), pid)"
-    require(loop.dither is not None, "averaging needs a loop with dither: ClosedLoop(plant, pid, Dither())")
-    require(loop.pid.sample_time is None, sampled)
-    own = loop.dither.waveform if loop.dither else Waveform.SINE
-    require(waveform in (None, own), f"the loop's dither is a {own.value}; leave waveform= out")
-
-    def steady_motion(parameters: ParameterSet, reference: float) -> tuple[Array, Array]:
-        inputs = np.array([reference if n == "reference" else 0.0 for n in names(loop.inputs)])
-        return loop.initial(parameters, reference=reference), inputs
-
-    return _DitheredSystem(loop.system(), loop.parameters, frequency, None, own, steady_motion)
-
-
-def _dithered_plant(
-    plant: System, frequency: float, actuated: str | None, waveform: Waveform | None
-) -> _DitheredSystem:
+        return _DitheredSystem(loop.system(), loop.parameters, frequency, None, own, loop_motion)
     inputs = {q.name: q for q in plant.inputs}
     name = actuated or next(iter(inputs), "")
     require(actuated is not None or len(inputs) == 1, f"the plant has the inputs {', '.join(inputs)}; choose actuated=")
     check_names("input", [name], inputs, "average_dither: actuated")
     added = ParameterSet({n: Parameter(0.0, inputs[name].unit) for n in (DITHER_AMPLITUDE, DITHER_OFFSET)})
 
-    def steady_motion(parameters: ParameterSet, reference: float) -> tuple[Array, Array]:
+    def plant_motion(parameters: ParameterSet, reference: float) -> tuple[Array, Array]:
         if plant.rest_hook is None:
             return np.zeros(len(plant.states)), np.zeros(len(inputs))
         rest = plant.rest_hook(parameters, {"speed": reference})
@@ -268,31 +275,7 @@ def _dithered_plant(
         return states, np.array([rest.inputs.get(n, 0.0) for n in inputs])
 
     own = waveform or Waveform.SINE
-    return _DitheredSystem(plant, plant.parameters | added, frequency, name, own, steady_motion)
-
-
-def _first_harmonic(
-    dithered: _DitheredSystem, parameters: ParameterSet, point: tuple[Array, Array], nodes: int
-) -> NDArray[np.complex128]:
-    """Newton's method; where it fails, the amplitude is raised step by step."""
-    require(nodes >= 8, f"nodes must be at least 8, got {nodes}")
-    imbalance, full = dithered.imbalance(nodes), parameters.value(DITHER_AMPLITUDE)
-    scale = np.tile([q.nominal for q in dithered.system.states], 2)
-
-    def solve_harmonic(fraction: float, start: Array) -> Array | None:
-        p = parameter_vector(dithered.parameters, parameters.with_values({DITHER_AMPLITUDE: fraction * full}))
-        return _newton_root(lambda z: imbalance(z * scale, *point, p), scale, start)
-
-    found = solve_harmonic(1.0, np.zeros_like(scale))
-    if found is None:
-        found, before = np.zeros_like(scale), AMPLITUDE_FRACTIONS[0]
-        for fraction in AMPLITUDE_FRACTIONS:
-            found, before = solve_harmonic(fraction, found * fraction / before), fraction
-            where = f"for a dither of {fraction * full:g} at {dithered.frequency:g} Hz"
-            if found is None:
-                raise ConvergenceError(f"no ripple found {where}; give another operating point, or more nodes")
-    a, b = np.split(found * scale, 2)
-    return np.asarray(a + 1j * b)
+    return _DitheredSystem(plant, plant.parameters | added, frequency, name, own, plant_motion)
 
 
 def _newton_root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: Array) -> Array | None:

@@ -73,31 +73,24 @@ class Compensator(Protocol):
 
     def check(self, on: SensedSignal, axis: Axis | None) -> None:
         """Raise `ModelError` where it does not fit the loop's signal, its plant or its sample time."""
-        ...
 
     def parameters(self, on: SensedSignal, unit: str) -> ParameterSet:
         """Its parameters for a signal and a command's unit; a value outside their bounds cannot run."""
-        ...
 
     def reads(self, on: SensedSignal) -> tuple[str, ...]:
         """Outputs of the plant that it reads beside the loop's own signal."""
-        ...
 
     def motion_inputs(self, on: SensedSignal) -> tuple[str, ...]:
         """Rates of the reference that it uses: names of the loop's inputs."""
-        ...
 
     def states(self, on: SensedSignal, command: Quantity) -> tuple[Quantity, ...]:
         """What it remembers."""
-        ...
 
     def start(self, on: SensedSignal, seen: ControllerSnapshot) -> list[Any]:
         """The states in a loop whose signals have been constant so far, or with a sampled PID since the last sample."""
-        ...
 
     def act(self, seen: ControllerSnapshot, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The states' rates, or with a sampled PID their next values, and what it adds to the command."""
-        ...
 
 
 def check_compensators(given: object, on: SensedSignal, axis: Axis | None) -> None:

@@ -157,8 +157,7 @@ class ControllerUpdate(NamedTuple):
 class Controller:
     """A PID and all that acts beside it; its parts are those of `ClosedLoop`.
 
-    Its methods take states, inputs, outputs and parameters by their names in a loop ("pid.Kp"), as numbers or as
-    symbols, in mappings that may hold others, too.
+    Its methods take states, inputs, outputs and parameters, numbers or symbols, by their names in a loop ("pid.Kp").
     """
 
     pid: PID

@@ -141,8 +141,7 @@ class OpenLoops(NamedTuple):
 class ComposedLoops:
     """Function that linearises many loops of one kind; machine code of the plant's Jacobian pays for many plants.
 
-    Under dither the plant is the mean over its ripple, as in `AveragedPlant`, with a controller that does not react to
-    the ripple.
+    Under dither the plant is the mean over its ripple (`AveragedPlant`), to which the controller does not react.
     """
 
     loop: ClosedLoop
@@ -172,7 +171,7 @@ class ComposedLoops:
     def _plants(self, p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array], Array]:
         """A, B and C of the plants with a sensor's lag, in scaled states, and their outputs, shape (m, n_outputs)."""
         loop, scale = self.loop, np.array([q.nominal for q in self.loop.plant.states])
-        A, B, _, _, _ = self._average(p, x, u)
+        A, B, _, _, _ = _averaged_plant(loop, self.compiled)(p, x, u)
         A, B = A * scale / scale[:, None], (B / scale)[..., None]
         own = p[:, [list(loop.parameters).index(n) for n in loop.plant.parameters]]
         slopes, shown = self._outputs(x.T, u.T, own.T)
@@ -193,10 +192,6 @@ class ComposedLoops:
         y, p = ({n: ca.SX.sym(n) for n in own} for own in (names(loop.plant.outputs), loop.parameters))
         frozen = loop.controller.schedule_gains(p, y[loop.pid_signal.name], {}, y)
         return ca.Function("frozen", [stack(p), stack(y)], [stack(frozen)])
-
-    @cached_property
-    def _average(self) -> AveragedPlant:
-        return AveragedPlant(self.loop, self.compiled)
 
     @cached_property
     def _outputs(self) -> ca.Function:

@@ -433,9 +433,8 @@ def find_rest(
 ) -> tuple[Array, float]:
     """The plant's state and the command, at rest or in steady motion; `start` is what else is known of the plant.
 
-    A plant with a `rest_hook` gives them. Otherwise they are the equilibrium of plant and controller; a state that
-    neither the rates nor the measured output depend on, such as the position of an axis under speed control, is left
-    out and may keep moving.
+    Without a `rest_hook` they are the equilibrium of plant and controller, less states on which neither rates nor the
+    measured output depend, such as the position of an axis under speed control: those may keep moving.
     """
     plant, measured = loop.plant, loop.feedback.name
     require(measured not in start, f"start: {measured!r} is what the loop controls; give it as initial=")

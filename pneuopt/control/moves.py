@@ -487,14 +487,10 @@ class SCurve:
     jerk_time: float  # from no acceleration to the largest [s]; 0 makes it a trapezoid of speed
 
     @property
-    def cruise_time(self) -> float:
-        """At the peak speed [s]."""
-        return max(0.0, self.distance / self.peak_speed - self.acceleration_time)
-
-    @property
     def duration(self) -> float:
         """From rest to rest [s]."""
-        return 2 * self.acceleration_time + self.cruise_time
+        at_peak_speed = max(0.0, self.distance / self.peak_speed - self.acceleration_time)
+        return 2 * self.acceleration_time + at_peak_speed
 
     def motion(self, t: Array) -> tuple[Array, Array, Array]:
         """See `PlannedMotion`; the second half is the first, mirrored, so that the end is met exactly."""
@@ -544,11 +540,6 @@ def plan_s_curve(distance: float, speed: float, acceleration: float, jerk: float
     """The fastest move from rest to rest within limits of speed, acceleration and jerk; without jerk's a trapezoid.
 
     L. Biagiotti and C. Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), sections 3.2 and 3.4.
-
-    Examples
-    --------
-    >>> plan_s_curve(0.2, speed=0.5, acceleration=5.0).duration, plan_s_curve(0.2, 0.5, 5.0, 100.0).duration
-    (0.5, 0.55)
     """
     ramp = acceleration / jerk  # [s], from no acceleration to the largest
     if speed >= acceleration * ramp:

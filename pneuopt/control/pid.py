@@ -159,22 +159,17 @@ class PID:
         ['Kp', 'Ti', 'Td', 'N', 'b', 'c']
         """
         h, gain = self.sample_time or 0.0, unit_ratio(output_unit, input_unit)
-        shortest = h or SHORTEST_TIME
+        shortest, integral = h or SHORTEST_TIME, unit_ratio(output_unit, f"{difference_unit(input_unit)}*s")
+        derivative = unit_ratio(f"{difference_unit(output_unit)}*s", input_unit)
         known = {
             "Kp": Parameter(1.0, gain, meaning="proportional gain"),
             "K": Parameter(1.0, gain, meaning="gain of the series form"),
-            "Ki": Parameter(0.0, unit_ratio(output_unit, f"{difference_unit(input_unit)}*s"), meaning="integral gain"),
-            "Kd": Parameter(
-                0.0, unit_ratio(f"{difference_unit(output_unit)}*s", input_unit), meaning="derivative gain"
-            ),
-            "Tf": Parameter(
-                0.01, "s", lower=0.0 if h else shortest, meaning="time constant of the derivative's filter"
-            ),
+            "Ki": Parameter(0.0, integral, meaning="integral gain"),
+            "Kd": Parameter(0.0, derivative, meaning="derivative gain"),
+            "Tf": Parameter(0.01, "s", 0.0 if h else shortest, meaning="time constant of the derivative's filter"),
             "Ti": Parameter(inf, "s", lower=0.0, meaning="integral time; inf: no integral action"),
             "Td": Parameter(0.0, "s", lower=0.0, meaning="derivative time"),
-            "N": Parameter(
-                10.0, "1", lower=0.0, meaning="derivative filter as the ISA ratio, Tf = Td/N; inf: no filter"
-            ),
+            "N": Parameter(10.0, "1", 0.0, meaning="derivative filter as the ISA ratio, Tf = Td/N; inf: no filter"),
         }
         core = {n: known[n] for n in self.form.gains}
         weights = {
@@ -186,16 +181,18 @@ class PID:
         if self.dead_band:
             core["dead_band"] = Parameter(0.0, difference_unit(input_unit), lower=0.0, meaning=band)
         saturation = {
-            "Tt": Parameter(
-                _default_Tt(h), "s", lower=shortest, meaning="time in which the integral unwinds at a limit"
-            ),
+            "Tt": Parameter(_default_Tt(h), "s", shortest, meaning="time in which the integral unwinds at a limit"),
             "lower": Parameter(-inf, output_unit, meaning="least command"),
             "upper": Parameter(inf, output_unit, meaning="largest command"),
         }
         if self.anti_windup is AntiWindup.CLAMPING:
             del saturation["Tt"]
         found = ParameterSet(core | saturation if self.limits else core)
-        found = found | _fault_parameters(output_unit) if h else found
+        if h:
+            bad = "samples in a row that are no numbers, after which the output goes to its safe value"
+            safe = "output after that many, as the command counts: 0 is the centre"
+            faults = {"fault_samples": Parameter(FAULT_SAMPLES, "1", lower=0.0, meaning=bad)}
+            found |= ParameterSet(faults | {"fault_output": Parameter(0.0, output_unit, meaning=safe)})
         return found | reset_parameters(reference_unit or input_unit) if self.reset else found
 
     @property
@@ -378,17 +375,6 @@ def integrates(Ki: Any) -> Any:
 
 def _default_Tt(h: float) -> float:
     return max(0.1, 10 * h)
-
-
-def _fault_parameters(unit: str) -> ParameterSet:
-    count = "samples in a row that are no numbers, after which the output goes to its safe value"
-    safe = "output after that many, as the command counts: 0 is the centre"
-    return ParameterSet(
-        {
-            "fault_samples": Parameter(FAULT_SAMPLES, "1", lower=0.0, meaning=count),
-            "fault_output": Parameter(0.0, unit, meaning=safe),
-        }
-    )
 
 
 @dataclass(frozen=True)

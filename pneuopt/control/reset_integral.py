@@ -46,16 +46,9 @@ def reset_integral(x: Symbols, error: Any, p: Symbols) -> dict[str, ca.SX]:
 
 def reset_parameters(unit: str) -> ParameterSet:
     """The ratio [1], and the error within which no change of sign counts, of a signal of this unit."""
-    return ParameterSet(
-        {
-            "reset_ratio": Parameter(
-                1.0, "1", lower=0.0, upper=1.0, meaning="part of the integral that is kept, its sign turned"
-            ),
-            "reset_band": Parameter(
-                0.0, difference_unit(unit), lower=0.0, meaning="error within which no change of its sign counts"
-            ),
-        }
-    )
+    kept = "part of the integral that is kept, its sign turned"
+    still = Parameter(0.0, difference_unit(unit), 0.0, meaning="error within which no change of its sign counts")
+    return ParameterSet({"reset_ratio": Parameter(1.0, "1", 0.0, 1.0, meaning=kept), "reset_band": still})
 
 
 def reset_quantities(measured: Quantity) -> tuple[Quantity, ...]:

@@ -7,26 +7,18 @@ A certificate without findings means, for the gains as printed and on every refe
   `Metric.resolution` of its terms where it is nearly zero.
 * The linear loop is stable, with the margins that are shown, at every operating point of `Certificate.margins`.
 * The response has come to rest, or to a periodic orbit inside the settling band, at the reference. A horizon can end
-  too early to tell. So the response is continued, its length doubled again and again, until signal and command stand,
-  to sixteen horizons, or to the end of the stroke, which a note then says. Growth, hunting and creep that begin beyond
-  the horizon are findings, and so is a response that a budget of simulated instants leaves undecided. The metrics stay
-  those of the horizon, but for a SettlingTime that the continuation refutes, which is NaN, and an Overshoot that it
-  exceeds.
+  too early to tell, so the response is continued, its length doubled again and again, until signal and command stand,
+  to sixteen horizons, or to the end of the stroke, which a note then says. The metrics stay those of the horizon, but
+  for a SettlingTime that the continuation refutes, which is NaN, and an Overshoot that it exceeds.
 
-A design with a finding is never "converged", whatever was asked, unless `tune(..., accept=...)` names the defect. A
-rest off the reference is none where a limit on SteadyStateError allows it.
-
-What it does not mean: other plants than the scenarios may behave otherwise, and the model may be wrong.
+A design with a finding is never "converged", unless `tune(..., accept=...)` names the defect. Other plants than the
+scenarios may behave otherwise, and the model may be wrong.
 
 The certificate shares the model with the search, its equations, parameters, rest, linearisation and compiled right-hand
-side; the definitions of the metrics, which read both responses; and the formulas of frequency responses and stability.
-It shares no step of the search: the search integrates by steps of RK4 on its own samples and reads the margins of many
-loops at once off a grid; the certificate integrates by SciPy's LSODA with step control on a closer grid, and refines
-each margin to machine precision. That what is shared is right is shown by tests against hand-written plants, SciPy and
-python-control.
-
-In this order: what is found (`Certificate`), how a response is continued beyond its horizon (`ContinuedResponse`), how
-it ends there (`Ending`), and settling bands that are narrower than what a sensor's counts show (`describe_counts`).
+side; the definitions of the metrics; and the formulas of frequency responses and stability. It shares no step of the
+search: the search integrates by steps of RK4 on its own samples and reads the margins of many loops at once off a grid;
+the certificate integrates by SciPy's LSODA with step control on a closer grid, and refines each margin to machine
+precision. That what is shared is right is shown by tests against hand-written plants, SciPy and python-control.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -189,10 +181,9 @@ def certificate(
 def judge_evaluations(
     evaluations: Sequence[CaseEvaluation], band: Band, rest_error: float = 0.0, *, continues: bool = True
 ) -> Certificate:
-    """The certificate of gains that have been evaluated on every case.
+    """The certificate of evaluated gains, whose loops may rest a fraction `rest_error` of the step off the reference.
 
-    Their loops may rest a fraction `rest_error` of the step off the reference. Without `continues`, for gains that are
-    refused already, the certificate is of the linear loop only.
+    Without `continues`, for gains that are refused already, it is of the linear loop only.
     """
     import pandas as pd
 
@@ -279,11 +270,6 @@ class ContinuedResponse:
         """The mean signal's distance from the reference in steps, positive beyond it, at the instants `times`."""
         return (self._mean(self.signal, self.reference.initial) - self.reference.final) / self.reference.nominal_size
 
-    @cached_property
-    def mean_command(self) -> Array:
-        """The command's mean at the instants `times` [its unit]."""
-        return self._mean(self.command, float(self.command[0]))
-
     def since(self, share: float) -> slice:
         """The instants of `times` from this share of the record on."""
         return slice(int(np.searchsorted(self.times, share * self.times[-1])), None)
@@ -295,7 +281,7 @@ class ContinuedResponse:
     def is_decided(self, band: float) -> bool:
         """Whether signal and command stand and the linear loop is stable, or nothing is left to simulate."""
         ahead = 2 * (MAX_HORIZONS * self.horizon / self.t[-1] - 1)  # halves of the record still to come
-        drift = np.ptp(self.mean_command[self.since(0.5)]) * ahead
+        drift = np.ptp(self._mean(self.command, float(self.command[0]))[self.since(0.5)]) * ahead
         quiet = self.is_stable and self.stands(band) and drift <= COMMAND_DRIFT_SHARE * np.abs(self.command).max()
         return self.is_over or bool(quiet)
 
@@ -319,9 +305,15 @@ def continue_response(found: CaseEvaluation, band: float) -> ContinuedResponse:
         if not contact and np.any(limit.side * (limit.limit(found.parameters) - run[limit.state][1:]) <= 0):
             contact = f"{limit.event} within the horizon"
     continued = ContinuedResponse(loop, reference, period, t, y, u, contact=contact, is_stable=stable)
-    left = MAX_CONTINUATION_INSTANTS
-    while not continued.is_decided(band):
-        inputs, instants = _next_inputs(found, run.t[-1], continued)
+    left, spacing = MAX_CONTINUATION_INSTANTS, sample_spacing(loop, reference, found.parameters)
+    readings = 1 if loop.pid.sample_time is None else readings_a_sample(loop, reference)
+    held = {"reference": reference.final, **{disturbance_input(n): v for n, v in reference.disturbance.items()}}
+    while not continued.is_decided(band):  # the inputs stay as they were after the step
+        length = min(continued.t[-1], MAX_HORIZONS * continued.horizon - continued.t[-1])
+        count = max(1, int(np.ceil(length / spacing - 1e-9)))
+        at = run.t[-1] + spacing * np.arange(count + 1)
+        inputs = Trajectory(at, {q.name: np.full(len(at), held.get(q.name, 0.0)) for q in loop.inputs})
+        instants = np.linspace(at[0], at[-1], readings * count + 1)
         left -= len(instants)
         if left < 0:
             return replace(continued, is_cut=True)
@@ -336,19 +328,6 @@ def continue_response(found: CaseEvaluation, band: float) -> ContinuedResponse:
         t, y, u = (np.concatenate(parts) for parts in zip(known, (t, y, u), strict=True))
         continued = replace(continued, t=t, signal=y, command=u, contact=str(met[0]) if met else "")
     return continued
-
-
-def _next_inputs(found: CaseEvaluation, begin: float, continued: ContinuedResponse) -> tuple[Trajectory, Array]:
-    """Inputs that stay as they were after the step for once more the record's length, and instants to report."""
-    loop, reference, h = found.loop, found.case.reference, found.loop.pid.sample_time
-    length = min(continued.t[-1], MAX_HORIZONS * continued.horizon - continued.t[-1])
-    spacing = sample_spacing(loop, reference, found.parameters)
-    count = max(1, int(np.ceil(length / spacing - 1e-9)))
-    t = begin + spacing * np.arange(count + 1)
-    held = {"reference": reference.final, **{disturbance_input(n): v for n, v in reference.disturbance.items()}}
-    columns = {q.name: np.full(len(t), held.get(q.name, 0.0)) for q in loop.inputs}
-    readings = 1 if h is None else readings_a_sample(loop, reference)
-    return Trajectory(t, columns), np.linspace(t[0], t[-1], readings * count + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,12 +402,6 @@ class Ending:
         inside = self.is_inside(self.response.error[self.response.since(share)])
         return int(np.sum(inside[:-1] & ~inside[1:]))
 
-    @property
-    def largest_overshoot(self) -> float:
-        """The mean's largest distance beyond the reference, in steps; on either side where only a disturbance steps."""
-        error = self.response.error
-        return float(max(0.0, (error if self.response.reference.changes else np.abs(error)).max()))
-
     def refutes(self, settling_time: float) -> bool:
         """Whether the mean leaves the band after this instant, beyond the horizon [s]."""
         beyond = self.response.error[self.response.times > self.response.horizon]
@@ -476,7 +449,8 @@ class Ending:
 
         SettlingTime is NaN where the mean leaves the band again; the overshoot is the continuation's if that is larger.
         """
-        largest = self.largest_overshoot
+        error = self.response.error
+        largest = float(max(0.0, (error if self.response.reference.changes else np.abs(error)).max()))
         times = [n for n in ("SettlingTime", "SettlingTimeRaw") if n in metrics]
         refuted = dict.fromkeys(times, nan) if self.refutes(metrics["SettlingTime"]) else {}
         higher = {"Overshoot": 100 * largest, "OvershootDistance": largest * abs(self.response.reference.nominal_size)}

@@ -87,32 +87,16 @@ PRICE_METRICS = {
 
 @dataclass(frozen=True)
 class DitherEffect:
-    """Amplitudes that a dither causes, by harmonic balance of the nonlinear plant; NaN where they are not known.
+    """Amplitudes that a dither causes, by harmonic balance of the nonlinear plant; NaN where they are not known."""
 
-    Attributes
-    ----------
-    amplitude, frequency : float
-        [command's unit], [Hz]
-    spool : float
-        Amplitude of the final element's moving part, a valve's spool [half travels].
-    valve_gain : float
-        Ratio of the spool's amplitude to the command's, which the valve's lag reduces [1].
-    force : float
-        Amplitude of the force on a body held fast at rest [the axis's unit of force].
-    speed, travel : float
-        Amplitudes of a body that moves at the reference's final speed [its speed's unit], [that times s].
-    drive_frequency : float
-        Natural frequency of the load on the element's medium, the air in the chambers, without friction [Hz].
-    """
-
-    amplitude: float
-    frequency: float
-    spool: float = nan
-    valve_gain: float = nan
-    force: float = nan
-    speed: float = nan
-    travel: float = nan
-    drive_frequency: float = nan
+    amplitude: float  # [command's unit]
+    frequency: float  # [Hz]
+    spool: float = nan  # of the final element's moving part, a valve's spool [half travels]
+    valve_gain: float = nan  # ratio of the spool's amplitude to the command's, which the valve's lag reduces [1]
+    force: float = nan  # on a body held fast at rest [the axis's unit of force]
+    speed: float = nan  # of a body that moves at the reference's final speed [its speed's unit]
+    travel: float = nan  # of that body [its speed's unit times s]
+    drive_frequency: float = nan  # natural frequency of the load on the air in the chambers, without friction [Hz]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

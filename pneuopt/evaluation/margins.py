@@ -1,8 +1,5 @@
 """Frequency response and robustness margins of a loop, at each operating point of a step response; the worst counts.
 
-`margins` gives those of one linear loop, to machine precision: crossings and peaks are bracketed on a grid that
-resolves the loop's features, and refined. `are_stable` judges each pole by how far rounding may have moved it.
-
 A nonlinear loop has as many margins as it has operating points. Three count here (`operating_points`), since a loop
 stays near each of them for long enough to oscillate there:
 
@@ -14,13 +11,11 @@ stays near each of them for long enough to oscillate there:
 
 A passage through the friction's falling branch on the way is no such point: it lasts for milliseconds, in which nothing
 can grow. Under dither the points are those of the response without its ripple, and the loop is averaged over the ripple
-there. A mean over the dither's period alone would smooth a fast command, even under a dither of a picovolt. A plant
-whose Jacobian is the same everywhere has one point, its end.
+there. A mean over the dither's period alone would smooth a fast command, even under a dither of a picovolt.
 
 Searches read the margins and sensitivity peaks of many loops at once (`sensitivity_peaks`). The sensitivity of a loop
-whose open loop rolls off is ``S(s) = prod (s - p)/prod (s - q)`` over the poles p of the open and q of the closed loop.
-So it takes no frequency response of the plant, and the resonances are known beforehand: they lie near the closed loop's
-poles.
+whose open loop rolls off is ``S(s) = prod (s - p)/prod (s - q)`` over the poles p of the open and q of the closed loop,
+so it takes no frequency response of the plant, and the resonances lie near the closed loop's poles.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -215,14 +210,6 @@ def noise_gain(
     The controller is Kp, Ki, Kd, Tf of a PID with Tf > 0, or a linear system (`noise_path`). Lower frequencies than
     `lowest_frequency` [rad/s] do not count: an integral answers a constant error of a measured speed without bound
     where the plant cannot go on moving so, a piston whose chambers fill for example.
-
-    Examples
-    --------
-    A gain of 3 before ``1/(s + 1)`` follows noise at high frequencies with that gain, at rest with 3/4:
-
-    >>> L = Linearisation(*(np.array([[v]]) for v in (-1.0, 1.0, 3.0, 0.0)), ("x",), ("u",), ("y",))
-    >>> noise_gain(L, (3.0, 0.0, 0.0, 0.01))
-    3.0
     """
     if isinstance(controller, Linearisation):
         at_infinity = float(controller.D[0, 0] / (1 + open_loop.D[0, 0]))
@@ -331,10 +318,9 @@ def _closed_loop(open_loop: Linearisation) -> Array:
 
 
 def are_stable(closed: Array, poles: ComplexArray | None = None) -> NDArray[np.bool_]:
-    """Which closed loops are stable, by their state matrices, shape (m, n, n), and their poles where they are known.
+    """Which closed loops are stable, by their state matrices (m, n, n), and their poles where they are known.
 
-    Poles at zero are allowed, a position in a speed loop or an unused integral: a pole counts as zero where rounding
-    may have moved it that far, whatever the fastest pole (`_has_stable_poles`).
+    A pole counts as zero, which is allowed, where rounding may have moved it that far (`_has_stable_poles`).
     """
     found = np.linalg.eigvals(closed).astype(complex) if poles is None else poles
     growth, size = found.real.max(axis=-1, initial=-1.0), np.abs(found).max(axis=-1, initial=1.0)
@@ -347,10 +333,9 @@ def are_stable(closed: Array, poles: ComplexArray | None = None) -> NDArray[np.b
 
 
 def _has_stable_poles(A: Array) -> bool:
-    """Whether no pole of a matrix, none of whose parts stands alone, lies further right of zero than rounding moves it.
+    """Whether no pole of a matrix in one part lies further right of zero than `POLE_ROUNDING` in its condition allows.
 
-    That is `POLE_ROUNDING` times the size of the balanced matrix times the pole's condition number: G. H. Golub & C. F.
-    Van Loan, Matrix Computations, 4th ed., Johns Hopkins 2013, section 7.2.2.
+    G. H. Golub & C. F. Van Loan, Matrix Computations, 4th ed., Johns Hopkins 2013, section 7.2.2.
     """
     balanced = matrix_balance(A)[0]
     parts: Any = eig(balanced, left=True, right=True)
@@ -360,15 +345,11 @@ def _has_stable_poles(A: Array) -> bool:
     return bool((poles.real <= POLE_ROUNDING * np.linalg.norm(balanced) * condition).all())
 
 
-def sensitivity_terms(
-    loop: ClosedLoop, omega: ArrayLike, parameters: ParameterSet, x: Array | None = None
-) -> ca.Function:
-    """``|1 + L(jw)|^2`` as a smooth function of the PID's gains; ``1/Ms^2`` is its lower bound where Ms is kept.
+def sensitivity_terms(loop: ClosedLoop, omega: ArrayLike, parameters: ParameterSet) -> ca.Function:
+    """``|1 + L(jw)|^2`` as a smooth function of the PID's gains, which limits Ms by ``terms(p) >= 1 / Ms**2``.
 
-    A search limits the maximum sensitivity Ms by ``terms(p) >= 1 / Ms**2``, p in the order of ``loop.parameters``:
-    numbers, SX or MX. The plant enters as numbers, its response at `parameters` and, where it is nonlinear, at the
-    state x, so each scenario needs its own terms, and none of its parameters may be free. A loop with a compensator
-    that counts, a cascade or scheduled gains is refused: its sensitivity is no such function of the gains.
+    The plant enters as numbers, its response at `parameters`: each scenario needs its own terms. A loop whose
+    sensitivity is no such function of the gains is refused.
     """
     shaping = ", ".join(type(c).__name__ for c in loop.controller.acting_always)
     for fits, reason in (
@@ -380,7 +361,7 @@ def sensitivity_terms(
     free = ", ".join(n for n in parameters.free_names if n in loop.plant.parameters)
     require(not free, f"{free}: free, but the sensitivity needs a fixed plant; fix it", ModelError)
     w = np.asarray(omega, dtype=float)
-    P = frequency_response(linear_plant(loop, parameters, x), w) * pade_delay_response(w, loop.dead_time)
+    P = frequency_response(linear_plant(loop, parameters), w) * pade_delay_response(w, loop.dead_time)
     p = ca.SX.sym("p", len(loop.parameters))
     Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
     ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
@@ -473,8 +454,7 @@ def margin_rows(
 def worst_margins(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     """The worst of each metric over operating points: NaN and infinite where the loop is unstable at one of them.
 
-    Of a gain margin that is the closest to one, of a phase margin the smallest magnitude, of a friction's slope the
-    smallest value.
+    Of a friction's slope that is the smallest value.
     """
     given, worst = list(rows), dict[str, float]()
     for metric in (n for n in MARGIN_METRICS if given and n in given[0]):
@@ -498,11 +478,7 @@ def counted_points(metric: str, count: int) -> int:
 
 
 def friction_slope(loop: ClosedLoop, parameters: ParameterSet, linear: Linearisation) -> dict[str, float]:
-    """FrictionSlope: derivative of the steady friction force to speed [N s/m]; for drives with a load.
-
-    This is the viscous friction of the linearised plant, or open loop, at low frequencies, where the bristles follow
-    the speed. A negative slope makes crawl likely.
-    """
+    """FrictionSlope: viscous friction [N s/m] of a linearised drive with a load, whose bristles follow the speed."""
     states, axis = names(loop.plant.states), loop.plant.axis
     if axis is None or not any(n.startswith("friction.") for n in loop.plant.parameters):
         return {}
@@ -539,10 +515,8 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
     The frequencies `omega` [rad/s], shape (n,), are positive, increasing; from `lowest_noise` on a noise gain counts.
     The function ``(p, x, u, only) -> found`` takes parameters, shape (m, n_parameters), in the order of
     ``loop.parameters``, and the plant's states and inputs at k operating points of each, shapes (k, m, n_plant_states)
-    and (k, m, n_plant_inputs), means under dither; its arguments are not checked. It gives an array of shape (m,) for
-    each name in `only`, the worst over the points: "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin",
-    "PhaseMargin" [deg] as in `Margins`, and "NoiseGain". Crossings are interpolated, peaks refined between the grid's
-    frequencies. Where a closed loop is unstable, its margins are NaN, its sensitivities and noise gain infinite.
+    and (k, m, n_plant_inputs), means under dither. It gives the worst over the points, shape (m,), for each name in
+    `only`, as `Margins` and `noise_gain` have them, NaN and infinite where a closed loop is unstable.
     """
     w = np.asarray(omega, dtype=float)
     if loop.is_composed:
@@ -778,14 +752,6 @@ def sensitivity_peaks(
 
     Its first grid has the frequencies about the closed loop's poles, and so many that are spread evenly: with fewer a
     broad maximum is missed. More loops at a time do not fit the processor's cache.
-
-    Examples
-    --------
-    ``L = 25/(s (s + 3))`` closes to poles at ``-1.5 +- 4.77j``:
-
-    >>> peak = sensitivity_peaks(np.array([[0.0, -3.0]]), np.roots([1.0, 3.0, 25.0])[None], 0.01, 1e3)
-    >>> round(float(peak[0]), 4)
-    1.9946
     """
     parts, peaks = np.arange(0, len(opened), at_a_time)[1:], list[Array]()
     for p, q in zip(np.split(opened, parts), np.split(closed, parts), strict=True):

@@ -398,14 +398,7 @@ def remove_ripple(t: Array, y: Array, means: Array, period: float) -> RippleFree
 
 
 def describe_ripple(metrics: Mapping[str, float], size: float, band: float) -> str | None:
-    """Sentence for a response of which only the mean over the dither's period settles; None for others.
-
-    Examples
-    --------
-    >>> from math import nan
-    >>> print(describe_ripple({"SettlingTime": 0.0931, "SettlingTimeRaw": nan, "Ripple": 0.018}, 0.1, 0.02))
-    only the mean settles, in 0.0931 s: a ripple of 18 % of the step takes the signal itself out of the band of +-2 %
-    """
+    """Sentence for a response of which only the mean over the dither's period settles; None for others."""
     settled, raw, ripple = (metrics[n] for n in ("SettlingTime", "SettlingTimeRaw", "Ripple"))
     if isnan(settled) or not isnan(raw):
         return None
@@ -417,8 +410,7 @@ def describe_ripple(metrics: Mapping[str, float], size: float, band: float) -> s
 def measure_ripple(t: Array, rest: Array, period: float) -> Array:
     """Peak to peak of what repeats with the dither in the last periods, shape (m,), of signals less their means (m, n).
 
-    It is that of the mean over the periods, in which an oscillation with another period averages out, or that of the
-    calmest period, which a late transient leaves alone, whichever is smaller.
+    The smaller of that of the mean over the periods and that of the calmest one, which a late transient leaves alone.
     """
     return ripple_and_slopes(t, (rest, np.zeros((len(rest), 0, len(t)))), *wave_instants(t, period))[0]
 
@@ -578,14 +570,7 @@ def band_number(band: Band) -> float:
 
 
 def band_share(band: Band, reference: Reference) -> float:
-    """Half width of a band as a fraction of the reference's size; refused where the response would begin settled.
-
-    Examples
-    --------
-    >>> from pneuopt.control.reference import Step
-    >>> band_share(0.02, Step(0.2)), band_share(Tolerance(1e-3), Step(0.2))
-    (0.02, 0.005)
-    """
+    """Half width of a band as a fraction of the reference's size; refused where the response would begin settled."""
     if not isinstance(band, Tolerance):
         require(0 < band < 1, f"band is a fraction between 0 and 1, got {band:g}; 2 % is 0.02")
         return band

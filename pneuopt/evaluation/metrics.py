@@ -215,9 +215,8 @@ def batch_metrics(
 ) -> dict[str, Array]:
     """Metrics (m,) of many step responses (m, n) on one grid at once; see `step_metrics`.
 
-    `only` names the metrics that are needed, others are left out where they cost time. `averaged`, shape (m, k), are
-    means over the dither's period at the first k samples from the step on, where they are known. `meter` has the
-    channels of the plant's meter (m, n). `wider` are further settling bands, "SettlingTimes" of shape (m, len(wider)).
+    `only` names the metrics that are needed; `averaged` (m, k) are known means over the dither's period from the step,
+    `meter` has the channels of the plant's meter (m, n), `wider` are further settling bands for "SettlingTimes".
     """
     require(scale is not None or reference_final != initial, f"no step: the reference stays at {initial:g}")
     shape = t.shape if control is None else control.shape[-1:]
@@ -406,17 +405,7 @@ def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajecto
 def refine_instants(
     t: Array, signal: Array, target: float, size: float, start: float, tolerance: float = 1.0
 ) -> Array | None:
-    """Instants with others added where readings are too far apart, by a multiple of the tolerances; None where nowhere.
-
-    Examples
-    --------
-    >>> t = np.linspace(0.0, 10.0, 101)
-    >>> finer = refine_instants(t, 1 - np.exp(-5 * t), 1.0, 1.0, 0.0)
-    >>> bool(finer[1] < t[1] and finer[-2] == t[-2])
-    True
-    >>> refine_instants(t, np.zeros(101), 1.0, 1.0, 0.0) is None
-    True
-    """
+    """Instants with others added where readings are too far apart, by a multiple of the tolerances; or None."""
     after, error = np.maximum(t - start, 0.0), np.where(t < start - 1e-12, 0.0, signal - target) / abs(size)
     coarse = np.diff(t) ** 2 / 8 * _curvatures(t, signal / abs(size)) > tolerance * LINE_TOLERANCE
     for integrand in (error, error**2, after * error):

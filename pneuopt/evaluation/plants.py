@@ -167,24 +167,13 @@ GAIN_PREFIXES = ("pid.", "feedforward.")
 
 @dataclass(frozen=True, eq=False)
 class CorrelatedParameters:
-    """Parameters that vary together from plant to plant, on their own.
-
-    Attributes
-    ----------
-    names : tuple of str
-    share : float
-        By which fraction of the value they vary, either way.
-    low, high : mapping of str to float or Factor
-        The scenario in which they are at their low, and at their high end, and nothing else differs.
-    is_gain : bool
-        Whether it is the controller's.
-    """
+    """Parameters that vary together from plant to plant, on their own."""
 
     names: tuple[str, ...]
-    share: float
-    low: Mapping[str, float | Factor]
+    share: float  # by which fraction of the value they vary, either way
+    low: Mapping[str, float | Factor]  # the scenario in which they are at their low end, and nothing else differs
     high: Mapping[str, float | Factor]
-    is_gain: bool = False
+    is_gain: bool = False  # of the controller
 
     @property
     def label(self) -> str:
@@ -292,8 +281,15 @@ def expected_plants(
         low, high = ({n: Factor(1 + side * share) for n in names} for side in (-1, 1))
         axes.append(CorrelatedParameters(tuple(names), share, low, high, names[0].startswith(GAIN_PREFIXES)))
     if estimated is not None:
+        from scipy.stats import t
+
         deviations = dict(zip(map(str, estimated.index), np.sqrt(np.diag(estimated)).tolist(), strict=True))
-        axes += [_estimate_axis(parameters, n, s, dof.get(n, math.inf)) for n, s in deviations.items()]
+        for n, deviation in deviations.items():
+            p, width = parameters[n], float(t.ppf(0.975, dof.get(n, math.inf))) * deviation  # half an interval of 95 %
+            ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
+            least, most = (float(min(max(end, p.lower), p.upper)) for end in ends)
+            share = width / abs(p.value) if p.value else 0.0
+            axes.append(CorrelatedParameters((n,), share, {n: least}, {n: most}))
     for n, (least, most) in ranges.items():
         value = abs(parameters.value(n))
         axes.append(CorrelatedParameters((n,), (most - least) / 2 / value if value else 0.0, {n: least}, {n: most}))
@@ -309,13 +305,3 @@ def _usual_tolerances(parameters: ParameterSet, others: Collection[str]) -> dict
         own = tuple(n for n in names if n in parameters and n not in others and parameters.value(n) != 0)
         found |= {own: share} if own else {}
     return found
-
-
-def _estimate_axis(parameters: ParameterSet, name: str, deviation: float, dof: float) -> CorrelatedParameters:
-    """An estimate with the interval that its standard deviation leaves, within its bounds."""
-    from scipy.stats import t
-
-    p, width = parameters[name], float(t.ppf(0.975, dof)) * deviation  # half an interval of 95 %
-    ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
-    low, high = (float(min(max(end, p.lower), p.upper)) for end in ends)
-    return CorrelatedParameters((name,), width / abs(p.value) if p.value else 0.0, {name: low}, {name: high})

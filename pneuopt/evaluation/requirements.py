@@ -11,6 +11,7 @@ stand first, the scales of values and limits last.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from math import inf
 from typing import Any, TypeVar, final
@@ -144,12 +145,7 @@ class FollowingError(AtMost):
     """
 
     metric = Metric(
-        "FollowingError",
-        "{measured}",
-        Source.RESPONSE,
-        resolution=1e-8,
-        slope=following_error_rows,
-        positions=True,
+        "FollowingError", "{measured}", Source.RESPONSE, resolution=1e-8, slope=following_error_rows, positions=True
     )
 
 
@@ -246,42 +242,31 @@ class RiseTime(AtMost):
     metric = Metric("RiseTime", "s", Source.RESPONSE)
 
 
+_share_of_step = partial(
+    Metric,
+    unit="1",
+    source=Source.RESPONSE,
+    percent=True,
+    limits=(0.0, 1.0),
+    floor=0.0,
+    resolution=1e-5,
+    headline=True,
+    exact=True,
+)
+
+
 @final
 class Overshoot(AtMost):
     """Distance of the response beyond the reference, as a fraction of the step."""
 
-    metric = Metric(
-        "Overshoot",
-        "1",
-        Source.RESPONSE,
-        percent=True,
-        limits=(0.0, 1.0),
-        advice="5 % is 0.05",
-        floor=0.0,
-        resolution=1e-5,
-        headline=True,
-        slope=overshoot_rows,
-        exact=True,
-    )
+    metric = _share_of_step("Overshoot", advice="5 % is 0.05", slope=overshoot_rows)
 
 
 @final
 class SteadyStateError(AtMost):
     """Distance from the reference at the end of the horizon, as a fraction of the step."""
 
-    metric = Metric(
-        "SteadyStateError",
-        "1",
-        Source.RESPONSE,
-        percent=True,
-        limits=(0.0, 1.0),
-        advice="2 % is 0.02",
-        floor=0.0,
-        resolution=1e-5,
-        headline=True,
-        slope=steady_state_rows,
-        exact=True,
-    )
+    metric = _share_of_step("SteadyStateError", advice="2 % is 0.02", slope=steady_state_rows)
 
 
 @final
@@ -480,13 +465,7 @@ def upper_limit(requirement: Requirement) -> float:
 
 
 def describe_value(requirement: Requirement, value: float) -> tuple[str, str]:
-    """A value of `requirement_values` and its limit, written as the user writes them: ("1.8", "at least 2").
-
-    Examples
-    --------
-    >>> describe_value(GainMargin(min=2.0), 1 / 1.8), describe_value(Overshoot(max=0.05), 0.06)
-    (('1.8', 'at least 2'), ('0.06', 'allowed 0.05'))
-    """
+    """A value of `requirement_values` and its limit, written as the user writes them: ("1.8", "at least 2")."""
     words = "at least" if requirement.metric.sense is Sense.AT_LEAST else "allowed"
     return f"{user_value(requirement, value):.6g}", f"{words} {user_limit(requirement):.6g}"
 

@@ -51,24 +51,12 @@ class Sampling(Enum):
 
 
 def further(seed: Seed, *words: str) -> Seed:
-    """A seed of another stream: what is drawn with it shares no number with what is drawn with the first.
-
-    Examples
-    --------
-    >>> further(3, "validation")
-    (3, 'validation')
-    """
+    """A seed of another stream: what is drawn with it shares no number with what is drawn with the first."""
     return (*(seed if isinstance(seed, tuple) else (seed,)), *words)
 
 
 def generator(seed: Seed, *stream: str) -> np.random.Generator:
-    """Random numbers of a stream, the same on every machine; those of two streams, of two names, are independent.
-
-    Examples
-    --------
-    >>> float(generator(0, "samples", "load.mass").random()) == float(generator(0, "draws", "load.mass").random())
-    False
-    """
+    """Random numbers of a stream, the same on every machine; those of two streams, of two names, are independent."""
     parts: list[int | str] = []
     for part in (*(seed if isinstance(seed, tuple) else (seed,)), *stream):
         if isinstance(part, str):
@@ -82,14 +70,7 @@ def generator(seed: Seed, *stream: str) -> np.random.Generator:
 
 
 def unit_points(sampling: Sampling, count: int, axes: Sequence[str], seed: Seed, kind: str) -> Array:
-    """Points of the unit cube, shape (count, n_axes); `kind` and each axis's name say which random numbers it has.
-
-    Examples
-    --------
-    >>> points = unit_points(Sampling.LATIN_HYPERCUBE, 4, ["mass", "force"], 0, "samples")
-    >>> np.sort((4 * points).astype(int), axis=0).tolist()
-    [[0, 0], [1, 1], [2, 2], [3, 3]]
-    """
+    """Points of the unit cube, shape (count, n_axes); `kind` and each axis's name say which random numbers it has."""
     return _POINTS[sampling](count, axes, further(seed, kind, sampling.value))
 
 
@@ -243,14 +224,7 @@ DISTRIBUTIONS: Mapping[str, type[Distribution]] = {
 
 
 def quantiles(distribution: Distribution, name: str, parameter: Parameter, shares: Array) -> Array:
-    """Values below which the given shares of a distribution lie [SI], the part of it within a parameter's bounds.
-
-    Examples
-    --------
-    >>> mass = Parameter(5.0, "kg", 0.0, 5.0)
-    >>> quantiles(Uniform((4.0, 6.0)), "load.mass", mass, np.array([0.0, 0.5, 1.0])).round(6).tolist()
-    [4.0, 4.5, 5.0]
-    """
+    """Values below which the given shares of a distribution lie [SI], the part of it within a parameter's bounds."""
     p, frozen = parameter, distribution.freeze(parameter.value)
     lower = max(p.lower, 0.0) if p.log else p.lower
     below, above = float(frozen.cdf(lower)), float(frozen.sf(p.upper))
@@ -508,6 +482,8 @@ def draws(
     InputError
         If the covariance names a parameter that the set lacks, or holds NaN: the logs could not identify that one.
     """
+    from scipy.stats import norm, t
+
     require(count >= 1, f"count must be at least 1, got {count}")
     names = [str(n) for n in covariance.index]
     check_names("parameter", names, parameters, "covariance")
@@ -523,11 +499,14 @@ def draws(
     variances, axes = np.linalg.eigh((scaled + scaled.T) / 2)
     factor = np.asarray(axes * np.sqrt(np.maximum(variances, 0.0)))  # rounding makes some variances negative
     rng = generator(seed, "draws", *names)
-    freedom = np.array([dof.get(n, math.inf) for n in names])
+    freedom, sizes = np.array([dof.get(n, math.inf) for n in names]), np.linalg.norm(factor, axis=1)
+    few = np.isfinite(freedom) & (sizes > 0)
 
     def draw_within_bounds() -> dict[str, float]:
         for _ in range(MAX_DRAWS_PER_SAMPLE):
-            z = mean + _by_student_t(factor @ rng.standard_normal(len(names)), np.linalg.norm(factor, axis=1), freedom)
+            z = factor @ rng.standard_normal(len(names))
+            z[few] = sizes[few] * t.ppf(norm.cdf(z[few] / sizes[few]), freedom[few])  # of Student's t
+            z += mean
             drawn = np.where(log, np.exp(np.where(log, z, 0.0)), z)
             values = dict(zip(names, drawn.tolist(), strict=True))
             if all(parameters[n].lower <= v <= parameters[n].upper for n, v in values.items()):
@@ -536,16 +515,6 @@ def draws(
         raise InputError(f"{message}; widen them, or give corners")
 
     return {f"draw {k}": draw_within_bounds() for k in range(1, count + 1)}
-
-
-def _by_student_t(normal: Array, deviations: Array, dof: Array) -> Array:
-    """Normal draws, moved to the same probability of Student's t where there are finite degrees of freedom."""
-    from scipy.stats import norm, t
-
-    few = np.isfinite(dof) & (deviations > 0)
-    out = normal.copy()
-    out[few] = deviations[few] * t.ppf(norm.cdf(normal[few] / deviations[few]), dof[few])
-    return out
 
 
 def _axis_names(

@@ -64,8 +64,7 @@ class Specification:
     def tighten(self, margin: float, peaks: float) -> "Specification":
         """Copy with band and limits smaller by the share `margin`; peak control and sensitivities by the share `peaks`.
 
-        An optimum lies on its limits. One that is found on tightened limits still keeps the requested ones when it is
-        simulated independently and its gains are rounded for print.
+        So an optimum, which lies on its limits, still keeps those requested once its gains are rounded and simulated.
         """
         room: dict[type, float] = {SettlingTime: 0.0}
         room |= dict.fromkeys((PeakControl, MaxSensitivity, MaxComplementarySensitivity), peaks)
@@ -122,15 +121,7 @@ Objective = Requirement | Mapping[Requirement, float] | Specification
 
 
 def specify(minimise: Objective, subject_to: Sequence[Requirement | NoHunting] = ()) -> Specification:
-    """Check an objective and its limits: a term with a bound is a limit as well, a Specification comes alone.
-
-    Examples
-    --------
-    >>> from pneuopt.evaluation.requirements import Overshoot
-    >>> spec = specify({SettlingTime(): 1.0, Overshoot(): 2.0}, [MaxSensitivity(1.6)])
-    >>> spec.objective({"SettlingTime": 0.3, "Overshoot": 0.05, "MaxSensitivity": 1.5})
-    0.4
-    """
+    """Check an objective and its limits: a term with a bound is a limit as well, a Specification comes alone."""
     if isinstance(minimise, Specification):
         require(len(subject_to) == 0, "minimise is a Specification, which holds its limits; leave subject_to out")
         spec = minimise

@@ -108,10 +108,8 @@ def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
 def check_figure_path(path: str | Path) -> None:
     """Raise `InputError` unless a figure can be written in the format of the file's suffix."""
     suffix = Path(path).suffix.lower().removeprefix(".")
-    require(
-        suffix in FIGURE_SUFFIXES,
-        f"{path}: a figure is written as {', '.join('.' + s for s in FIGURE_SUFFIXES)}; name it so",
-    )
+    known = ", ".join(f".{s}" for s in FIGURE_SUFFIXES)
+    require(suffix in FIGURE_SUFFIXES, f"{path}: a figure is written as {known}; name it so")
 
 
 def common_channels(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> list[str]:

@@ -123,10 +123,10 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
     for (over_time, auto, crossed, spread), channel in zip(grid, shown, strict=True):
         factor, unit = plot_unit([e for _, e in pairs], channel)
         residuals = _channel_residuals(pairs, channel)
-        every = max(1, sum(len(log) for log, _ in residuals) // STYLE.points)
+        every = max(1, sum(len(e) for _, e in residuals) // STYLE.points)
         for number, (log, e) in enumerate(residuals):
             colour = (BLUE, ORANGE)[number % 2] if len(residuals) <= 4 else BLUE
-            over_time.plot(log.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
+            over_time.plot(log.trajectory.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
         over_time.axhline(0, color=GREY, lw=0.8)
         over_time.set_ylabel(f"{channel} [{unit}]")
         _draw_autocorrelation(auto, pairs, channel)
@@ -165,24 +165,16 @@ def plot_correlation(result: IdentificationResult) -> "Figure":
     if count <= STYLE.numbered_cells:
         for (row, column), value in np.ndenumerate(values):
             colour = "white" if abs(value) > 0.6 else "black"
-            # two digits, but never a 1.00 that is none
-            text = (
-                f"{value:.2f}"
-                if abs(value) < 0.995 or abs(value) > 1 - 1e-9
-                else f"{math.trunc(1e4 * value) / 1e4:.4f}"
-            )
+            nearly_one = 0.995 <= abs(value) <= 1 - 1e-9  # two digits, but never a 1.00 that is none
+            text = f"{math.trunc(1e4 * value) / 1e4:.4f}" if nearly_one else f"{value:.2f}"
             axes.text(column, row, text, ha="center", va="center", fontsize=8, color=colour)
     axes.set_title("correlation of the estimates", fontsize=10)
     note_omissions(figure, count, len(covariance), "estimates have a standard deviation")
     return figure
 
 
-def _channel_residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> list[tuple[Trajectory, Array]]:
-    return [
-        (e.trajectory, e.trajectory[channel] - run[channel])
-        for run, e in pairs
-        if channel in e.trajectory and channel in run
-    ]
+def _channel_residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> list[tuple[Experiment, Array]]:
+    return [(e, e.trajectory[channel] - run[channel]) for run, e in pairs if channel in e.trajectory and channel in run]
 
 
 def _draw_autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
@@ -201,7 +193,7 @@ def _draw_autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experi
 
 
 def _draw_crosscorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
-    residuals = _channel_residuals(pairs, channel)
+    residuals = [(log.trajectory, e) for log, e in _channel_residuals(pairs, channel)]
     outputs = {n for run, _ in pairs for n in run}
     logged = dict.fromkeys([*CHANNELS, *(n for log, _ in residuals for n in log)])
     inputs = [n for n in logged if n not in outputs and any(n in log for log, _ in residuals)]
@@ -218,16 +210,11 @@ def _draw_crosscorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Exper
 
 def _draw_distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
     """Residuals over their noise, beside the normal distribution that they should have."""
-    scaled = np.concatenate(
-        [
-            (e.trajectory[channel] - run[channel]) / e.noise.get(channel, math.nan)
-            for run, e in pairs
-            if channel in e.trajectory and channel in run
-        ]
-    )
+    residuals = _channel_residuals(pairs, channel)
+    scaled = np.concatenate([e / log.noise.get(channel, math.nan) for log, e in residuals])
     label = "residual / noise"
     if not np.isfinite(scaled).any():  # no noise is declared: the residuals' own deviation
-        scaled = np.concatenate([e for _, e in _channel_residuals(pairs, channel)])
+        scaled = np.concatenate([e for _, e in residuals])
         scaled, label = scaled / np.nanstd(scaled), "residual / its deviation"
     scaled = scaled[np.isfinite(scaled)]
     edge = max(4.0, float(np.quantile(np.abs(scaled), 0.999)))

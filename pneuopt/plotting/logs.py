@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.logs.columns import CHANNELS
-from pneuopt.logs.doctor import Evidence, LogFinding
+from pneuopt.logs.doctor import LogFinding
 from pneuopt.logs.experiment import Experiment
 from pneuopt.plotting.canvas import (
     BLUE,
@@ -26,7 +26,6 @@ from pneuopt.quantities.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -92,6 +91,8 @@ def plot_finding(finding: LogFinding) -> "Figure":
     InputError
         If the finding has no evidence.
     """
+    from matplotlib.patches import Patch
+
     shown = finding.evidence
     if shown is None:
         raise InputError(f"the finding {finding.check!r} has no signals to be drawn")
@@ -123,17 +124,10 @@ def plot_finding(finding: LogFinding) -> "Figure":
         grid[-1][column].set_xlabel("time [s]")
     title = f"{finding.log}: {finding.message}" if finding.log else finding.message
     figure.suptitle("\n".join(textwrap.wrap(title, STYLE.title_letters)), fontsize=9, ha="left", x=0.01)
-    _add_legend(figure, [row[0] for row in grid], shown)
-    return figure
-
-
-def _add_legend(figure: "Figure", panels: Sequence["Axes"], shown: Evidence) -> None:
-    """Names of the curves of panels that have several, and what is shaded, below all axes."""
-    from matplotlib.patches import Patch
-
-    several = [axes for axes, panel in zip(panels, shown.panels, strict=True) if len(panel.curves) > 1]
+    several = [row[0] for row, panel in zip(grid, shown.panels, strict=True) if len(panel.curves) > 1]
     handles: list[Artist] = [line for axes in several for line in axes.get_legend_handles_labels()[0]]
     if not shown.contradiction.all():
         handles.append(Patch(color=RED, alpha=0.15, label=shown.label))
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure

@@ -88,15 +88,8 @@ def _draw_tracking(axes: "Axes", response: Response, band: Band) -> None:
     run, reference, unit = response.run, response.reference, response.units[0]
     width = band_share(band, reference) * abs(reference.nominal_size)
     end = float(run.t[-1])
-    axes.fill_between(
-        [reference.at, end],
-        reference.final - width,
-        reference.final + width,
-        color=ORANGE,
-        alpha=0.2,
-        lw=0,
-        label=f"± {describe_band(band, unit)}",
-    )
+    low, high, label = reference.final - width, reference.final + width, f"± {describe_band(band, unit)}"
+    axes.fill_between([reference.at, end], low, high, color=ORANGE, alpha=0.2, lw=0, label=label)
     t = np.array([0, reference.at, reference.at, end]) if isinstance(reference, Step) else np.linspace(0, end, 500)
     # a step stands upright
     upright = np.repeat([reference.initial, reference.final], 2)

@@ -89,16 +89,8 @@ def _draw_lines(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], m
     missing = ~np.isfinite(y)
     for at, error in zip(x[missing], ordered["error"][missing], strict=True):
         panel.axvline(at, color=RED, lw=1.0, ls=":")
-        panel.text(
-            at,
-            0.5,
-            _failure_word(metric, error),
-            transform=panel.get_xaxis_transform(),
-            color=RED,
-            rotation=90,
-            ha="right",
-            va="center",
-        )
+        across, word = panel.get_xaxis_transform(), _failure_word(metric, error)
+        panel.text(at, 0.5, word, transform=across, color=RED, rotation=90, ha="right", va="center")
 
 
 def _draw_map(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric: str) -> None:

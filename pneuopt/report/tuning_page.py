@@ -1,8 +1,6 @@
 """`write_report`, and the pages of loops: tuned, simulated, studied; and of results that have no page of their own.
 
 `live_script`: a closed loop in JavaScript with sliders; a page is whole without it.
-
-`RestFinder` prepares how the script finds the rest, or steady motion, that a slider changes.
 """
 
 import json
@@ -470,9 +468,7 @@ def live_script(
 ) -> str:
     """The script of a loop, which fills the page's element "live"; empty where the loop cannot move in a page.
 
-    Where a parameter moves the rest, or steady motion, at which a response begins (a load's force, a supply's
-    pressure), the script finds it anew; it has no slider where the script could not. A limit is watched only where the
-    script's metrics agree with `certified`, a column a reference.
+    A limit is watched only where the script's metrics agree with `certified`, a column a reference.
     """
     loop = add_disturbances(loop, references)
     steps = {k: r for k, r in enumerate(references) if isinstance(r, Step)}

@@ -186,7 +186,8 @@ def evaluate_batch(
     check_lanes(loop, chosen)
     cases = {str(name): values for name, values in cases.items()}
     batch = PlantBatch(add_disturbances(loop, steps), steps, parameters, cases, chosen, band)
-    columns, report = batch.empty_columns(), ProgressReporter(progress, "batch")
+    columns = {batch.column(n, grid): np.full(len(cases), nan) for grid in batch.grids for n in chosen}
+    report = ProgressReporter(progress, "batch")
     memory = _Memory(journal, parameters, cases, columns)
     with suppress(KeyboardInterrupt):
         for begin in range(0, len(memory.missing), chunk):
@@ -344,17 +345,9 @@ class PlantBatch:
         rate = max(RATE_MARGIN * self._fastest_mode(), dither_resolution_rate(loop, self._full))
         self.substeps = [rk4_substeps(rate, grid.spacing) for grid in self.grids]
 
-    def nominal_value(self, name: str) -> float:
-        """Value of a parameter of the nominal plant."""
-        return float(self._full.value(name))
-
     def column(self, metric: str, grid: ReferenceGrid) -> str:
         """Heading of a metric's column."""
         return metric if len(self.grids) == 1 else f"{metric}[{grid.reference.label}]"
-
-    def empty_columns(self) -> dict[str, Array]:
-        """The metrics' columns, NaN."""
-        return {self.column(n, g): np.full(len(self._cases), nan) for g in self.grids for n in self.metrics}
 
     def varied_columns(self) -> dict[str, Array]:
         """The parameters in which the plants differ."""

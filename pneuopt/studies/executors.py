@@ -267,10 +267,9 @@ class Chunk:
 
 
 class CaseQueue:
-    """Hands cases out in chunks of about half a second, or of `most_seconds` [s] where a limit of time is lower.
+    """Hands cases out in chunks of about half a second: longer ones lose more with a process, shorter cost to send.
 
-    Longer chunks lose more with a process, shorter ones cost more to send; more cases in one hold up the table, and
-    fill the memory where each is large.
+    Of `most_seconds` [s] where a limit of time is lower; large cases in one chunk would fill the memory.
     """
 
     def __init__(
@@ -564,7 +563,4 @@ class _Task:
         return evaluate_cases(*_unpack(self._packed), cases)
 
 
-@functools.lru_cache(maxsize=2)
-def _unpack(packed: bytes) -> tuple[CaseFunction, ParameterSet]:
-    fn, parameters = pickle.loads(packed)
-    return fn, parameters
+_unpack: Callable[[bytes], tuple[CaseFunction, ParameterSet]] = functools.lru_cache(maxsize=2)(pickle.loads)

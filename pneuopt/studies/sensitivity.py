@@ -9,8 +9,6 @@ derivative is that of its reading: the reader takes the response moved along its
 Of a settling time this is the implicit derivative of the instant at which the signal enters the band,
 ``dt = -(dy/dp) / (dy/dt)``; of an overshoot it is the sensitivity at the peak.
 
-A search in each cell of a grid: from a neighbour's result, again where a cell breaks with its neighbours, flagged.
-
 A tuning in each cell of a grid ends in a local optimum here and there, three times as bad as beside it. Cells are
 computed in waves, by their distance from the one nearest to the given parameters, then the flagged ones again: what
 comes out does not depend on the order in which processes finish.
@@ -188,14 +186,8 @@ def sensitivity(
     A, B = shares[:, : len(axes)], shares[:, len(axes) :]
     points = [A, B, *(np.column_stack([*A.T[:k], B[:, k], *A.T[k + 1 :]]) for k in range(len(axes)))]
     values = (row for block in points for row in values_at(parameters, spreads, block))
-    cases = sweep(
-        fn,
-        parameters,
-        {f"point {k}": row for k, row in enumerate(values, 1)},
-        executor=executor,
-        progress=progress,
-        journal=journal,
-    )
+    chosen = {f"point {k}": row for k, row in enumerate(values, 1)}
+    cases = sweep(fn, parameters, chosen, executor=executor, progress=progress, journal=journal)
     results = [str(n) for n in cases.columns if n not in (*parameters, "case", "seconds", "error")]
     numbers = [n for n in results if cases[n].dtype.kind in "fiub"]
     why = next((str(e) for e in cases["error"] if e), "it returns no number")
@@ -429,7 +421,7 @@ def _run_with_sensitivities(
     axes: Mapping[str, Mapping[str, float]],
 ) -> tuple[Array, Array]:
     """The outputs, shape (n, n_outputs), and their change along each axis, shape (axes, n, n_outputs)."""
-    order = list(loop.parameters)
+    order, nominal = list(loop.parameters), dict(zip(loop.parameters, batch.nominal.tolist(), strict=True))
     names = list(dict.fromkeys(n for steps in axes.values() for n in steps))
     lanes = LoopLanes(loop, batch.metrics, partial(Rollout, wrt=[order.index(n) for n in names], start=True))
     x0 = lanes.with_integral(batch.start({}, grid.reference)[None])
@@ -439,7 +431,7 @@ def _run_with_sensitivities(
     along = list[Array]()
     for steps in axes.values():
         before, after = (
-            batch.start({n: batch.nominal_value(n) + side * START_SIDE * s for n, s in steps.items()}, grid.reference)
+            batch.start({n: nominal[n] + side * START_SIDE * s for n, s in steps.items()}, grid.reference)
             for side in (-1, 1)
         )
         start_change = lanes.with_integral((after - before)[None] / (2 * START_SIDE))[0]

@@ -144,8 +144,7 @@ class Design:
 class Front:
     """The designs of a front while they are searched for, from the best by the first requirement on.
 
-    `last` is the limit on the second with which the front ends, as `upper_limit` counts; None: the best that it can
-    be.
+    `last` is the limit on the second with which the front ends, as `upper_limit` counts; None: the best possible.
     """
 
     base_search: Search

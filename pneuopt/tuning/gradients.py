@@ -136,10 +136,9 @@ class RowGroups:
 
 @dataclass(frozen=True, eq=False)
 class LinearisedPoint:
-    """A point z (n,) with f, its gradient (n,), and the objective's rows linearised there.
+    """A point z (n,) with f, its gradient (n,), and the rows linearised there, -inf where one does not count.
 
-    Each row has a value (n_rows,), -inf where it does not count, slopes (n_rows, n) and a group (n_rows,); `data` is
-    what the problem needs to improve the point.
+    `data` is what the problem needs to improve the point.
     """
 
     z: Array
@@ -381,9 +380,8 @@ class LinearisedResponse:
 class LinearisedProblem:
     """The minimax problem that `descend` minimises, in the gains as numbers from 0 to 1 and Ts over the horizon [s].
 
-    Responses of the simulator's cases are read at so many nodes; the objective's size `scale` sets that of the
-    penalties. `bounds` (n + 1, 2) and `scales` (n + 1,) are the unknowns' ranges and trust regions, `count` the
-    candidates simulated; `most_lanes` with sensitivities run at a time, as fit a processor's cache.
+    `scale`, the objective's size, sets that of the penalties; `bounds` (n + 1, 2), `scales` (n + 1,) are the unknowns'
+    ranges and trust regions; `most_lanes` with sensitivities run at a time, as fit a processor's cache.
     """
 
     most_lanes: ClassVar[int] = 64

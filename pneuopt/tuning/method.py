@@ -42,9 +42,7 @@ class TuningTask:
 class SearchResult:
     """The point (n,) that a method found, before rounding, with the limits and bounds that are active there.
 
-    `optimum` is the objective there, NaN where the method has none; `stats` are further figures for users;
-    `is_complete` is False where Ctrl-C ended the search; `uses_simulator` says that closer samples of the task's
-    simulator matter to it.
+    `optimum` is the objective there, NaN where the method has none; `is_complete`: no Ctrl-C has ended the search.
     """
 
     point: Array
@@ -71,7 +69,6 @@ class LimitPath(Protocol):
 
     def follow(self, start: Array, specs: Sequence[Specification]) -> list[Solution]:
         """Solve for one specification after the other, the first from gains of shape (n,), each from the one before."""
-        ...
 
 
 def check_method_options(method: "Method") -> None:
@@ -89,35 +86,28 @@ class Method(Protocol):
     @property
     def margin(self) -> float:
         """By what fraction its limits are tighter than those asked for."""
-        ...
 
     @property
     def peak_margin(self) -> float:
         """The share of `margin` by which limits on peaks of command and sensitivity are tightened."""
-        ...
 
     @property
     def digits(self) -> int | None:
         """To how many significant digits the gains are rounded; None: not at all."""
-        ...
 
     @property
     def parameters_without_effect(self) -> tuple[str, ...]:
         """Parameters on which its problem does not depend: they stay as given."""
-        ...
 
     @property
     def successor(self) -> "Method | None":
         """The method to try next where this one was chosen by default and fails; None: its answer is final."""
-        ...
 
     def check(self, task: TuningTask) -> None:
         """Refuse a task that it cannot tune: `InputError` names the reason and the remedy."""
-        ...
 
     def suits(self, task: TuningTask) -> bool:
         """Whether it is to be chosen before those that follow it in `METHODS`; it can tune any task that it suits."""
-        ...
 
     def find(
         self,
@@ -130,19 +120,14 @@ class Method(Protocol):
     ) -> SearchResult:
         """Search for the best point from a start (n,); Ctrl-C ends a search by simulation with the best so far.
 
-        `spec` is the task's, tightened by the margin; `attempt` counts the certificates that have failed, and from 1 on
-        `start` is the point found with less margin; `progress` receives a line of text a generation, start or
-        program.
+        `attempt` counts the certificates that have failed; from 1 on `start` is the point found with less margin.
         """
-        ...
 
     def shorten(self, margin: float) -> "Method":
         """The method for a short search from a point that is close."""
-        ...
 
     def limit_path(self, task: TuningTask, spec: Specification) -> LimitPath | None:
         """The problem prepared for moving limits, `spec` the first, tightened; None where each needs a new search."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -154,12 +139,6 @@ class Agreement:
     more ends in another optimum: of w optima from n independent starts ``w (w + 1)/(n (n - 1))`` (C. G. E. Boender and
     A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods, Math. Program. 37 (1987)
     59-80); fewer than three tell nothing, NaN.
-
-    Examples
-    --------
-    >>> found = compare_starts([0.94, 0.9402, 1.223, float("inf")], 1e-3)
-    >>> found.converged, found.agreeing, found.optima, round(found.spread, 3), found.unseen
-    (3, 2, 2, 0.301, 1.0)
     """
 
     starts: int
@@ -195,13 +174,7 @@ def compare_starts(objectives: Sequence[float], tolerance: float) -> Agreement:
 
 
 def describe_agreement(found: Agreement | None) -> tuple[str, str]:
-    """Words on the agreement of a result's starts, and a sentence where some do not agree; empty where none has ended.
-
-    Examples
-    --------
-    >>> print(*describe_agreement(compare_starts([0.94, 0.94, 0.94, 1.223], 1e-3)), sep="; ")
-    3 of 4 starts agree; others end up to 30 % worse, one start more would find another optimum with a chance of 50 %
-    """
+    """Words on the agreement of a result's starts, and a sentence where some do not agree; empty where none ended."""
     if found is None or not found.starts:
         return "", ""
     words = f"{found.agreeing} of {found.starts} starts agree"

@@ -188,8 +188,7 @@ def run_racing(
 ) -> RacingResult:
     """Search in phases from starts that differ in kind; Ctrl-C ends the search with the best point so far.
 
-    `spec` is tightened; `start` (n,) is a member of the first population, and a method without `bands` searches about
-    it.
+    `start` (n,) is a member of the first population; a method without `bands` searches about it.
     """
     rng, space = np.random.default_rng(method.seed), simulator.space
     search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress)
@@ -208,9 +207,8 @@ CUT_REQUIREMENTS = (SettlingTime, Overshoot, PeakControl, ControlRate, *ROBUSTNE
 class Race:
     """Races on one simulator for one specification.
 
-    `scale`, the horizon [s], stands for the settling time of what never settles; `count` is the number of points
-    simulated, on one case or more; `is_cut` says that races see less than the whole of a response, and `most_numbers`
-    how many numbers of 8 bytes it records, at most.
+    `scale`, the horizon [s], stands for the settling time of what never settles; `is_cut` says that races see less than
+    the whole of a response, `most_numbers` how many numbers of 8 bytes it records, at most.
     """
 
     most_numbers: ClassVar[int] = 2**25
@@ -240,8 +238,7 @@ class Race:
     def race(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
         """Merits and worst cases (m,) of points (m, n) no worse than their rivals; of others more than the rival's.
 
-        `first` (m,) is the case on which each point is simulated first, its rival's worst; of a loser the worst case is
-        the one by which it lost.
+        `first` (m,) is the case on which each point is simulated first; a loser's worst case is that by which it lost.
         """
         self.count += len(points)
         compete, most = self._race_cases, len(points)
@@ -298,8 +295,7 @@ class Race:
     def _complete_merits(self, responses: Responses, rivals: Array) -> tuple[Array, Indices]:
         """Merits and worst cases of points that ran on every case, margins left out of the latter.
 
-        Margins, a frequency response each, cost as much as a simulation and can only raise a merit, so they are read of
-        points that can still beat their rival.
+        Margins cost as much as a simulation and only raise a merit: they are read of points that may beat their rival.
         """
         merits = np.full(len(rivals), -np.inf)
         if not self._spec.weight(ROBUSTNESS_REQUIREMENTS):

@@ -222,8 +222,7 @@ def report_tuning(
 ) -> Report:
     """How a tuning ended, and its design; of one that failed what was refused, and how far limits have to give way.
 
-    `was` are the metrics with the gains before, `source` names the gains that stand where it failed, empty where
-    nothing was sought.
+    `was` are the metrics with the gains before, `source` names the gains that stand; empty where nothing was sought.
     """
     found = report_status(result.status) if source else report_certificate_status(result.status)
     if not result.status.converged:

@@ -162,13 +162,9 @@ class Certifier:
         """Every case over its horizon, and the warnings of end stops and emptied chambers that the responses met."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
+            task, spec = self.task, self.task.spec
             found = evaluate_cases(
-                self.task.loop,
-                self.task.references,
-                parameters,
-                scenarios=self.task.scenarios,
-                band=self.task.spec.band,
-                envelope=self.task.spec.envelope,
+                task.loop, task.references, parameters, scenarios=task.scenarios, band=spec.band, envelope=spec.envelope
             )
             return tuple(found), [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
 
@@ -259,13 +255,6 @@ def objectives_agree(certified: float, claimed: float, optimum: float, resolutio
 
     A claim far above the certificate is as wrong as one far below: the search has then compared other figures than
     those of the response. Near zero, where no relative difference counts, `resolution` decides.
-
-    Examples
-    --------
-    >>> objectives_agree(4e-16, 0.0, 0.0, 1e-6)
-    True
-    >>> objectives_agree(0.3, 0.4, 0.4, 1e-6), objectives_agree(0.4, 0.3, 0.3, 1e-6)
-    (False, False)
     """
     lowest, highest = claimed, min(claimed, optimum)
     above = lowest - SAME_OBJECTIVE * abs(lowest) - resolution
@@ -354,10 +343,9 @@ class Search:
         return other
 
     def lengthen(self, *, rests: bool) -> "Search":
-        """A search over a longer horizon, in which a response that hunts or creeps later never settles.
+        """A search over the longest of `HORIZON_FACTORS` horizons with room for the piston; without any, this one.
 
-        With `rests` it has to settle within the horizon asked for, otherwise within the longer one, the longest of
-        `HORIZON_FACTORS` for which the piston has room; where there is none it is this search.
+        With `rests` a response has to settle within the horizon asked for, otherwise within the longer one.
         """
         for factor in HORIZON_FACTORS:
             steps = tuple(r.with_horizon(r.at + factor * (r.horizon - r.at)) for r in self.task.references)
@@ -487,9 +475,8 @@ class Search:
                 break
         if tried:
             return
-        points = np.vstack(
-            [nearest, self.space.neighbourhood(nearest, digits)]
-        )  # no single last place keeps the limits
+        # no single last place keeps the limits
+        points = np.vstack([nearest, self.space.neighbourhood(nearest, digits)])
         rows = to_records(self.simulator.values(points, spec))
         costs = [np.inf if spec.violations(row) else spec.objective(row) for row in rows]
         best = [k for k in np.argsort(costs).tolist() if costs[k] <= most][:MAX_CERTIFIED_POINTS]
@@ -593,8 +580,7 @@ def confirm_refusal(search: Search, refused: TuningResult) -> tuple[TuningResult
                 best, is_stopped = _improve(search, longer, held)
                 return replace(best, status=best.status.with_details(words)), is_stopped
     except KeyboardInterrupt:
-        sentences = (f"nothing found so far: {refused.status.verdict}", "run again for an answer")
-        return replace(refused, status=Status(Code.INTERRUPTED, sentences)), False
+        return _interrupt(refused), False
     failed = f"of {len(points)} designs that it finds none is certified" if points else "finds none that comes to rest"
     words = f"{describe_confirmation(count)}, {failed}, either"
     stats = {**refused.stats, "confirmation.simulations": float(count)}
@@ -724,11 +710,5 @@ def _describe_closest(excess: float) -> str:
 
 
 def describe_confirmation(simulations: int) -> str:
-    """Say in words by what an infeasible answer, or a refusal, is confirmed.
-
-    Examples
-    --------
-    >>> describe_confirmation(3600)
-    "a second search, SciPy's differential evolution over 3600 simulations"
-    """
+    """Say in words by what an infeasible answer, or a refusal, is confirmed."""
     return f"a second search, SciPy's differential evolution over {simulations} simulations"

@@ -62,8 +62,7 @@ from pneuopt.tuning.tolerances import (
 class ResponsePoints(NamedTuple):
     """Where m lanes begin, move fastest and end.
 
-    States (m, k, n_states) stand at every `KEPT_STATES`-th sample, `ends` (m, n_states) with the commands (m,) there;
-    `fastest` (m,) is the sample of the largest speed, under dither without its ripple.
+    States (m, k, n_states) are those of every `KEPT_STATES`-th sample, `fastest` (m,) is the one of the largest speed.
     """
 
     states: Array
@@ -80,12 +79,6 @@ class ResponsePoints(NamedTuple):
     def select(self, rows: Indices | Mask) -> "ResponsePoints":
         """The points of some lanes."""
         return ResponsePoints(self.states[rows], self.ends[rows], self.fastest[rows], self.command[rows])
-
-
-def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices:
-    """Samples (m,) of the largest of speeds (m, n) after the step, without a dither's ripple of this period [s]."""
-    first = grid.step_index
-    return np.asarray(first + first_largest(without_ripple(grid.t, speed, period)[:, first:]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +156,7 @@ class PointFinder:
     def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: ResponsePoints) -> tuple[Array, Array]:
         """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.
 
-        Under dither one period more is run; half the change over it is subtracted from its mean, which so belongs to
-        the end.
+        Under dither one period more is run; half the change over it is subtracted from its mean, to belong to the end.
         """
         out = np.column_stack([own.ends[:, : len(self.loop.plant.states)], own.command])
         reach = np.zeros_like(out)
@@ -258,8 +250,7 @@ class Responses:
 class LaneMetrics:
     """The metrics (m,) of lanes, which of them do not run away, and the points of their responses.
 
-    Beside those of `step_metrics` there is "Excess", the mean error near the end, by which responses that never settle
-    are graded; infinite where the response runs away.
+    "Excess" is the mean error near the end, by which responses that never settle are graded.
     """
 
     metrics: dict[str, Array]
@@ -301,8 +292,7 @@ LaneRun = tuple[Array, Array, Array]  # states at every `KEPT_STATES`-th sample,
 class Simulator:
     """Simulate many candidates, compiled, on every reference and every scenario's plant, and read their metrics.
 
-    The plant's true signal counts, whatever a sensor shows the controller of it. The requirements of `spec` are read
-    beside the common ones; margins stand apart, for they cost a frequency response each.
+    The plant's true signal counts, whatever a sensor shows the controller of it; margins stand apart, for their cost.
     """
 
     def __init__(
@@ -340,8 +330,7 @@ class Simulator:
     def coarse(self, spec: Specification, bands: Sequence[Band] = ()) -> "Simulator":
         """A copy for use during a search, with half as many samples, which reads only what `spec` asks for.
 
-        With `bands` SettlingTime is the mean over those and the band asked for, `penalty_settling_time` where it does
-        not settle.
+        With `bands` SettlingTime is the mean over these and the band asked for (`penalty_settling_time`).
         """
         part = copy.copy(self)
         part._wider = tuple(bands)
@@ -529,9 +518,11 @@ class Simulator:
                 out.response_points.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
 
     def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float) -> Indices:
-        """Samples of the largest speed, as `ResponsePoints` has them; zeros for a plant without an axis."""
-        k = speed_output(self.loop, self.sampled.channels)
-        return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period)
+        """Samples (m,) of the largest speed after the step, without a dither's ripple; zeros without an axis."""
+        k, first = speed_output(self.loop, self.sampled.channels), grid.step_index
+        if k is None:
+            return np.zeros(len(y), dtype=np.intp)
+        return np.asarray(first + first_largest(without_ripple(grid.t, y[:, :, k], period)[:, first:]))
 
     def _fastest_eigenvalue(self, references: Sequence[Reference]) -> float:
         """The rate of the fastest mode over the gains' box and all plants [1/s].

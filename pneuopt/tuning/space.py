@@ -108,16 +108,7 @@ class Space:
         return rows
 
     def round_point(self, point: Array, digits: int) -> Array:
-        """Round a point to so many significant digits, within the bounds, shape (n,); close to a bound it is the bound.
-
-        Examples
-        --------
-        >>> from pneuopt.quantities.parameters import Parameter
-        >>> gains = ParameterSet({"pid.Kp": Parameter(0.39661, "1", 0.0, 1.0, free=True)})
-        >>> space = Space(gains, ("pid.Kp",))
-        >>> space.round_point(space.start, 4).item(), space.neighbours(np.array([0.3966]), 4).ravel().tolist()
-        (0.3966, [0.3965, 0.3967])
-        """
+        """Round a point to so many significant digits, within the bounds, shape (n,); near a bound it is the bound."""
         found = np.array(point)
         for k, (value, (low, up)) in enumerate(zip(point.tolist(), self.bounds.tolist(), strict=True)):
             at = next((b for b in (low, up) if abs(value - b) <= BOUND_DISTANCE * (up - low)), None)
@@ -272,8 +263,7 @@ SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT, INTEGRAL_OUTPUT = [*range(3), -1]
 class ReferenceGrid:
     """Samples t (n,) and inputs u (n, n_inputs) at which the response to one reference is run and read.
 
-    `spacing` [s] is the largest distance of two samples, and that of all under dither and of sampled loops;
-    `sample_time` [s] is the controller's, None for a continuous one.
+    `spacing` [s] is the largest distance of two samples, `sample_time` [s] the controller's, None for a continuous one.
     """
 
     reference: Reference
@@ -383,8 +373,7 @@ def is_sound(y: Array, x_end: Array) -> Mask:
 def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
     """The loop's sampled step, with the measured signal, the command and channels of the meter as its outputs.
 
-    The axis's speed follows, where there is one (`speed_output`); under dither the signal's integral, zero at the
-    start, is one more state and the last output.
+    The axis's speed follows (`speed_output`); under dither the signal's integral is one more state and the last output.
     """
     discrete, outputs = loop.discrete(), names(loop.outputs)
     ode = (loop.system() if loop.pid.sample_time is None else loop.hold_system()).ode
@@ -437,8 +426,7 @@ def read_metrics(
 ) -> dict[str, Array]:
     """The metrics `only`, shape (m,), of outputs y (m, n, n_outputs) of `loop_pieces` that do not run away.
 
-    Over several bands SettlingTime is the mean, `penalty_settling_time` where it does not settle; `period` [s] is the
-    averaging time.
+    Over several bands SettlingTime is the mean (`penalty_settling_time`); `period` [s] is the averaging time.
     """
     reference, signal, since = grid.reference, y[:, :, SIGNAL_OUTPUT], slice(grid.step_index, None)
     late = slice(int(np.searchsorted(grid.t, 0.8 * reference.horizon + 0.2 * reference.at)), None)

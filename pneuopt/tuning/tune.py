@@ -273,14 +273,8 @@ def _prove_further(
         try:
             if count:
                 progress(f"trying the design on {count} plants")
-                found = validate_design(
-                    task.loop,
-                    task.references,
-                    result.parameters,
-                    minimise=task.spec,
-                    scenarios=chosen,
-                    accept=task.accept,
-                )
+                given = task.loop, task.references, result.parameters
+                found = validate_design(*given, minimise=task.spec, scenarios=chosen, accept=task.accept)
                 result = replace(result, validation=found)
         except KeyboardInterrupt:
             result = _interrupt(task, result, "the trial on other plants was interrupted")

@@ -295,8 +295,7 @@ def transcribe_two_phase(
 ) -> Transcription:
     """Write the two-phase problem of a linear loop, in which the references share one settling time, the largest.
 
-    `nodes` are those of the transient and of the settled phase; an `InputError` where the state before the step depends
-    on the gains, or a mode is too fast for the nodes.
+    An `InputError` where the state before the step depends on the gains, or a mode is too fast for the nodes.
     """
     free_loop = without_clip(loop)
     averaged = space.parameters.select(free_loop.parameters)
@@ -354,8 +353,7 @@ def _extra_unknowns(references: Sequence[Reference], spec: Specification) -> Par
 def _durations(references: Sequence[Reference], spec: Specification, settling: Parameter) -> ParameterSet:
     """The durations [s] of each reference, before its step and of its settled phase.
 
-    The settled phase is as long as the record, which shows more of the band, unless the error at the end of it
-    counts.
+    The latter is as long as the record, which shows more of the band, unless the error at the end of it counts.
     """
     found = {f"before.{i}": Parameter(r.at, "s") for i, r in enumerate(references) if r.at > 0}
     for i, r in enumerate(references):

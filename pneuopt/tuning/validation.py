@@ -343,11 +343,9 @@ def advise(
     axes: Mapping[CorrelatedParameters, "pd.DataFrame"],
     most: int = 3,
 ) -> tuple[tuple[str, ...], tuple[CorrelatedParameters, ...]]:
-    """Advice where a design breaks on plants, a sentence each, and what to tune over.
+    """Advice where a design breaks on plants: limits that hold with the same gains, and what to tune over.
 
-    It says with which limits the same gains hold on all plants but those where no limit helps, and what breaks a limit
-    on its own, or comes nearest to it, the worst first, at most so many. `axes` are the metrics with one thing that
-    varies alone at its low and its high end, a column each.
+    `axes` are the metrics with one thing that varies alone at its low and its high end, a column each.
     """
     if not broken:
         return (), ()

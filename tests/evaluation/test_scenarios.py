@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.special import ndtr
+from scipy.special import ndtr, stdtr
 
 from pneuopt.evaluation.scenarios import (
     DISTRIBUTIONS,
@@ -82,6 +82,14 @@ def test_draws_have_the_covariance_that_was_given() -> None:
     assert np.cov(table[names[0]], table[names[1]]) == pytest.approx(given[:2, :2], rel=0.1)
     logs = np.log(table[names[2]])
     assert (logs.mean(), logs.std()) == pytest.approx((math.log(0.02), 0.1), rel=0.05)
+
+
+def test_draws_of_few_degrees_of_freedom_have_the_same_probability_in_students_distribution() -> None:
+    name = "load.force"
+    covariance = pd.DataFrame([[4.0]], index=[name], columns=[name])
+    normal, wide = (draws(RIG, covariance, 50, dof=dof) for dof in ({}, {name: 3.0}))
+    sizes = np.array([[found[k][name] - RIG.value(name) for k in normal] for found in (normal, wide)]) / 2.0
+    assert np.allclose(ndtr(sizes[0]), stdtr(3.0, sizes[1]), rtol=1e-9)
 
 
 def test_a_singular_covariance_is_drawn_along_its_line() -> None:

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.patches import Rectangle
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.logs.experiment import Experiment, split
@@ -182,6 +183,9 @@ def test_residuals_show_what_is_left_in_them() -> None:
         assert told.get_text().startswith("Ljung-Box p")
         assert ("< 1e-4" in told.get_text()) is expected
         assert (spread.get_xlabel(), spread.get_ylabel()) == ("residual / noise", "")
+        bars = [bar.get_bbox() for bar in spread.patches if isinstance(bar, Rectangle)]
+        inside = [b.width * b.height for b in bars if abs(b.x0 + b.x1) < 2]
+        assert 0.1 < sum(inside) < 0.75  # of a normal distribution 0.68 lies within its deviation
 
 
 def test_correlations_are_cells_and_never_a_rounded_one() -> None:
