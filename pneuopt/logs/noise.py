@@ -15,6 +15,7 @@ from pneuopt.logs.tolerances import (
     BLOCK,
     LATTICE_TOLERANCE,
     MAX_CORRELATION,
+    MIN_VARIED_SHARE,
     ORDERS,
     ROUNDING,
     WHITE_LAGS,
@@ -78,10 +79,49 @@ def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstima
     return NoiseEstimate(random, resolution, is_white)
 
 
-def find_resolution(values: ArrayLike) -> float:
-    """The step of the lattice on which all values (n,) lie, as an encoder's do; 0 where there is none."""
+def find_resolution(values: ArrayLike, bins: int = 50, candidates: int = 6) -> float:
+    """The step of a sensor on whose multiples all values (n,) lie, but for their decimals; 0 where there is none.
+
+    The step of an encoder is no round number, and a log writes it with decimals. So it is one of the most frequent
+    differences of neighbours: the largest one on whose lattice all values lie. Where there is none, it is that of the
+    decimals.
+
+    Examples
+    --------
+    >>> x = np.sqrt(np.arange(50.0))
+    >>> round(find_resolution(np.round(x / 0.02) * 0.02), 9), find_resolution(x)
+    (0.02, 0.0)
+    """
     values = np.asarray(values, dtype=float)
     smallest = ROUNDING * float(np.max(np.abs(values), initial=0.0))
+    decimals, steps = _decimals(values, smallest), list[float]()
+    for order in (1, 2):
+        sizes = np.abs(np.diff(values, order))
+        sizes = sizes[sizes > max(smallest, 0.5 * decimals)]
+        if sizes.size:
+            unit = max(decimals, float(np.median(sizes)) / bins)
+            places, counts = np.unique(np.round(sizes / unit), return_counts=True)
+            below = np.concatenate([[0], np.cumsum(counts)])  # decimals move a difference by one place
+            near = below[np.searchsorted(places, places + 1, "right")] - below[np.searchsorted(places, places - 1)]
+            frequent = places[np.argsort(-near, kind="stable")[:candidates]]
+            steps += [float(np.mean(sizes[np.abs(sizes / unit - k) <= 1.5])) for k in frequent]
+    written = max(decimals, _last_digit(values), 4 * smallest)
+    return max([decimals, *(_fit_lattice(values, step, written) for step in steps if step > 4 * decimals)])
+
+
+def _last_digit(values: Array, most: int = 12) -> float:
+    """The last digit of the largest value, where all are written with as many significant digits; else 0."""
+    sizes = np.abs(values[values != 0])
+    places = np.floor(np.log10(sizes)).astype(int)
+    for digits in range(3, most):
+        scaled = sizes * 10.0 ** (digits - 1 - places)
+        if np.all(np.abs(np.round(scaled) - scaled) < 1e-3):
+            return float(10.0 ** (int(places.max()) - digits + 1))
+    return 0.0
+
+
+def _decimals(values: Array, smallest: float) -> float:
+    """The step of the lattice on which all values lie to their rounding as doubles; 0 where there is none."""
     # second differences are on the same lattice, and small however fast the motion is; of a perfect ramp there are none
     for order in (2, 1):
         sizes = np.sort(np.abs(np.diff(values, order)))
@@ -96,6 +136,28 @@ def find_resolution(values: ArrayLike) -> float:
     step = float(offsets @ counts / (counts @ counts)) if counts.any() else 0.0
     lies_on = float(np.max(np.abs(offsets - step * counts))) < LATTICE_TOLERANCE * step
     return step if lies_on and smallest < LATTICE_TOLERANCE * step else 0.0
+
+
+def _fit_lattice(values: Array, step: float, written: float, most: int = 4000, largest: float = 300.0) -> float:
+    """The step of the lattice about a given one on which all values lie, but for their decimals; 0 where they do not.
+
+    Counts of neighbours are added up: they are small, so that a step known to a per cent numbers them. A motion at one
+    speed makes steps, too: they are a sensor's only where they vary.
+    """
+    sizes = np.diff(values)
+    sizes = sizes[(sizes != 0) & (np.abs(sizes) < largest * step)][:most]
+    if not sizes.size:
+        return 0.0
+    # the step near the given one by which most differences are whole numbers, to an eighth of a count of the largest
+    tried = step * np.linspace(0.95, 1.05, 1 + math.ceil(0.8 * float(np.max(np.abs(sizes))) / step))
+    step = float(max(tried, key=lambda s: abs(np.exp(2j * np.pi / s * sizes).sum())))
+    moves = np.round(np.diff(values) / step)
+    varies = np.count_nonzero(np.diff(moves)) > MIN_VARIED_SHARE * values.size
+    counts = np.concatenate([[0.0], np.cumsum(moves)])
+    off, spread = values - values.mean(), counts - counts.mean()
+    step = float(off @ spread / (spread @ spread)) if spread.any() else 0.0
+    is_lattice = varies and step > 0 and float(np.max(np.abs(off - step * spread))) <= min(step / 4, written)
+    return step if is_lattice else 0.0
 
 
 class _Level(NamedTuple):

@@ -28,6 +28,7 @@ ORDERS = (1, 2, 3, 4, 6, 8, 10)  # of differences: without high ones motion at a
 BLOCK = 100  # differences of a block: shorter ones have uncertain levels, longer ones leave none that is quiet
 WHITE_LAGS = 20  # [samples] at which white noise is uncorrelated: with one, motion at a quarter of the rate looks white
 MAX_CORRELATION = 0.2  # of differences at these lags, above which they are motion or hum: lower blames filtered noise
+MIN_VARIED_SHARE = 0.01  # of the samples where a sensor's steps change: fewer are a motion at one speed
 LATTICE_TOLERANCE = 0.02  # distance from a resolution's lattice, in its steps: rounded decimals lie nearer
 ROUNDING = 1e-12  # share of the largest value that is rounding of doubles: above, fine steps are missed
 

@@ -141,6 +141,31 @@ def test_the_resolution_of_a_lattice(step: float, origin: float, n: int, seed: i
     assert find_resolution(values) == pytest.approx(step, rel=1e-6)
 
 
+ENCODERS = {
+    "ball screw of 5 mm, 8192 counts, in mm": (5 / 8192, ("%.4f", "%.6f", "%.17g")),
+    "10 um, in mm": (0.01, ("%.4f",)),
+    "4096 counts a turn, in rad": (2 * math.pi / 4096, ("%.6f", "%.10g", "%.17g")),
+    "4096 counts a turn, in degrees": (360 / 4096, ("%.4f",)),
+    "12 bit of 10 bar": (10 / 4096, ("%.4f",)),
+}
+
+
+@pytest.mark.parametrize(("step", "decimals"), [(s, d) for s, formats in ENCODERS.values() for d in formats])
+def test_the_step_of_an_encoder_is_seen_through_the_decimals_of_its_log(step: float, decimals: str) -> None:
+    """A ratio of counts is no round number: the lattice of the decimals is not the sensor's."""
+    t = np.arange(8000) * 1e-3
+    x = 40 * np.clip(np.sin(2 * np.pi * 0.3 * t), -0.8, 0.8)
+    written = np.array([float(decimals % v) for v in np.round(x / step) * step])
+    found = estimate_noise(written, t)
+    assert found.resolution == pytest.approx(step, rel=1e-3)
+    assert found.level == pytest.approx(step / math.sqrt(12), rel=0.02)
+
+
+def test_decimals_coarser_than_the_encoder_are_the_resolution() -> None:
+    x = 40 * np.sin(2 * np.pi * 0.3 * np.arange(8000) * 1e-3)
+    assert find_resolution(np.round(np.round(x / (5 / 8192)) * (5 / 8192), 3)) == pytest.approx(1e-3)
+
+
 def test_values_on_no_lattice_have_no_resolution() -> None:
     rng = np.random.default_rng(0)
     for n in (10, 100, 10_000):
