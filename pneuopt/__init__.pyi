@@ -106,7 +106,7 @@ from .identification.identifiability import examine_logs, identifiability
 from .identification.identify import identify, predict, validate
 from .identification.losses import Huber, SoftL1
 from .identification.profiles import Profile, PropagatedValue, profile, propagate_error
-from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
+from .identification.result import ChosenWindow, IdentificationResult, Mark, Verdict
 from .identification.select_model import ModelSelection, select_model
 from .identification.tracking import LogComparison, Tracking, compare_logs, track
 from .logs.doctor import LogFinding, Severity
@@ -187,7 +187,6 @@ __all__ = [
     "Bootstrap",
     "Certificate",
     "Checkup",
-    "ChosenWidth",
     "ChosenWindow",
     "ClosedLoop",
     "Code",

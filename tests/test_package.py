@@ -44,7 +44,6 @@ PUBLIC_NAMES = [
     "Certificate",
     "certificate",
     "certify",
-    "ChosenWidth",
     "ChosenWindow",
     "ClosedLoop",
     "coarse_delay",

@@ -95,7 +95,7 @@ def run_identify(
     verdict, cut = result.verdict, result.window
     tables |= {"estimates": records(result.estimates), "fit": records(result.fit)}
     tables["verdict"] = {**verdict.to_dict(), "table": records(verdict.table)} if verdict is not None else {}
-    tables |= {"widths": [asdict(width) for width in result.widths], "window": asdict(cut) if cut else None}
+    tables["window"] = asdict(cut) if cut else None
     kept = "with -o fit.toml: keeps the fit, for pneuopt tune"
     hints = [kept if outputs.output is None else f"pneuopt tune {outputs.output} tuning.toml -o tuned.toml"]
     hints += ["with --report FILE.html: a page to hand on"] if outputs.report is None else []

@@ -154,7 +154,7 @@ class Axis(NamedTuple):
     final_element: FinalElement | None = None
 
 
-DEFAULT_WIDTH = "default; identify chooses it by the logs"
+DEFAULT_WIDTH = "default; identify estimates it with the rest"
 """Source of a width that nobody has stated; one that a user states has another source, whatever its value."""
 
 
@@ -200,16 +200,10 @@ class SeparatingRun:
 
 @dataclass(frozen=True)
 class Width:
-    """A width over which a model rounds a kink so that it can be integrated: a means, and no property of the plant.
+    """A width over which a model rounds a kink: an identification estimates it, unless the user states it."""
 
-    An identification chooses it by the logs, unless the user states it (`IdentificationResult.widths`).
-    """
-
-    name: str  # the parameter; it is on a logarithmic scale
-    factor: float  # by which a search narrows or widens it
-    follows: tuple[str, ...] = ()  # parameters that are narrowed or widened with it
-    # the parameter that a width of its size hides, as a rounded edge does a dead zone; empty if there is none
-    hides: str = ""
+    name: str  # the parameter
+    start: float = 0.0  # where a search begins [the parameter's unit]; 0: at the parameter's own value
 
 
 @dataclass(frozen=True)
@@ -239,5 +233,5 @@ class IdentificationHints:
 
         needs = {f"{prefix}.{n}": replace(e, confused_with=whole(e.confused_with)) for n, e in self.needs.items()}
         runs = tuple(replace(r, some=whole(r.some), others=whole(r.others)) for r in self.runs)
-        widths = tuple(Width(own(w.name), w.factor, tuple(map(own, w.follows)), own(w.hides)) for w in self.widths)
+        widths = tuple(Width(own(w.name), w.start) for w in self.widths)
         return IdentificationHints(needs, runs, widths, {own(n): own(m) for n, m in self.at_least.items()})

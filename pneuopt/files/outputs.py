@@ -21,7 +21,6 @@ from pneuopt.files.tuned import CertificateCheck
 from pneuopt.identification.checkup import Assumption, LogRow
 from pneuopt.identification.result import (
     AgreementRow,
-    ChosenWidth,
     ChosenWindow,
     EstimateRow,
     IdentifiableRow,
@@ -241,7 +240,6 @@ OUTPUTS: Mapping[str, Member] = {
         estimates=_rows("a row a free parameter", _ESTIMATES),
         fit=_FIT,
         verdict=_VERDICT,
-        widths=_rows("widths that the logs have chosen", members_of(ChosenWidth)),
         window=Member("windows in which logs were fitted", Holds.RECORD, members_of(ChosenWindow), is_optional=True),
         bootstrap=_optional(_rows("with --bootstrap, a row an estimate", _NAMED, is_open=True)),
         stats=_STATS,

@@ -313,7 +313,7 @@ def list_assumptions(
         section, _, key = name.partition(".")
         reason = f"{used.meaning} ({used.source})" if used.source else used.meaning
         if used.source == DEFAULT_WIDTH:
-            reason = f"{used.meaning}; identify chooses it by the logs"
+            reason = f"{used.meaning}; identify estimates it with the rest"
         found.append(Assumption(name, used.value, used.unit, f"[{section}] {key}", DRIVE_FILE, reason))
     return tuple(found)
 

@@ -27,6 +27,7 @@ from pneuopt.identification.problem import (
     check_free,
     check_logs,
     find_centre,
+    known_runs,
 )
 from pneuopt.identification.profiles import Profile
 from pneuopt.identification.result import (
@@ -47,12 +48,12 @@ from pneuopt.identification.tolerances import (
     MAX_PRIOR_DEVIATION,
     MAX_PRIOR_VARIANCE_SHARE,
     MAX_RELATIVE_DEVIATION,
+    MAX_TRIAL_SAMPLES,
     MIN_COMBINATION_SHARE,
     MIN_FORCE_SHARE,
     MIN_STOP_FORCE,
     UNIDENTIFIABLE_DEVIATION,
 )
-from pneuopt.identification.widths import excerpts
 from pneuopt.logs.doctor import PISTON, LogFinding, StatedAxis, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.mending import MendedLog, convert, empty_cells, leave_out
@@ -373,6 +374,24 @@ def pose_problem(
     check_free(logs, parameters)
     check_content(model, logs, parameters)
     return EstimationProblem(model, tuple(logs), model.parameters | parameters, method)
+
+
+def excerpts(experiments: Sequence[Experiment], stretches: int = 4) -> tuple[Experiment, ...]:
+    """The logs, or evenly spread stretches of them where they are long."""
+    total = sum(len(e.trajectory) for e in experiments)
+    if total <= MAX_TRIAL_SAMPLES:
+        return tuple(experiments)
+    share, out = MAX_TRIAL_SAMPLES / total, list[Experiment]()
+    for e in experiments:
+        n = len(e.trajectory)
+        size, each = n // stretches, round(share * n / stretches)
+        for k in range(stretches):
+            begin, end = k * size, k * size + max(10, each)
+            holes = [(max(a, begin) - begin, min(b, end) - begin) for a, b in e.holes if a < end and b > begin]
+            run = e.trajectory.rows(begin, end)
+            part = replace(e, trajectory=run, holes=tuple(holes), name=f"{e.name}@{k}")
+            out += [part] if known_runs(part) else []
+    return tuple(out)
 
 
 def check_content(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:

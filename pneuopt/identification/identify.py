@@ -24,7 +24,7 @@ from pneuopt.identification.identifiability import (
     prior_influenced,
 )
 from pneuopt.identification.losses import Loss, fit_robustly
-from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, suspect_widths
+from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit
 from pneuopt.identification.problem import (
     EstimationProblem,
     apply_conditions,
@@ -55,7 +55,7 @@ from pneuopt.identification.search import (
     tighten_gaps,
 )
 from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
-from pneuopt.identification.widths import choose_widths
+from pneuopt.identification.widths import estimated_widths, free_widths, sticking_covariance
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
@@ -206,7 +206,7 @@ def _fit_and_review(
     if start is None:
         for sentence in foresee_unidentifiable(problem):
             warnings.warn(sentence, PhysicsWarning, stacklevel=3)
-    problem, widths = choose_widths(problem)
+    problem = free_widths(problem)
     doubts = FixedValueTest()
     if start is None:
         search = partial(fit_from_starts, loss=loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
@@ -228,7 +228,7 @@ def _fit_and_review(
     while better := fit_from_profiles(held, fit, profiles):
         fit = better
         reviewed, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
-    result = replace(mark_order(held, reviewed), widths=widths, window=chosen)
+    result = replace(mark_order(held, reviewed), window=chosen)
     result = replace(result, status=problem.method.budget.name_end(result.status))
     if doubts.found:
         result = replace(result, status=result.status.with_details(str(doubts.found)))
@@ -364,9 +364,8 @@ def _result(
     squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
     dof = degrees_of_freedom(problem, fit)
     variance = squares / dof
-    diagnosed = replace(diagnose_misfit(problem, fit, variance, dof), restarts=restarts)
-    misfit = suspect_widths(diagnosed, problem, fit, variance)
-    covariance = misfit.covariance
+    misfit = replace(diagnose_misfit(problem, fit, variance, dof), restarts=restarts)
+    covariance = None if misfit.covariance is None else misfit.covariance + sticking_covariance(problem, fit)
     influenced = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
@@ -374,7 +373,8 @@ def _result(
         found = np.array([p.value for p in estimates.values()])
         resting = prior_dominated(covariance, fit.prior_covariance, found, problem.fixed.values())
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
-    status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else misfit.assess(fit.status)
+    asked = set(free) - set(estimated_widths(problem))
+    status = NOTHING_IDENTIFIABLE if asked and asked <= set(unidentifiable) else misfit.assess(fit.status)
     matrix = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
     result = IdentificationResult(
         problem.parameters.with_values(values),
@@ -413,7 +413,7 @@ def _estimates(
             (p.value * math.exp(change / p.value) if p.log else p.value + change)
             for change in misfit.ranges[i].tolist()
         ]
-        mark = misfit.mark(i, is_optimum=status.converged and math.isfinite(deviation) and not influenced[i])
+        mark = misfit.mark(is_optimum=status.converged and math.isfinite(deviation) and not influenced[i])
         shown = [p.value, low, high, p.unit, mark]
         rows[name] = [*shown, deviation, dof, *ends, p.lower, p.upper, bool(at_bound[i]), p.source]
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)

@@ -95,35 +95,6 @@ class Verdict(Shown):
 
 
 @dataclass(frozen=True)
-class ChosenWidth:
-    """A width that an identification has used, and whether the logs would have narrower ones.
-
-    Attributes
-    ----------
-    name : str
-    value : float
-        [unit]
-    unit : str
-    given : float
-        Before the choice [unit].
-    too_stiff : bool
-        Whether a narrower one was left out, for it takes too many integration steps.
-    """
-
-    name: str
-    value: float
-    unit: str
-    given: float
-    too_stiff: bool = False
-
-    def __str__(self) -> str:
-        kept = self.value == self.given
-        how = "stays at" if kept else "narrowed to" if self.value < self.given else "widened to"
-        reason = "; narrower ones take too many integration steps" if self.too_stiff else ""
-        return f"{self.name} {how} {write_value(self.value, self.unit, 3)}, the best width tried{reason}"
-
-
-@dataclass(frozen=True)
 class ChosenWindow:
     """The windows in which logs were fitted, each with a start state of its own, and why.
 
@@ -286,8 +257,6 @@ class IdentificationResult(Result):
         Versions, options, start, and the logs' sha256.
     verdict : Verdict
         What the logs do not identify, why, and which run would: ``print(result.verdict)``.
-    widths : tuple of ChosenWidth
-        The widths over which the model rounds its kinks, as chosen by the logs; `parameters` holds them, too.
     window : ChosenWindow or None
         The windows in which the logs were fitted; None where they were fitted whole.
     """
@@ -301,18 +270,17 @@ class IdentificationResult(Result):
     stats: Mapping[str, float]
     provenance: Mapping[str, str]
     verdict: Verdict | None = None
-    widths: tuple[ChosenWidth, ...] = ()
     window: ChosenWindow | None = None
 
     def summary(self) -> Report:
         """The end of the fit, estimates with intervals and marks, what is unidentifiable, agreement with the logs."""
         sentences = tuple(map(Line, self.verdict.sentences if self.verdict else ()))
-        estimates = report_estimates(self.estimates, self.widths)
+        estimates = report_estimates(self.estimates)
         return report_status(self.status) + estimates + Report(sentences) + report_agreement(self.fit)
 
 
-def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> Report:
-    """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen."""
+def report_estimates(estimates: "pd.DataFrame") -> Report:
+    """Value, interval or range, and mark of each free parameter."""
     rows = []
     for name, row in estimates.to_dict(orient="index").items():
         estimate, spread, low, high = (float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high"))
@@ -333,10 +301,9 @@ def report_estimates(estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = 
         value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
         mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
         rows.append((str(name), value, interval, str(row["unit"]), str(mark)))
-    rows += [(w.name, format_number(w.value, 3), "-", w.unit, "chosen") for w in widths]
     columns = *text_columns("parameter"), *number_columns("value", f"95{TIED}% interval"), *text_columns("unit", "mark")
     table = (Table(columns, tuple(rows)),) if rows else ()
-    return Report((*table, *(Line(str(width)) for width in widths)))
+    return Report(table)
 
 
 def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:

@@ -20,7 +20,6 @@ from pneuopt.identification.identifiability import (
     verdict_from_covariance,
     verdict_from_sensitivities,
 )
-from pneuopt.identification.misfit import fixed_widths
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.profiles import Profile, trace_profile
 from pneuopt.identification.result import (
@@ -45,7 +44,7 @@ from pneuopt.identification.tolerances import (
     TRIAL_FIT_ITERATIONS,
     WHOLE_SHARE,
 )
-from pneuopt.identification.widths import advise_widths
+from pneuopt.identification.widths import estimated_widths
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
 from pneuopt.shooting.equations import segment_gaps
@@ -129,7 +128,8 @@ def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple
     if is_missed or result.stats["gap_deviation"] > problem.method.stages[-1].gap:
         return found, []  # an error of the model, or noise of the states: the bias is not in a profile
     unknowns = problem.unknowns()
-    waiting = [n for n in known if unknowns[n].log and rows["stderr"][n] > MAX_LINEAR_DEVIATION * rows["value"][n]]
+    doubtful = (n for n in known if unknowns[n].log and rows["stderr"][n] > MAX_LINEAR_DEVIATION * rows["value"][n])
+    waiting = [n for n in doubtful if n not in estimated_widths(problem)]  # of those nobody asks for an interval
     try:
         while waiting:
             name = waiting[0]
@@ -189,7 +189,7 @@ def _review_failure(problem: EstimationProblem, start: Start, result: Identifica
     if status.code is not Code.INTERRUPTED:
         status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
         advice = _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
-        status = status.with_remedies(*(advice if verdict.unidentifiable else ()), *advise_widths(problem))
+        status = status.with_remedies(*(advice if verdict.unidentifiable else ()))
     unknown = result.covariance * math.nan
     return replace(result, estimates=estimates, covariance=unknown, status=status, verdict=verdict)
 
@@ -197,7 +197,8 @@ def _review_failure(problem: EstimationProblem, start: Start, result: Identifica
 def _name_part(problem: EstimationProblem, status: Status, verdict: Verdict) -> Status:
     """The status of a fit with what its logs do not identify, and where that is held; first where it is good."""
     unknowns = problem.unknowns()
-    held = [f"{n} at {write_value(problem.fixed[n], p.unit, 3)}" for n, p in unknowns.items() if n in problem.fixed]
+    fixed = {n: v for n, v in problem.fixed.items() if n not in estimated_widths(problem)}
+    held = [f"{n} at {write_value(fixed[n], p.unit, 3)}" for n, p in unknowns.items() if n in fixed]
     words = f"held: {join_names(held)}; the intervals of the others allow for a factor of ten" if held else ""
     said = tuple(filter(None, (_name_unidentifiable(verdict), words)))
     if not said or status.code is not Code.CONVERGED:
@@ -328,7 +329,8 @@ def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
 def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
     """The squares with tight gaps by the equations linearised at a fit, and those with each fixed value freed."""
     # a fixed parameter may be wrong unless it is a width, or each log has or states one of its own
-    stated = {n for e in problem.experiments for n in e.conditions} | set(fixed_widths(problem))
+    widths = {w.name for w in problem.system.plant.identification_hints.widths}
+    stated = {n for e in problem.experiments for n in e.conditions} | widths
     fixed = {n: p for n, p in problem.parameters.items() if not (p.free or p.per_log) and n not in stated}
     names = [n for n, p in fixed.items() if p.lower < p.value < p.upper]
     if not names:

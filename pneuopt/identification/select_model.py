@@ -36,7 +36,6 @@ from pneuopt.identification.tolerances import (
     NESTED_TEST_LEVEL,
     TIE,
 )
-from pneuopt.identification.widths import COMMON_WIDTH
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_argument, check_parameters
@@ -330,7 +329,7 @@ def _fit_beside(
     alike: "_Alike",
 ) -> Fits:
     """The fit of the leader and those of the others, as alike to it as can be, the simplest first."""
-    widths, out = {width.name: width.value for width in fit.widths}, Fits({leader: fit})
+    out = Fits({leader: fit})
     out |= _refute_hopeless(leader, fit, candidates, trials, alike)
     others = sorted(candidates.keys() - out.keys(), key=lambda n: (len(candidates[n].parameters.free_names), n))
     if others and alike.window is None:
@@ -339,8 +338,7 @@ def _fit_beside(
             out[leader] = alike.fit(candidates[leader], fit)
     for name in others:
         alike.announce("fitting", name, len(out), len(candidates))
-        out[name] = found = _fit_one(_with_widths(candidates[name], widths), leader, candidates, alike, out)
-        widths = {**{width.name: width.value for width in found.widths}, **widths}
+        out[name] = _fit_one(candidates[name], leader, candidates, alike, out)
     return out
 
 
@@ -351,10 +349,10 @@ def _refute_hopeless(
 
     A static map is always fitted, for that is as short.
     """
-    out, widths = dict[str, Refutation](), {width.name: width.value for width in fit.widths}
+    out = dict[str, Refutation]()
     for name in _richest_first({n: c for n, c in candidates.items() if n != leader and c.system.states}):
-        candidate, trial = _with_widths(candidates[name], widths), trials[name]
-        is_tried = candidate == candidates[name] and bool(trial.by_stage)
+        candidate, trial = candidates[name], trials[name]
+        is_tried = bool(trial.by_stage)
         if is_tried and not trial.is_hopeless:
             continue
         if not (is_tried and any(candidates[n].extends(candidate) for n in out)):
@@ -447,14 +445,6 @@ class _Alike:
 def _has_jumps(fit: IdentificationResult, method: LeastSquares) -> bool:
     """Whether gaps stand for noise of the states in a fit of whole logs."""
     return fit.window is None and fit.stats["gap_deviation"] > method.stages[-1].gap
-
-
-def _with_widths(candidate: Candidate, widths: Mapping[str, float]) -> Candidate:
-    """The candidate with the common widths, where the user has stated none."""
-    own, known = candidate.parameters, candidate.system.identification_hints.widths
-    every = {name for width in known for name in (width.name, *width.follows)} & own.keys() & widths.keys()
-    edits = {n: replace(own[n], value=widths[n], source=COMMON_WIDTH) for n in every}
-    return replace(candidate, parameters=own | ParameterSet(edits))
 
 
 @dataclass(frozen=True)

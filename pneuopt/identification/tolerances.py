@@ -131,11 +131,8 @@ MIN_LOGS = 4  # from which a drift is tested: three leave one degree of freedom,
 
 # Widths
 
-CONFIRMING_STAGES = 4  # of the method, that confirm another width
 MAX_TRIAL_SAMPLES = 8000  # of all logs
-FORESEEN_RATIO = 0.5  # [1] foreseen cost over the given width's, below which no search confirms a narrower one
-MIN_RELATIVE_FALL = 2e-3  # [1] of the cost, that counts
-MAX_HIDING_SHARE = 0.25  # [1] width over what it hides: above, a rounded edge shifts the dead zone fitted with it
+WIDTH_RANGE = 30.0  # [1] start of a width over its least: less keeps friction from sticking, more integrates slowly
 
 # Windows
 

@@ -28,7 +28,6 @@ from pneuopt.models.tolerances import (
     MIN_INERTIA_SHARE,
     MIN_REVERSALS,
     MIN_SPEED_RATIO,
-    SMOOTHING_FACTOR,
     STICKING_SPEED,
     STRIBECK_VELOCITIES,
     VISCOUS_SPEED_RATIO,
@@ -157,7 +156,7 @@ COULOMB_HINTS = (
     IdentificationHints(
         {},
         (SeparatingRun(CONSTANT_FORCES, FRICTION_LEVELS, "log both directions"),),
-        (Width("smoothing", SMOOTHING_FACTOR),),
+        (Width("smoothing"),),
     )
     | VISCOUS_HINTS
 )
@@ -197,7 +196,7 @@ ASYMMETRY_HINTS = IdentificationHints(
             ALIKE_AT_EVERY_SPEED,
         ),
     ),
-    (Width("smoothing", SMOOTHING_FACTOR, follows=("asymmetry_width",)),),
+    (Width("smoothing"), Width("asymmetry_width")),
 )
 _LEVELS = frozenset(f"friction.{n}" for n in FRICTION_LEVELS)
 

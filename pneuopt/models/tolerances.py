@@ -14,9 +14,9 @@ MIN_FIT_SAMPLES = (
 MIN_DIRECTION_SHARE = 0.05  # share of the moving samples in the rarer direction [1]: fewer are accidental
 MIN_REVERSALS = 2  # reversals of the motion: one alone does not show that presliding repeats
 MIN_INERTIA_SHARE = 0.02  # inertia force over the friction level [1]: less is lost in the model's error
-# factors of a search over the width of dry friction's sign, and over the rounding of the valve's edges [1]: a smaller
-# one takes more trials, a larger one leaves out widths at which a sliding log is followed best, or a worn valve's
-SMOOTHING_FACTOR, ROUNDING_FACTOR = 10.0, 4.0
+ROUNDING_START = (
+    0.01  # of a valve's edges [half travels], where a fit begins: wider hides a dead zone, narrower is stiff
+)
 
 # Starts of friction from a log
 

@@ -129,7 +129,7 @@ def prediction_page(
 def _estimate_section(result: IdentificationResult) -> Section:
     notes = result.estimates["note"].to_dict()
     lines = tuple(Line(f"{n}: {note}") for n, note in notes.items() if isinstance(note, str) and note)
-    parts: list[Report | Picture] = [report_estimates(result.estimates, result.widths), Report(lines)]
+    parts: list[Report | Picture] = [report_estimates(result.estimates), Report(lines)]
     if result.window is not None:
         parts.append(Report((Line(str(result.window)),)))
     if int(result.estimates["stderr"].notna().sum()) > 1:
@@ -141,8 +141,7 @@ def _estimate_section(result: IdentificationResult) -> Section:
 
 def _known_section(result: IdentificationResult) -> Section:
     """What the estimates stand on: the values that were given."""
-    found = {*result.estimates.index, *(width.name for width in result.widths)}
-    given = {n: q for n, q in result.parameters.items() if n not in found}
+    given = {n: q for n, q in result.parameters.items() if n not in result.estimates.index}
     rows = tuple((n, write_value(q.value, q.unit, 6), q.source) for n, q in given.items())
     lead = Line("not estimated: as the files state them, or by default")
     heads = *text_columns("parameter"), *number_columns("value"), *text_columns("source")

@@ -53,7 +53,7 @@ from pneuopt.models.tolerances import (
     MAX_COMPRESSION_RATIO,
     MAX_STOP_TRAVEL,
     MIN_CHAMBER_PRESSURE,
-    ROUNDING_FACTOR,
+    ROUNDING_START,
     STOP_ROUNDING,
 )
 from pneuopt.quantities.arrays import Array
@@ -360,7 +360,7 @@ _FLOW_HINTS = IdentificationHints(
             "log chambers filling up to the supply's pressure and emptying to the ambient's",
         ),
     ),
-    widths=(Width("valve.rounding", ROUNDING_FACTOR, hides="valve.dead_zone"),),
+    widths=(Width("valve.rounding", start=ROUNDING_START),),
 )
 _AIR_PARAMETERS = ParameterSet(
     {
