@@ -58,6 +58,7 @@ from pneuopt.evaluation.tolerances import (
     MAX_CONTINUATION_INSTANTS,
     MAX_HORIZONS,
     MIN_DRIFT_SHARE,
+    MIN_EXIT,
     MIN_GROWTH,
     MIN_LATER_OVERSHOOT,
     MIN_MOTION,
@@ -404,8 +405,12 @@ class Ending:
 
     def refutes(self, settling_time: float) -> bool:
         """Whether the mean leaves the band after this instant, beyond the horizon [s]."""
-        beyond = self.response.error[self.response.times > self.response.horizon]
-        return not self.is_inside(beyond).all() and settling_time <= self.response.horizon
+        return settling_time <= self.response.horizon and self.leaves(self.response.times, self.response.error)
+
+    def leaves(self, t: Array, error: Array) -> bool:
+        """Whether errors, in steps, clearly leave the band beyond the horizon; a touch of its edge does not."""
+        beyond = error[t > self.response.horizon]
+        return not SettlingBand(0.0, (1 + MIN_EXIT) * self.band).contains(beyond).all()
 
     @property
     def stands(self) -> bool:

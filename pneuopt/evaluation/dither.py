@@ -418,10 +418,8 @@ def begin_of_end(ending: Ending) -> float:
 
 def _settling_time(ending: Ending, within_horizon: float, t: Array, error: Array) -> float:
     """Settling time within the horizon unless the continuation refutes it; else its own; infinite for never [s]."""
-    inside = ending.is_inside(error)
-    if isfinite(within_horizon) and inside[t > ending.response.horizon].all():
-        return within_horizon
-    return entry_for_good(t, inside)
+    holds = isfinite(within_horizon) and not ending.leaves(t, error)
+    return within_horizon if holds else entry_for_good(t, ending.is_inside(error))
 
 
 def dither_effect(

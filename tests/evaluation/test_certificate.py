@@ -32,7 +32,7 @@ from pneuopt.evaluation.certificate import (
     continue_response,
     describe_counts,
 )
-from pneuopt.evaluation.dither import Usefulness, judge_dither
+from pneuopt.evaluation.dither import Usefulness, _settling_time, judge_dither
 from pneuopt.evaluation.evaluate import evaluate_cases
 from pneuopt.evaluation.metric import Tolerance, longest_stay
 from pneuopt.evaluation.response import loop_inputs
@@ -299,8 +299,16 @@ def test_a_response_that_rests_beyond_the_band_is_outside(share: float, inside: 
     found = ending(t, -np.maximum(np.exp(-t / 0.1), share * BAND))
     assert found.is_settled == inside
     assert ([f.defect for f in found.findings()] == []) == inside
-    late = ending(t, np.where(t > 1.2, share * BAND, 0.0))  # the horizon is 1 s
-    assert late.refutes(0.5) != inside
+
+
+@pytest.mark.parametrize(("share", "refutes"), [(1.0, False), (1.0007, False), (1.002, True), (np.nan, True)])
+def test_a_touch_of_the_edge_refutes_no_settling_within_the_horizon(share: float, refutes: bool) -> None:
+    """A ripple 3e-4 of the band beyond its edge made a dither "harmful" that settles in two thirds of the time."""
+    t = np.linspace(0.0, 1.5, 3001)
+    error = np.where(t > 1.2, share * BAND, 0.0)  # the horizon is 1 s
+    found = ending(t, error)
+    assert found.leaves(t, error) == found.refutes(0.5) == refutes
+    assert (_settling_time(found, 0.5, t, np.abs(error)) == 0.5) != refutes
 
 
 @pytest.mark.parametrize(("horizons", "refused"), [(0.9, False), (3.0, False), (5.0, True), (9.0, True)])
