@@ -1,6 +1,7 @@
 """Rigs of a simulator that shares nothing with pneuopt, identified by defaults: how many are right, refused, or false.
 
-    python problems/identify/foreign_rigs.py [--drives N] [--servos N] [--first SEED] [--step N] [--json FILE] [--out DIR]
+    python problems/identify/foreign_rigs.py [--drives N] [--servos N] [--first SEED] [--step N]
+                                             [--json FILE] [--out DIR]
 
 `problems/shared/foreign_rigs.py` draws each rig and writes its drive.toml and its log; `plain_rigs.c` moves it. The
 widths of the kinks are drawn, too, and stated nowhere; friction is a smooth curve, true stiction, or bristles.
@@ -46,7 +47,9 @@ def main(
 ) -> "pd.DataFrame":
     import pandas as pd
 
-    tables = {kind: study(kind, range(first, first + step * n, step)) for kind, n in zip(KINDS, (drives, servos))}
+    tables = {
+        kind: study(kind, range(first, first + step * n, step)) for kind, n in zip(KINDS, (drives, servos), strict=True)
+    }
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         pd.concat(tables.values()).to_csv(out / "foreign_rigs.csv", index=False)
@@ -67,8 +70,8 @@ def study(kind: str, seeds: range) -> "pd.DataFrame":
 def identify_rig(kind: str, given: po.ParameterSet) -> dict[str, Any]:
     """What `identify` makes of a rig's files, by defaults."""
     rig = KINDS[kind](round(given.value("seed")))
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         drive_file, log_file = foreign_rigs.write_rig(rig, Path(folder))
         began = time.process_time()
         try:
@@ -86,10 +89,9 @@ def identify_rig(kind: str, given: po.ParameterSet) -> dict[str, Any]:
             return {"rig": rig.name} | row
     seconds = time.process_time() - began
     row = judge(rig, fit) | {"cpu": seconds, "status": str(fit.status), "free_run": free_run_error(fit)}
-    shown = f"{row['outcome']}, worst {row['worst']} {row['percent']:.3g} %, {row['sigmas']:.3g} sd, {row['marked']:.0%} marked"
-    print(
-        f"{rig.name}, {rig.samples}: {shown}, {seconds:.1f} s, {'; '.join(fit.status.sentences)[:160]}", file=sys.stderr
-    )
+    worst = f"worst {row['worst']} {row['percent']:.3g} %, {row['sigmas']:.3g} sd, {row['marked']:.0%} marked"
+    line = f"{rig.name}, {rig.samples}: {row['outcome']}, {worst}, {seconds:.1f} s, {'; '.join(fit.status.sentences)[:160]}"
+    print(line, file=sys.stderr)
     return {"rig": rig.name} | row
 
 
