@@ -23,7 +23,7 @@ FINAL_PERIODS = 5  # of a dither at a record's end, over which its final value i
 TAIL_SHARE = 0.05  # of a record that is its end, where ripple is read and a settling comes too late to count
 RIPPLE_ALLOWANCE = 2.0  # amplitudes of the ripple by which the signal moves towards its mean: 1 leaves a growing ripple
 EDGE_ROUNDING = 1e-9  # share of a band's half width by which rounding may put what lies on its edge outside
-MIN_EXIT = 1e-3  # of a band's half width beyond it, that refutes a settling: less than two records of a response agree
+MIN_EXIT = 1e-3  # of a band's half width: an exit by less refutes no settling, for readings are no more exact
 MIN_STAY_RATIO = 2.0  # of the last stay in the band to the longest before, from which a late response has settled
 
 # Limit cycles

@@ -320,10 +320,6 @@ class CaseQueue:
             for name in chunk.cases:
                 yield name, Outcome(error=reason)
 
-    def separate(self, chunk: Chunk, reason: str) -> Iterator[tuple[str, Outcome]]:
-        """Take back a chunk that took too long: a case alone gets the reason, several are tried one by one."""
-        yield from self.give_back(Chunk(chunk.cases, TRIES), reason)
-
 
 Outcomes = Generator[tuple[str, Outcome], None, None]
 _THREADS_REMEDY = "in this process, executor=ThreadPoolExecutor()"
@@ -355,8 +351,8 @@ def run_in_processes(
                 for run, future in crew.wait():
                     yield from _receive(crew, queue, run, future)
                 for late in crew.stop_late():
-                    if late.chunk is not None:
-                        yield from queue.separate(late.chunk, chosen.time_reason)
+                    if late.chunk is not None:  # a case alone gets the reason, several are tried one by one
+                        yield from queue.give_back(Chunk(late.chunk.cases, TRIES), chosen.time_reason)
                     if queue:
                         crew.start()
             while chunk := queue.take():
@@ -391,9 +387,13 @@ class _Crew:
         self._processes.append(process)
         added = {n: "1" for n in _THREAD_VARIABLES if n not in os.environ}  # what the user has said goes first
         os.environ.update(added)  # it starts with one thread for linear algebra
+        mask = getattr(signal, "pthread_sigmask", None)  # not on Windows
+        before = mask and mask(signal.SIG_BLOCK, {signal.SIGINT})  # it inherits this: no Ctrl-C while it imports
         try:
             self.busy[process.submit(_load_task)] = _Run(process, None, inf)
         finally:
+            if mask:
+                mask(signal.SIG_SETMASK, before)
             for n in added:
                 del os.environ[n]
 

@@ -277,6 +277,22 @@ def test_ctrl_c_in_a_terminal_reaches_everybody_and_loses_nothing(functions: Mod
     assert (run.returncode, out, err) == (0, "['', 'interrupted', 'interrupted']\n", "")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="sends SIGINT to a group of processes")
+@pytest.mark.parametrize("slow", [1, 2])
+def test_ctrl_c_is_quiet_in_a_process_that_still_starts(functions: ModuleType, tmp_path: Path, slow: int) -> None:
+    """One that imported the user's script printed a traceback of its own."""
+    late = (
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "import multiprocessing, time\n"
+        f"if multiprocessing.current_process().name.endswith('-{slow}'):\n"
+        "    time.sleep(2)"
+    )
+    with running_study(tmp_path, before=late, after="print(table['error'].tolist())") as run:
+        os.killpg(run.pid, signal.SIGINT)
+        out, err = run.communicate(timeout=30)
+    assert (run.returncode, out, err) == (0, "['', 'interrupted', 'interrupted']\n", "")
+
+
 @pytest.mark.skipif(os.name == "nt", reason="no process ends without a word there")
 def test_the_processes_of_a_study_that_is_killed_end_with_it(functions: ModuleType, tmp_path: Path) -> None:
     """They hold its pipes: a shell that reads them waited for ever."""
