@@ -8,7 +8,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,13 +42,13 @@ from pneuopt.identification.problem import (
 from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult
 from pneuopt.identification.review import FixedValueTest, review_fit
 from pneuopt.identification.search import (
+    Search,
     check_window,
     enforce_ordering,
+    find_fit,
     fit_fixing_unidentifiable,
     fit_from_profiles,
-    fit_from_starts,
     fit_in_windows,
-    fit_logs,
     mark_order,
     run_freely,
     tighten_gaps,
@@ -209,9 +208,8 @@ def _fit_and_review(
     problem = free_widths(problem)
     doubts = FixedValueTest()
     if start is None:
-        search = partial(fit_from_starts, loss=loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
-        is_plain = loss is None and not estimate_noise
-        held, fit, label = fit_logs(problem, search) if is_plain else search(problem)
+        search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
+        _, held, fit, label, _ = find_fit(search)
     else:
         began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
@@ -410,7 +408,7 @@ def _estimates(
         deviation, dof = math.nan if at_bound[i] else float(stderr[i]), float(misfit.dof[i])
         low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
         ends = [
-            (p.value * math.exp(change / p.value) if p.log else p.value + change)
+            (p.value * math.exp(min(change / p.value, 700.0)) if p.log else p.value + change)
             for change in misfit.ranges[i].tolist()
         ]
         mark = misfit.mark(is_optimum=status.converged and math.isfinite(deviation) and not influenced[i])

@@ -65,19 +65,27 @@ class EstimationProblem:
     # time after which a log starts anew with a state of its own [s]; math.inf where it never does
     window: float = math.inf
     is_whole: bool = False  # whether logs stay whole also where the model does not follow them
+    # the starts that were made so far, with what they are of: trials of one problem share them
+    _made: list[tuple[tuple[object, ...], Sequence[Start]]] = field(default_factory=list, repr=False, compare=False)
 
     @property
     def has_gaps(self) -> bool:
         """Whether some segment continues another; not so in windows of one segment each."""
         return self.method.segment_time < self.window
 
-    @cached_property
+    @property
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
+        source = (self.system, self.parameters, *self.experiments)
+        for others, starts in self._made:
+            if len(others) == len(source) and all(a is b for a, b in zip(others, source, strict=True)):
+                return starts
         known = {
             e.name: (apply_conditions(self.parameters, e), input_behaviour(self.system, e)) for e in self.experiments
         }
-        return self.system.starts({e.name: Log(e.trajectory, *known[e.name]) for e in self.experiments})
+        starts = self.system.starts({e.name: Log(e.trajectory, *known[e.name]) for e in self.experiments})
+        self._made.append((source, starts))
+        return starts
 
     def start_from(self, fit: Fit | IdentificationResult, label: str = "fit") -> Start:
         """The start from a fit of these logs, by the parameters that both have.

@@ -15,8 +15,9 @@ of Probability and its Applications 35(3), 1991; problems/identify/windows.py ho
 """
 
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -54,11 +55,10 @@ from pneuopt.identification.tolerances import (
     PART_SEGMENTS,
     REFIT_STAGES,
     SAME_COST_RATIO,
-    SAME_MISFIT_RATIO,
-    SHORT_ITERATIONS,
     WINDOW_FACTOR,
     WINDOW_ITERATIONS,
 )
+from pneuopt.identification.widths import estimated_widths
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code, Status
@@ -72,65 +72,110 @@ from pneuopt.shooting.tolerances import GATHERED_DEVIATION, MAX_CHI_SQUARE_RATIO
 Candidate = tuple[EstimationProblem, Fit, str]
 
 
-def fit_from_starts(
-    problem: EstimationProblem,
-    loss: Loss | None = None,
-    *,
-    estimate_noise: bool = False,
-    gives_up: Callable[[EstimationProblem, Fit], bool] = lambda *_: False,
-) -> Candidate:
-    """Fit from the first start that ends at the noise's level; else the best of all until two agree on the least cost.
+class Tried(NamedTuple):
+    """What one try of an attempt came to."""
+
+    attempt: str
+    problem: EstimationProblem  # with what it holds
+    fit: Fit
+    label: str  # of the start
+    cpu_seconds: float
+
+
+@dataclass(eq=False)
+class Search:
+    """A problem, how it is fitted, and what was tried so far, in that order.
 
     `gives_up` is called with the best fit so far: whether another start cannot help.
     """
-    fits: list[Candidate] = []
-    interrupted, tightest = False, problem.method.stages[-1].gap
-    is_plain = loss is None and not estimate_noise
+
+    problem: EstimationProblem
+    loss: Loss | None = None
+    estimate_noise: bool = False
+    gives_up: Callable[[EstimationProblem, Fit], bool] = lambda *_: False
+    tried: list[Tried] = field(default_factory=list)
+
+    @property
+    def best(self) -> Tried:
+        """The best try so far."""
+        return min(self.tried, key=lambda each: rank(each.fit, self.problem.method.stages[-1].gap))
+
+    @property
+    def guesses(self) -> list[Start]:
+        """The model's starts that try values of what the logs do not determine."""
+        return [c for c in self.problem.candidates if c.trial_parameters]
+
+    def add(self, attempt: str, candidate: Candidate, cpu_seconds: float) -> None:
+        """Add a try, with the weights of a robust loss where there is one."""
+        held, fit, label = candidate
+        held, fit = fit_robustly(held, fit, self.loss, estimate_noise=self.estimate_noise)
+        self.tried.append(Tried(attempt, held, fit, label, cpu_seconds))
+
+
+class Attempt(NamedTuple):
+    """A way to a fit: where it suits, and the fits to which it leads, one after the other."""
+
+    name: str
+    suits: Callable[[Search], bool]
+    run: Callable[[Search], Iterator[Candidate]]
+    is_enough: Callable[[Search], bool]  # whether its last try is the answer
+
+
+def find_fit(search: Search) -> Tried:
+    """Make one attempt after the other until one is the answer; else the best of all, with a status that says so."""
+    interrupted = False
     try:
-        for start in starts_by_cost(problem, fits):
-            may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
-            limit = HOPELESS_MISFIT if may_wait else math.inf
-            # a search that joins the best one only confirms it: without noise of the states where that did not settle
-            is_joinable = is_plain and bool(fits) and is_optimum(fits[0][1]) and not fits[0][0].fixed
-            known = fits[0][1].stage_costs if is_joinable else ()
-            settles = is_joinable and problem.method.allows_state_noise and fits[0][1].status.converged
-            tried = replace(problem, method=replace(problem.method, allows_state_noise=settles)) if known else problem
-            held, fit = fit_fixing_unidentifiable(tried, start, limit, known)
-            held = replace(held, method=problem.method)
-            if fit.end is SearchEnd.DUPLICATE:
+        for attempt, candidate, seconds in _attempts(search):
+            search.add(attempt.name, candidate, seconds)
+            if attempt.is_enough(search) or _is_beyond_help(search):
                 break
-            held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
-            if explains_to_noise(held, fit) and not held.fixed and is_in_order(held, fit):
-                return held, fit, start.label
-            if fit.status.code is not Code.INTERRUPTED and is_at_noise(held, fit):
-                held, fit = fit_without_unsettled(held, fit, start.label)
-            interrupted = fit.status.code is Code.INTERRUPTED
-            fits.append((held, fit, start.label))
-            fits.sort(key=lambda each: rank(each[1], tightest))
-            is_end = interrupted or _are_enough(fits)
-            if is_end or ((is_optimum(fits[0][1]) or len(fits) == MIN_DOUBTED) and gives_up(*fits[0][:2])):
-                break
-            if len(fits) == 1 and is_plain and (predicted := _fit_predicted(problem, fit)):
-                return problem, predicted, f"{start.label}, by prediction errors"
     except KeyboardInterrupt:
-        if not fits:
+        if not search.tried:
             raise
         interrupted = True
-    held, fit, label = fits[0]
-    if not interrupted:
-        held, fit = fit_without_unsettled(held, fit, label)
-        interrupted = fit.status.code is Code.INTERRUPTED
-    return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
+    best = search.best
+    interrupted |= search.tried[-1].fit.status.code is Code.INTERRUPTED
+    status = _status(search.problem, best.fit, len(search.tried), interrupted=interrupted)
+    return best._replace(fit=replace(best.fit, status=status))
 
 
-def _fit_predicted(problem: EstimationProblem, first: Fit) -> Fit | None:
-    """The fit by prediction errors where the first start was left; None where that does not explain the logs."""
-    found = fit_from_predictions(problem, HOPELESS_MISFIT) if first.end is SearchEnd.ABANDONED else None
-    if found is not None and found.status.code is Code.INTERRUPTED:
-        raise KeyboardInterrupt
-    if found is None or not explains_to_noise(problem, found) or not is_in_order(problem, found):
-        return None
-    return found.with_effort_of(first)
+def _attempts(search: Search) -> Iterator[tuple[Attempt, Candidate, float]]:
+    """The tries of all attempts that suit, with the CPU seconds of each."""
+    for attempt in ATTEMPTS:
+        if not attempt.suits(search):
+            continue
+        began = time.process_time()
+        for candidate in attempt.run(search):
+            yield attempt, candidate, time.process_time() - began
+            began = time.process_time()
+
+
+def _is_beyond_help(search: Search) -> bool:
+    """Whether no other start can help: the search was interrupted, or a fixed value is what the logs reject."""
+    best = search.best
+    if search.tried[-1].fit.status.code is Code.INTERRUPTED:
+        return True
+    return (is_optimum(best.fit) or len(search.tried) == MIN_DOUBTED) and search.gives_up(best.problem, best.fit)
+
+
+def _is_at_noise(search: Search) -> bool:
+    """Whether the last try explains the logs to their noise; the first of all holds nothing but widths."""
+    last = search.tried[-1]
+    lost = set(last.problem.fixed) - set(estimated_widths(search.problem))
+    is_sure = len(search.tried) > 1 or (not lost and is_in_order(last.problem, last.fit))
+    return is_sure and explains_to_noise(last.problem, last.fit)
+
+
+def _is_followed(search: Search) -> bool:
+    """Whether the last try converged with tight gaps: it began at the best of many hypotheses, so no other is better."""
+    fit = search.tried[-1].fit
+    return fit.status.converged and fit.jumps is None
+
+
+def _is_confirmed(search: Search) -> bool:
+    """Whether two tries agree, or the last one explains the logs."""
+    best, second = sorted((each.fit for each in search.tried), key=lambda fit: fit.stats["cost"])[:2]
+    return are_alike(best, second) or _is_at_noise(search)
 
 
 def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: bool) -> Status:
@@ -146,44 +191,31 @@ def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: b
     return status
 
 
-def starts_by_cost(problem: EstimationProblem, fits: Sequence[Candidate] = ()) -> Iterator[Start]:
-    """The model's first start, then the others, settled to what each holds, the least cost first.
+def _from_first_start(search: Search) -> Iterator[Candidate]:
+    """The model's first start, left after its first stage where that is far from the logs and others are to come."""
+    problem, start = search.problem, search.problem.candidates[0]
+    may_wait = search.loss is None and problem.has_gaps and len(search.guesses) > 1
+    held, fit = fit_fixing_unidentifiable(problem, start, HOPELESS_MISFIT if may_wait else math.inf)
+    yield held, fit, start.label
 
-    `fits` are those from the starts up to then, the best first. An optimum needs one more start, as it is; one whose
-    gaps stand for noise of the states takes all so, for settling with wide gaps says little there.
-    """
-    candidates, gaps = problem.candidates, [stage.gap for stage in problem.method.stages]
-    yield candidates[0]
-    while len(candidates) > 1 and fits and is_optimum(fits[0][1]) and (len(fits) == 1 or fits[0][1].jumps is not None):
-        candidates = candidates[1:]
-        yield candidates[0]
-    guessed = [c for c in candidates if c.trial_parameters]
-    # after how many stages the first start was left, and what it cost after as many as the others get
-    left, known = 0, math.nan
-    if fits and fits[0][1].end is SearchEnd.ABANDONED:
-        left, last = 1 + gaps.index(fits[0][1].stats["gap_deviation"]), gaps[:GUESS_STAGES][-1]
-        known = next((cost for gap, cost in fits[0][1].stage_costs if gap == last), math.nan)
-    # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
-    stages = min(GUESS_STAGES, left or GUESS_STAGES) if problem.has_gaps else 1
-    settled, others = list[tuple[tuple[float, float], Start]](), list(guessed) if len(guessed) > 1 else []
-    while others:
-        cost, start, explains = _settle_start(problem, others.pop(0), stages)
-        if explains:
-            yield start
-            continue
-        settled.append((cost, start))
-        if cost[1] <= SAME_MISFIT_RATIO * known and cost[0] == gaps[GUESS_STAGES - 1]:
-            break
-    yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
-    yield from others
-    yield from [c for c in candidates[1:] if len(guessed) < 2 or not c.trial_parameters]
-    yield from candidates[:1] if left and len(guessed) < 2 else []
+
+def _from_other_starts(search: Search) -> Iterator[Candidate]:
+    """The other starts, with guesses held for a few stages; the least cost first."""
+    problem, candidates = search.problem, search.problem.candidates
+    guessed = search.guesses if len(search.guesses) > 1 else []
+    settled = sorted((_settle_start(problem, c) for c in guessed), key=lambda each: each[0])
+    for start in [*(start for _, start in settled), *(c for c in candidates[1:] if c not in guessed)]:
+        known = search.best.fit.stage_costs if is_optimum(search.best.fit) else ()
+        held, fit = fit_fixing_unidentifiable(problem, start, math.inf, known)
+        if fit.end is SearchEnd.DUPLICATE:
+            return
+        yield held, fit, start.label
 
 
 def _settle_start(
-    problem: EstimationProblem, candidate: Start, stages: int, width: float = 1e-9
-) -> tuple[tuple[float, float], Start, bool]:
-    """The cost of a start after some stages with its guesses held, the start from there, and whether that is the noise.
+    problem: EstimationProblem, candidate: Start, width: float = 1e-9
+) -> tuple[tuple[float, float], Start]:
+    """The cost of a start after some stages with its guesses held, and the start from there.
 
     Wider gaps cost less, which says nothing: they rank behind. Bounds of some `width` [1] hold a guess, for equal ones
     would compile other equations; with noise of the states a wrong guess would explain any log.
@@ -192,14 +224,13 @@ def _settle_start(
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
     bounds = {n: (v - width * abs(v), v + width * abs(v)) for n, v in guesses.items()}
     held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
-    method = replace(problem.method, stages=problem.method.stages[:stages], allows_state_noise=False)
+    stages = problem.method.stages[: GUESS_STAGES if problem.has_gaps else 1]
+    method = replace(problem.method, stages=stages, allows_state_noise=False)
     fit = solve_least_squares(held, method)
     if fit.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     start = problem.start_from(fit, f"{candidate.label}, settled")
-    gap, cost = fit.stats["gap_deviation"], fit.stats["cost"]
-    explains = stages == GUESS_STAGES and 2 * cost <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
-    return (gap, cost), replace(start, parameters={**start.parameters, **guesses}), explains
+    return (fit.stats["gap_deviation"], fit.stats["cost"]), replace(start, parameters={**start.parameters, **guesses})
 
 
 def fit_fixing_unidentifiable(
@@ -285,16 +316,6 @@ def is_at_noise(problem: EstimationProblem, fit: Fit) -> bool:
     )
 
 
-def _are_enough(fits: Sequence[Candidate]) -> bool:
-    """Whether two starts agree, or the better of them explains the logs to their noise with what it holds."""
-    if len(fits) < 2:
-        return False
-    (held, best, _), (_, second, _) = fits[:2]
-    # with noise of the states every estimate may be biased, and another optimum of it would not change that
-    is_wrong = best.jumps is not None and best.status.converged and is_optimum(second)
-    return is_wrong or are_alike(best, second) or explains_to_noise(held, best)
-
-
 def is_optimum(fit: Fit) -> bool:
     """Whether a search ended at an optimum, be it of a model so wrong that the gaps absorb its misfit."""
     is_settled = not (fit.unsettled or fit.unidentifiable)
@@ -314,14 +335,16 @@ def is_in_order(problem: EstimationProblem, fit: Fit) -> bool:
 
 
 def rank(fit: Fit, tightest: float) -> tuple[int, float]:
-    """The order of fits: by cost; after those that explain the log come those with state noise or wide gaps."""
+    """The order of fits: by cost; after optima that explain the log come others, state noise, misfits, wide gaps."""
     cost = fit.stats["cost"]
     is_cut = fit.end is SearchEnd.ABANDONED or fit.status.code is Code.INTERRUPTED
     if is_cut and fit.stats["gap_deviation"] > tightest:
-        return 3, cost
+        return 4, cost
     if fit.jumps is not None:
-        return 1, cost
-    return 0 if 2 * cost <= MAX_CHI_SQUARE_RATIO * fit.count else 2, cost
+        return 2, cost
+    if 2 * cost > MAX_CHI_SQUARE_RATIO * fit.count:
+        return 3, cost
+    return (0 if fit.status.converged else 1), cost
 
 
 def are_alike(best: Fit, second: Fit) -> bool:
@@ -330,89 +353,35 @@ def are_alike(best: Fit, second: Fit) -> bool:
     return same and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
 
 
-def fit_logs(problem: EstimationProblem, search: Callable[[EstimationProblem], Candidate]) -> Candidate:
-    """Fit long logs by the short ways where these lead to the noise, and else by a search from all starts."""
-    tried = list[Candidate]()
-    try:
-        found = _fit_long_logs(problem, tried) or search(problem)
-    except KeyboardInterrupt:
-        if not tried:
-            raise
-        held, fit, label = tried[0]
-        found = held, replace(fit, status=SearchEnd.INTERRUPTED.status), label
-    if found[1].status.code is not Code.INTERRUPTED:
-        return found
-    held, fit, label = min([found, *tried], key=lambda each: rank(each[1], problem.method.stages[-1].gap))
-    return held, replace(fit, status=found[1].status), label
-
-
-def _fit_long_logs(problem: EstimationProblem, tried: list[Candidate]) -> Candidate | None:
-    """A fit that explains long logs to their noise, or was interrupted; None if they need a longer search.
-
-    What was tried is appended to `tried`; a doubtful fit needs another one before it.
-    """
-    for found in _tries(problem):
-        held, fit, label = found
-        if tried and fit.status.code is Code.NOT_CONVERGED and is_at_noise(held, fit):
-            held, fit = fit_without_unsettled(*found)
-        is_answer = explains_to_noise(held, fit) and not fit.unidentifiable and (not held.fixed or bool(tried))
-        pairs = (sorted((fit, other), key=lambda each: each.stats["cost"]) for _, other, _ in tried)
-        is_sure = is_in_order(held, fit) or any(are_alike(better, worse) for better, worse in pairs)
-        tried.append((held, fit, label))
-        if (is_answer and is_sure) or fit.status.code is Code.INTERRUPTED:
-            return held, fit, label
-    return None
-
-
-def _tries(problem: EstimationProblem) -> Iterator[Candidate]:
-    """The attempts before a long search of long logs: short, from filtered states, from a part; none of short logs.
-
-    The states of whole logs are filtered by a part's parameters: rough states would spoil what it has found.
-    """
-    parts = cut_excerpts(problem)
+def _from_excerpt(search: Search) -> Iterator[Candidate]:
+    """The whole logs from the answer of their liveliest parts, with the states filtered by its parameters."""
+    problem, parts = search.problem, cut_excerpts(search.problem)
     if parts is None:
         return
-    rough, stages = problem.candidates[0], problem.method.stages
-    few = stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)
-    method = replace(problem.method, stages=few, max_misfit=HOPELESS_MISFIT, allows_state_noise=False)
-    short = solve_least_squares(problem.transcription(rough), method)
-    yield problem, short, rough.label
-    is_near = short.jumps is None and 2 * short.stats["cost"] <= MAX_CHI_SQUARE_RATIO * short.count
-    if is_near and not short.status.converged:
-        last = replace(problem.method, stages=stages[-1:])
-        longer = solve_least_squares(problem.transcription(problem.start_from(short)), last)
-        yield problem, longer.with_effort_of(short), rough.label
-    elif not is_near and (found := _fit_filtered(problem, rough, is_far=short.end is SearchEnd.ABANDONED)):
-        yield found
-    held, fit, label = fit_from_starts(parts)
-    if fit.status.code is Code.INTERRUPTED:
-        yield problem, replace(short, status=fit.status), rough.label
-    if not explains_to_noise(held, fit):
-        return
-    warm = replace(problem, method=replace(problem.method, stages=stages[-1:]))
-    start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters), stages[-1].gap)
-    whole, fit = fit_fixing_unidentifiable(warm, start, HOPELESS_MISFIT)
-    yield replace(whole, method=problem.method), fit, f"{label}, of a part"
+    found = find_fit(Search(parts, gives_up=search.gives_up))
+    if found.fit.status.code is Code.INTERRUPTED:
+        raise KeyboardInterrupt
+    tight = replace(problem, method=replace(problem.method, stages=problem.method.stages[-1:]))
+    rough = replace(problem.candidates[0], parameters=parts.start_from(found.fit).parameters)
+    held, fit = fit_fixing_unidentifiable(
+        tight, filter_states(tight, rough, tight.method.stages[-1].gap), HOPELESS_MISFIT
+    )
+    yield replace(held, method=problem.method), fit, f"{found.label}, of a part"
 
 
-def _fit_filtered(problem: EstimationProblem, rough: Start, *, is_far: bool) -> Candidate | None:
-    """The fit with tight gaps from states filtered by the parameters of wide ones, whose nodes would close slowly.
-
-    Where the rough states are far off, wide gaps begin with filtered ones, too. None where they leave more than noise.
-    """
-    stages = problem.method.stages
-    first_and_third = stages[:GUESS_STAGES:2]
-    wide = replace(problem.method, stages=first_and_third, allows_state_noise=False)
-    begin = filter_states(problem, rough) if is_far else rough
-    settled = solve_least_squares(problem.transcription(begin), wide)
+def _from_filtered(search: Search) -> Iterator[Candidate]:
+    """The fit with tight gaps from states filtered by the parameters of wide ones, whose nodes would close slowly."""
+    problem, rough, stages = search.problem, search.problem.candidates[0], search.problem.method.stages
+    wide = replace(problem.method, stages=stages[:GUESS_STAGES:2], allows_state_noise=False)
+    settled = solve_least_squares(problem.transcription(filter_states(problem, rough)), wide)
     if settled.status.code is Code.INTERRUPTED:
-        return problem, settled, rough.label
+        raise KeyboardInterrupt
     if not 2 * settled.stats["cost"] <= MAX_CHI_SQUARE_RATIO * settled.count:
-        return None
+        return
     tight = replace(problem, method=replace(problem.method, stages=stages[-1:], allows_state_noise=False))
     start = filter_states(tight, replace(rough, parameters=problem.start_from(settled).parameters))
     held, fit = fit_fixing_unidentifiable(tight, start, HOPELESS_MISFIT)
-    return replace(held, method=problem.method), fit.with_effort_of(settled), rough.label
+    yield replace(held, method=problem.method), fit.with_effort_of(settled), f"{rough.label}, filtered"
 
 
 def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
@@ -474,38 +443,44 @@ def liveliest_part(columns: Array, count: int) -> int:
 RATIOS = np.geomspace(1.1, 2.4, 8)
 
 
-def fit_from_predictions(problem: EstimationProblem, max_misfit: float) -> Fit | None:
-    """The fit with tight gaps from where the prediction errors of a filter lead; None where no guess predicts."""
+def _bounded(problem: EstimationProblem) -> dict[str, str]:
+    """The free parameters that another free one bounds from below, as Coulomb friction bounds static friction."""
     free = set(problem.parameters.free_names) - set(problem.fixed)
     order = problem.system.plant.identification_hints.at_least
-    bounded = {n: m for n, m in order.items() if n in free and m in free}
-    guesses = [c for c in problem.candidates if c.trial_parameters]
-    # a filter follows whole logs from segment to segment
+    return {n: m for n, m in order.items() if n in free and m in free}
+
+
+def _can_predict(search: Search) -> bool:
+    """Whether a filter can follow the logs from segment to segment, and there is something for it to decide."""
+    problem = search.problem
     is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
-    is_plain = is_whole and bool(problem.system.states) and not problem.weights
-    if not bounded or len(guesses) < 2 or not is_plain:
-        return None
+    is_plain = is_whole and bool(problem.system.states) and not problem.weights and search.loss is None
+    return is_plain and bool(_bounded(problem)) and len(search.guesses) > 1
+
+
+def _from_predictions(search: Search) -> Iterator[Candidate]:
+    """The fit with tight gaps from where the prediction errors of a filter lead; none where no guess predicts."""
+    problem, guesses = search.problem, search.guesses
     segments = segment(problem.transcription(guesses[0]))
     scaling = ParameterScaling(segments.transcription)
     with check_during_runs(problem.method.budget.check):
         errors = PredictionErrors(segments, start_nodes(segments), scaling, _liveliest(segments, problem))
-        z = _best_sets(errors, list(_hypotheses(guesses, bounded)), problem)
+        z = _best_sets(errors, list(_hypotheses(guesses, _bounded(problem))), problem)
         for gathered, steps, count in LEVELS:
             if problem.method.progress is not None:
                 problem.method.progress(f"prediction errors, states may gather {gathered:g} of their nominal size")
             z, costs = errors.descend(z, gathered, steps)
             if gathered >= DECIDING and not costs.min() < MAX_COST * errors.count:
-                return None
+                return
             z = z[np.argsort(costs)[:count]]
     values = scaling.values(z[0])
     named = dict(zip(segments.transcription.parameters, values.tolist(), strict=True))
     found = {n: named[n] for n in segments.transcription.parameters.free_names}
     last = problem.method.stages[-1:]
     tight = replace(problem, method=replace(problem.method, stages=last, allows_state_noise=False))
-    start = replace(guesses[0], parameters={**guesses[0].parameters, **found})
-    start = filter_states(tight, start, last[-1].gap)
-    method = replace(tight.method, max_misfit=max_misfit)
-    return solve_least_squares(tight.transcription(start), method)
+    start = replace(guesses[0], parameters={**guesses[0].parameters, **found}, label="prediction errors")
+    held, fit = fit_fixing_unidentifiable(tight, filter_states(tight, start, last[-1].gap), HOPELESS_MISFIT)
+    yield replace(held, method=problem.method), fit, "prediction errors"
 
 
 def _hypotheses(guesses: Sequence[Start], bounded: dict[str, str]) -> Iterator[tuple[tuple[int, int], Start]]:
@@ -537,6 +512,28 @@ def _liveliest(segments: Segments, problem: EstimationProblem) -> Indices:
         begin = liveliest_part(segments.measured[own], count)
         parts.append(own[begin : begin + count])
     return np.concatenate(parts)
+
+
+def _is_long(search: Search) -> bool:
+    """Whether a part of the logs may be enough to find where the answer is."""
+    return search.loss is None and not search.estimate_noise and cut_excerpts(search.problem) is not None
+
+
+def _has_filter(search: Search) -> bool:
+    """Whether states can be filtered along whole logs that a model follows with gaps."""
+    problem = search.problem
+    is_whole = problem.has_gaps and math.isinf(problem.window) and not any(e.holes for e in problem.experiments)
+    return is_whole and bool(problem.system.states) and search.loss is None and not problem.weights
+
+
+ATTEMPTS = (
+    Attempt("first start", lambda _: True, _from_first_start, _is_at_noise),
+    Attempt("excerpt", _is_long, _from_excerpt, _is_at_noise),
+    Attempt("prediction errors", _can_predict, _from_predictions, _is_followed),
+    Attempt("filtered states", _has_filter, _from_filtered, _is_at_noise),
+    Attempt("other starts", lambda search: len(search.problem.candidates) > 1, _from_other_starts, _is_confirmed),
+)
+"""In their order: what leads to the answer most often, for the least, comes first."""
 
 
 def tighten_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:

@@ -104,8 +104,8 @@ SHORT_ITERATIONS = 10  # with tight gaps, before a part of long logs is tried
 EXCERPT_SEGMENTS = 1000  # of an excerpt
 MIN_LENGTH_RATIO = 2.5  # [1] length of a log over that of an excerpt, from which on it has one
 MAX_SEGMENTS = 20_000  # of logs whose states are filtered one node after the other
-PART_SEGMENTS = 300  # of all logs, that the filter follows
-BEST = 4  # sets that descend
+PART_SEGMENTS = 150  # of all logs, that the filter follows
+BEST = 2  # sets that descend
 # deviation that the states gather along a segment [nominal sizes], the steps at most, and the sets that go on
 LEVELS = ((1e-3, 4, 2), (3e-4, 6, 1), (1e-4, 6, 1), (3e-5, 6, 1))
 MAX_COST = 1.3  # [1] cost a sample at which no set goes on; of what would lead to the noise .9

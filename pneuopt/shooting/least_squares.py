@@ -593,9 +593,9 @@ def pass_stage(state: SearchState, stage: Stage) -> SearchState:
     state = replace(state, stage_ends=(*state.stage_ends, StageEnd(state.iterate.nodes, state.iterate.z, state.cost)))
     if joins_known_search(state):
         return state.end_with(SearchEnd.DUPLICATE)
-    if stage is not first:
-        return state
-    return state.end_with(SearchEnd.ABANDONED) if state.is_hopeless else shorten(state)
+    if stage is not last and state.is_hopeless:
+        return state.end_with(SearchEnd.ABANDONED)
+    return shorten(state) if stage is first else state
 
 
 def joins_known_search(state: SearchState) -> bool:
