@@ -195,8 +195,9 @@ def _from_first_start(search: Search) -> Iterator[Candidate]:
     """The model's first start, left after its first stage where that is far from the logs and others are to come."""
     problem, start = search.problem, search.problem.candidates[0]
     may_wait = search.loss is None and problem.has_gaps and len(search.guesses) > 1
-    held, fit = fit_fixing_unidentifiable(problem, start, HOPELESS_MISFIT if may_wait else math.inf)
-    yield held, fit, start.label
+    tried = replace(problem, method=replace(problem.method, allows_state_noise=False))
+    held, fit = fit_fixing_unidentifiable(tried, start, HOPELESS_MISFIT if may_wait else math.inf)
+    yield replace(held, method=problem.method), fit, start.label
 
 
 def _from_other_starts(search: Search) -> Iterator[Candidate]:
@@ -206,10 +207,18 @@ def _from_other_starts(search: Search) -> Iterator[Candidate]:
     settled = sorted((_settle_start(problem, c) for c in guessed), key=lambda each: each[0])
     for start in [*(start for _, start in settled), *(c for c in candidates[1:] if c not in guessed)]:
         known = search.best.fit.stage_costs if is_optimum(search.best.fit) else ()
-        held, fit = fit_fixing_unidentifiable(problem, start, math.inf, known)
+        tried = replace(problem, method=replace(problem.method, allows_state_noise=False))
+        held, fit = fit_fixing_unidentifiable(tried, start, math.inf, known)
         if fit.end is SearchEnd.DUPLICATE:
             return
-        yield held, fit, start.label
+        yield replace(held, method=problem.method), fit, start.label
+
+
+def _from_state_noise(search: Search) -> Iterator[Candidate]:
+    """The fit in which gaps stand for noise of the states, from the best one whose gaps absorb what the model misses."""
+    best, problem = search.best, search.problem
+    held, fit = fit_fixing_unidentifiable(problem, problem.start_from(best.fit))
+    yield held, fit, f"{best.label}, noise of the states"
 
 
 def _settle_start(
@@ -526,12 +535,19 @@ def _has_filter(search: Search) -> bool:
     return is_whole and bool(problem.system.states) and search.loss is None and not problem.weights
 
 
+def _gaps_absorb_misfit(search: Search) -> bool:
+    """Whether gaps absorb what the model misses in the best fit, and may stand for noise of its states."""
+    fit, allows = search.best.fit, search.problem.method.allows_state_noise
+    return allows and not fit.status.converged and fit.stats["gap_share"] > MAX_GAP_SHARE
+
+
 ATTEMPTS = (
     Attempt("first start", lambda _: True, _from_first_start, _is_at_noise),
     Attempt("excerpt", _is_long, _from_excerpt, _is_at_noise),
     Attempt("prediction errors", _can_predict, _from_predictions, _is_followed),
     Attempt("filtered states", _has_filter, _from_filtered, _is_at_noise),
     Attempt("other starts", lambda search: len(search.problem.candidates) > 1, _from_other_starts, _is_confirmed),
+    Attempt("noise of the states", _gaps_absorb_misfit, _from_state_noise, lambda _: True),
 )
 """In their order: what leads to the answer most often, for the least, comes first."""
 
