@@ -317,6 +317,9 @@ def identify_command(
     budget: SearchBudget = inf,
     draws: Draws = 0,
     held_out: HeldOut = None,
+    trail: Annotated[
+        bool, typer.Option("--trail", help="Show what the search has tried, for how long, and why.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
@@ -330,7 +333,8 @@ def identify_command(
         require(draws == 0 or draws >= 2, f"--bootstrap {draws}: a spread takes two sets of logs at least")
         require(not (draws and select), "--bootstrap tries one model's fit: leave it out with --select")
         require(not held_out or report is not None, "--held-out predicts a log in the report: name it, --report FILE")
-        raise typer.Exit(run_select(*given) if select else run_identify(*given, budget, draws, held_out or ()))
+        require(not (trail and select), "--trail shows one fit's search: leave it out with --select")
+        raise typer.Exit(run_select(*given) if select else run_identify(*given, budget, draws, held_out or (), trail))
 
 
 @_command("tune")

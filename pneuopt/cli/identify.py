@@ -25,7 +25,7 @@ from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, read_fit, write_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.identify import identify, predict, validate
-from pneuopt.identification.result import IdentificationResult, Mark, report_agreement
+from pneuopt.identification.result import IdentificationResult, Mark, report_agreement, report_trail
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.doctor import CHECKS, LogFinding
 from pneuopt.logs.experiment import Experiment
@@ -69,6 +69,7 @@ def run_identify(
     budget: float = math.inf,
     draws: int = 0,
     held_out: Sequence[Path] = (),
+    trail: bool = False,
 ) -> int:
     """Identify from logs, and from simulated ones if draws are asked for; returns the exit status.
 
@@ -96,6 +97,8 @@ def run_identify(
     tables |= {"estimates": records(result.estimates), "fit": records(result.fit)}
     tables["verdict"] = {**verdict.to_dict(), "table": records(verdict.table)} if verdict is not None else {}
     tables["window"] = asdict(cut) if cut else None
+    tables["trail"] = [] if result.trail is None else records(result.trail)
+    tried = Report() if result.trail is None or not trail else report_trail(result.trail)
     kept = "with -o fit.toml: keeps the fit, for pneuopt tune"
     hints = [kept if outputs.output is None else f"pneuopt tune {outputs.output} tuning.toml -o tuned.toml"]
     hints += ["with --report FILE.html: a page to hand on"] if outputs.report is None else []
@@ -105,7 +108,7 @@ def run_identify(
         tables | stats_and_provenance(result),
         result.status,
         figures=partial(_fit_figures, system, result, experiments, found.findings),
-        report=result.summary() + (trial or Report()),
+        report=result.summary() + tried + (trial or Report()),
         page=lambda: fit_page(head, result, experiments, system, held_out=others, findings=found.findings, trial=trial),
         hints=hints,
     )

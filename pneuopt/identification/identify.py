@@ -44,14 +44,11 @@ from pneuopt.identification.review import FixedValueTest, review_fit
 from pneuopt.identification.search import (
     Search,
     check_window,
-    enforce_ordering,
     find_fit,
     fit_fixing_unidentifiable,
-    fit_from_profiles,
     fit_in_windows,
     mark_order,
     run_freely,
-    tighten_gaps,
 )
 from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
 from pneuopt.identification.widths import estimated_widths, free_widths, sticking_covariance
@@ -206,27 +203,22 @@ def _fit_and_review(
         for sentence in foresee_unidentifiable(problem):
             warnings.warn(sentence, PhysicsWarning, stacklevel=3)
     problem = free_widths(problem)
-    doubts = FixedValueTest()
+    doubts, trail = FixedValueTest(), None
     if start is None:
         search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
         _, held, fit, label, _ = find_fit(search)
+        trail = search.trail
     else:
         began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
     chosen = ChosenWindow(window, window, window, fit.stats["gap_share"]) if math.isfinite(window) else None
     restarts = False
-    if not doubts.found and (closed := tighten_gaps(held, fit)):
-        fit = closed
-    elif not doubts.found and (windowed := fit_in_windows(held, fit)):
+    if not doubts.found and (windowed := fit_in_windows(held, fit)):
         restarts = 2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
-    held, fit = enforce_ordering(held, fit, label)
-    reviewed, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
-    while better := fit_from_profiles(held, fit, profiles):
-        fit = better
-        reviewed, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
-    result = replace(mark_order(held, reviewed), window=chosen)
+    result = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
+    result = replace(mark_order(held, result), window=chosen, trail=trail)
     result = replace(result, status=problem.method.budget.name_end(result.status))
     if doubts.found:
         result = replace(result, status=result.status.with_details(str(doubts.found)))

@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from pneuopt.identification.tolerances import MOVING_SPEED_SHARE
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Line, Report, Table, format_number, number_columns, text_columns
-from pneuopt.quantities.results import Result, Shown
+from pneuopt.quantities.results import NOT_SAVED, Result, Shown
 from pneuopt.quantities.status import Status, report_status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
@@ -120,6 +120,33 @@ class ChosenWindow:
         why = f"over whole logs the gaps between segments carry {self.gap_share:.0%} of the cost"
         tried = f"windows of {self.shortest:.3g} to {self.longest:.3g} s"
         return f"{start}: {why}, and of {tried} these give the narrowest intervals"
+
+
+class TrailRow(NamedTuple):
+    """A row of `IdentificationResult.trail`: one try of the search.
+
+    Attributes
+    ----------
+    attempt : str
+        The way to a fit, a row of the search's table.
+    start : str
+        Where it began.
+    iterations : int
+        Of the least squares.
+    chi_square_ratio : float
+        Squares of residuals and gaps over the number of samples, in noise variances; noise alone has 1.
+    cpu_seconds : float
+        CPU time of it [s].
+    end : str
+        "converged", or why it was left.
+    """
+
+    attempt: str
+    start: str
+    iterations: int
+    chi_square_ratio: float
+    cpu_seconds: float
+    end: str
 
 
 class EstimateRow(TypedDict):
@@ -259,6 +286,8 @@ class IdentificationResult(Result):
         What the logs do not identify, why, and which run would: ``print(result.verdict)``.
     window : ChosenWindow or None
         The windows in which the logs were fitted; None where they were fitted whole.
+    trail : DataFrame or None
+        What the search has tried, in its order, a row a try, a `TrailRow`; None for a fit from a given one.
     """
 
     parameters: ParameterSet
@@ -271,12 +300,23 @@ class IdentificationResult(Result):
     provenance: Mapping[str, str]
     verdict: Verdict | None = None
     window: ChosenWindow | None = None
+    trail: "pd.DataFrame | None" = field(default=None, metadata=NOT_SAVED)
 
     def summary(self) -> Report:
         """The end of the fit, estimates with intervals and marks, what is unidentifiable, agreement with the logs."""
         sentences = tuple(map(Line, self.verdict.sentences if self.verdict else ()))
         estimates = report_estimates(self.estimates)
         return report_status(self.status) + estimates + Report(sentences) + report_agreement(self.fit)
+
+
+def report_trail(trail: "pd.DataFrame") -> Report:
+    """What a search has tried."""
+    rows = list[tuple[str, ...]]()
+    for row in (TrailRow(*each) for each in trail.itertuples(index=False)):
+        figures = f"{row.iterations}", f"{row.chi_square_ratio:.3g}", f"{row.cpu_seconds:.2f}"
+        rows.append((row.attempt, *figures, row.end))
+    columns = *text_columns("tried"), *number_columns("iterations", "squares a sample", "CPU [s]")
+    return Report((Table((*columns, *text_columns("end")), tuple(rows)),))
 
 
 def report_estimates(estimates: "pd.DataFrame") -> Report:

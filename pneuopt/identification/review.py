@@ -58,14 +58,14 @@ if TYPE_CHECKING:
 
 def review_fit(
     problem: EstimationProblem, result: IdentificationResult, unidentifiable: Sequence[str] = ()
-) -> tuple[IdentificationResult, tuple[Profile, ...]]:
-    """Review the intervals of a fit, mark what its logs do not identify, and return the profiles traced on the way.
+) -> IdentificationResult:
+    """Review the intervals of a fit, by profiles where the linear ones are doubtful, and mark what is not identified.
 
     Without convergence no interval stays, and the status names the worst place.
     """
     start = problem.start_from(result)
     if not result.status.converged:
-        return _review_failure(problem, start, result), ()
+        return _review_failure(problem, start, result)
     result = replace(result, estimates=_blank_intervals(result.estimates, unidentifiable))
     profiles, waiting = _profiles(problem, result)
     result = _widen_dragged(result, profiles)
@@ -94,8 +94,7 @@ def review_fit(
         detail = f"the intervals of {join_names(waiting)} are of the linear model, which is doubtful here"
         status = Status(Code.INTERRUPTED, (words, detail, *status.sentences[1:], "run again for the intervals"))
     status = _name_part(problem, status, verdict)
-    result = replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
-    return result, tuple(profiles.values())
+    return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
 
 
 def _widen_covariance(covariance: "pd.DataFrame", stderr: "pd.Series[float]") -> "pd.DataFrame":

@@ -16,36 +16,31 @@ of Probability and its Applications 35(3), 1991; problems/identify/windows.py ho
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.identifiability import prior_dominated, rejects_fixed_values, verdict_from_sensitivities
+from pneuopt.identification.identifiability import rejects_fixed_values
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, t_quantile
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
-from pneuopt.identification.profiles import Profile
-from pneuopt.identification.result import ChosenWindow, IdentificationResult, Mark
+from pneuopt.identification.result import ChosenWindow, IdentificationResult, Mark, TrailRow
 from pneuopt.identification.tolerances import (
     ACCEPTED_CHI_SQUARE_RATIO,
     BEST,
     CLEAR_DEVIATIONS,
     DECIDING,
     EXCERPT_SEGMENTS,
-    GAP_FACTOR,
     GUESS_STAGES,
     HOPELESS_MISFIT,
     LEVELS,
-    MAX_CLOSED_MISFIT,
-    MAX_CLOSED_SHARE,
     MAX_COST,
     MAX_SEGMENTS,
-    MAX_STAGES,
     MIN_DOUBTED,
     MIN_EXCESS,
     MIN_KNOWN_SHARE,
@@ -68,6 +63,9 @@ from pneuopt.shooting.filters import PredictionErrors, filter_nodes
 from pneuopt.shooting.least_squares import BudgetSpentError, Fit, SearchEnd, close_gaps, solve_least_squares
 from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
 from pneuopt.shooting.tolerances import GATHERED_DEVIATION, MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Candidate = tuple[EstimationProblem, Fit, str]
 
@@ -104,6 +102,18 @@ class Search:
     def guesses(self) -> list[Start]:
         """The model's starts that try values of what the logs do not determine."""
         return [c for c in self.problem.candidates if c.trial_parameters]
+
+    @property
+    def trail(self) -> "pd.DataFrame":
+        """A row a try, a `TrailRow`."""
+        from pneuopt.quantities.frames import WideFrame
+
+        rows = list[TrailRow]()
+        for attempt, _, fit, label, seconds in self.tried:
+            ratio = 2 * fit.stats["cost"] / max(1, fit.count)
+            end = str(fit.status.code) if fit.status.converged else fit.status.verdict
+            rows.append(TrailRow(attempt, label, int(fit.stats["iterations"]), ratio, seconds, end))
+        return WideFrame(rows, columns=TrailRow._fields)
 
     def add(self, attempt: str, candidate: Candidate, cpu_seconds: float) -> None:
         """Add a try, with the weights of a robust loss where there is one."""
@@ -167,7 +177,7 @@ def _is_at_noise(search: Search) -> bool:
 
 
 def _is_followed(search: Search) -> bool:
-    """Whether the last try converged with tight gaps: it began at the best of many hypotheses, so no other is better."""
+    """Whether the last try converged with tight gaps: it began at the best of many hypotheses."""
     fit = search.tried[-1].fit
     return fit.status.converged and fit.jumps is None
 
@@ -215,7 +225,7 @@ def _from_other_starts(search: Search) -> Iterator[Candidate]:
 
 
 def _from_state_noise(search: Search) -> Iterator[Candidate]:
-    """The fit in which gaps stand for noise of the states, from the best one whose gaps absorb what the model misses."""
+    """The fit in which gaps stand for noise of the states, from the best one so far."""
     best, problem = search.best, search.problem
     held, fit = fit_fixing_unidentifiable(problem, problem.start_from(best.fit))
     yield held, fit, f"{best.label}, noise of the states"
@@ -279,34 +289,6 @@ def _hold_unidentifiable(
         if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):
             break
     return held, fit
-
-
-def fit_without_unsettled(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
-    """The fit of the other parameters, where a search did not settle in one: that one is held where it came to."""
-    held, part = problem, fit
-    last = problem.method.stages[-REFIT_STAGES:]
-    warm = replace(
-        problem.method, stages=last, allows_state_noise=problem.method.allows_state_noise and fit.jumps is not None
-    )
-    while not part.status.converged:
-        names = part.unidentifiable or part.unsettled
-        if not names or len(held.fixed) + len(names) >= len(part.parameters.free_names):
-            return problem, fit
-        held = replace(held, fixed={**held.fixed, **{n: part.parameters.value(n) for n in names}})
-        before, part = part, solve_least_squares(held.transcription(held.start_from(part, label)), warm)
-        part = part.with_effort_of(before)
-        if part.status.code is Code.INTERRUPTED:
-            return problem, replace(fit, status=part.status)
-        if part.status.code is Code.DIVERGED:
-            return problem, fit
-    if part.covariance is None or part.prior_covariance is None:
-        return held, part
-    # where those held may be ten times as large, the logs may tell nothing of any other
-    values = np.array([part.parameters.value(n) for n in part.parameters.free_names])
-    covariance = part.covariance + part.prior_covariance
-    free = [n not in held.fixed for n in part.parameters.free_names]
-    leans = prior_dominated(covariance, part.prior_covariance, values, held.fixed.values())
-    return (problem, fit) if leans[free].all() else (held, part)
 
 
 def explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
@@ -550,71 +532,6 @@ ATTEMPTS = (
     Attempt("noise of the states", _gaps_absorb_misfit, _from_state_noise, lambda _: True),
 )
 """In their order: what leads to the answer most often, for the least, comes first."""
-
-
-def tighten_gaps(problem: EstimationProblem, fit: Fit) -> Fit | None:
-    """The fit with tighter gaps, where a search has ended at an optimum whose gaps absorb the misfit.
-
-    None where they lead to no optimum, or to residuals so large that the model does not follow the logs.
-    """
-    is_missed = fit.status.code is Code.NOT_CONVERGED and MAX_GAP_SHARE < fit.stats["gap_share"] < MAX_CLOSED_SHARE
-    found, stage = fit, replace(problem.method.stages[-1], refine=1)  # steps are refined where it has converged
-    for _ in range(MAX_STAGES if is_missed else 0):
-        if not (is_optimum(found) and 2 * found.stats["cost"] <= MAX_CLOSED_MISFIT * found.count):
-            break
-        stage = replace(stage, gap=GAP_FACTOR * stage.gap)
-        method = replace(problem.method, stages=(stage,), allows_state_noise=False)
-        before, found = found, solve_least_squares(problem.transcription(problem.start_from(found)), method)
-        found = found.with_effort_of(before)
-        if found.status.converged:
-            return found
-    return None
-
-
-def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[Profile]) -> Fit | None:
-    """The fit that begins with the best values of the first profile whose interval does not hold the estimate.
-
-    None where every estimate lies in its interval; the given fit, not converged, where no better one is found.
-    """
-    found = next((p for p in profiles if not p.low <= p.estimate <= p.high), None)
-    if found is None:
-        return None
-    start, best = problem.start_from(fit), found.curve.sort_values("deviance").iloc[0]
-    value = float(best["value"])
-    values = {n: float(best[n]) for n in start.parameters if n != found.name} | {found.name: value}
-    method = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
-    start = replace(start, parameters={**start.parameters, **values})
-    better = solve_least_squares(problem.transcription(start), method).with_effort_of(fit)
-    is_better = better.stats["cost"] < fit.stats["cost"]
-    if better.status.code is Code.INTERRUPTED:
-        return better if is_better else replace(fit, status=better.status)
-    if is_better and better.status.converged:
-        return better
-    verdict = f"{found.name} fits better at {value:.4g} {found.unit}, from where the search finds no better optimum"
-    return replace(fit, status=Status(Code.NOT_CONVERGED, (verdict, "try other start values, or fix a parameter")))
-
-
-def enforce_ordering(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
-    """Hold parameters that no plant has below another one at that one's value, where the logs do not show them."""
-    found, bound = fit.parameters, dict(zip(fit.parameters.free_names, fit.at_bound, strict=True))
-    order = problem.system.plant.identification_hints.at_least
-    below = {n: m for n, m in order.items() if bound.get(n) or n in problem.fixed}
-    given = problem.unknowns()
-    known = {n: m for n, m in below.items() if m in found and found.value(n) < found.value(m) <= given[n].upper}
-    values = {n: found.value(m) for n, m in known.items()}
-    if not values or not fit.status.converged:
-        return problem, fit
-    start = problem.start_from(fit, label)
-    start = replace(start, parameters={**start.parameters, **values})
-    begun = given.with_values(start.parameters)
-    unseen = {n: begun.value(n) for n in verdict_from_sensitivities(problem, start).unidentifiable}
-    ordered = replace(problem, fixed={**problem.fixed, **unseen, **values})
-    if len(ordered.fixed) >= len(found.free_names):
-        return problem, fit
-    held, other = fit_fixing_unidentifiable(ordered, start)
-    settled = other.status.converged and not other.unidentifiable and (other.jumps is None or fit.jumps is not None)
-    rejected = not settled or rejects_fixed_values(other, fit, len(held.fixed))
-    return (problem, fit) if rejected else (held, other.with_effort_of(fit))
 
 
 def mark_order(problem: EstimationProblem, result: IdentificationResult) -> IdentificationResult:
