@@ -199,15 +199,15 @@ def _name_part(problem: EstimationProblem, status: Status, verdict: Verdict) -> 
     fixed = {n: v for n, v in problem.fixed.items() if n not in estimated_widths(problem)}
     held = [f"{n} at {write_value(fixed[n], p.unit, 3)}" for n, p in unknowns.items() if n in fixed]
     words = f"held: {join_names(held)}; the intervals of the others allow for a factor of ten" if held else ""
-    said = tuple(filter(None, (_name_unidentifiable(verdict), words)))
+    asked = [n for n in verdict.unidentifiable if n not in estimated_widths(problem)]  # nobody asks for a width
+    said = tuple(filter(None, (_name_unidentifiable(asked), words)))
     if not said or status.code is not Code.CONVERGED:
         return status.with_details(*said)
     return Status(Code.PARTIAL, (*said, *status.sentences))
 
 
-def _name_unidentifiable(verdict: Verdict) -> str:
+def _name_unidentifiable(names: Sequence[str]) -> str:
     """A sentence on what the logs do not identify; empty if they identify all."""
-    names = verdict.unidentifiable
     return f"the logs do not identify {join_names(names)}" if names else ""
 
 

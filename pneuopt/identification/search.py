@@ -111,7 +111,7 @@ class Search:
         rows = list[TrailRow]()
         for attempt, _, fit, label, seconds in self.tried:
             ratio = 2 * fit.stats["cost"] / max(1, fit.count)
-            end = str(fit.status.code) if fit.status.converged else fit.status.verdict
+            end = fit.status.code.value if fit.status.converged else fit.status.verdict
             rows.append(TrailRow(attempt, label, int(fit.stats["iterations"]), ratio, seconds, end))
         return WideFrame(rows, columns=TrailRow._fields)
 
