@@ -523,7 +523,7 @@ def _gaps_absorb_misfit(search: Search) -> bool:
     return allows and not fit.status.converged and fit.stats["gap_share"] > MAX_GAP_SHARE
 
 
-ATTEMPTS = (
+ATTEMPTS: tuple[Attempt, ...] = (
     Attempt("first start", lambda _: True, _from_first_start, _is_at_noise),
     Attempt("excerpt", _is_long, _from_excerpt, _is_at_noise),
     Attempt("prediction errors", _can_predict, _from_predictions, _is_followed),
