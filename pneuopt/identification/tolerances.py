@@ -7,7 +7,6 @@ CLEAR_DEVIATIONS = 4.0  # [1] standard deviations beyond which a difference or a
 MODEL_ERROR_LEVEL = 2.0  # [1] residuals over the noise from which most of their power is an error of the model
 MOVING_SPEED_SHARE = 0.05  # [1] of the largest speed, below which a sample counts as standing still
 REFIT_STAGES = 3  # last stages of a method that a refit runs, near its answer
-SIGNIFICANT_FALL = 10.8  # [variances] fall of squared residuals that counts: chance exceeds it once in a thousand
 MIN_WINDOW_SAMPLES = 20  # measured samples of the shortest window: of fewer its start state takes most
 
 # Compare logs
@@ -60,7 +59,6 @@ MOTION_LEVEL = 0.001  # [1] probability, over all signals and outputs, below whi
 MAX_MISFIT = 20.0
 MAX_NRMSE = 0.2  # [1] the same over the channel's own variation, where the noise is estimated
 MIN_SIGNAL_SPREAD = 1e-6  # [1] of a signal over its size: a smaller one is rounding, and has no classes
-HARMLESS_SHIFT = 0.5  # [deviations] by a rejected width: a 95 % interval so far off holds the truth 92 times in 100
 
 # Problem
 
@@ -96,11 +94,9 @@ ALIKE_SQUARES = 20.0  # [variances of the residuals] above the best, up to which
 GUESS_STAGES = 3  # of a search with guesses held
 HOPELESS_MISFIT = 3.0  # [noise variances a sample] beyond which the first start waits for the others
 ACCEPTED_CHI_SQUARE_RATIO = 1.05  # [1] up to which no other start is tried: a wrong basin of bristles has left 1.1
-SAME_MISFIT_RATIO = 1.02  # [1] cost of a settled start over the first one's, up to which the guess is not wrong
 MIN_DOUBTED = 2  # fits after which the problem is doubted
 MIN_EXCESS = 0.03  # [1] of a parameter over one that bounds it, below which another start is tried
 SAME_COST_RATIO = 1.001  # [1] costs of two fits up to which both are one optimum
-SHORT_ITERATIONS = 10  # with tight gaps, before a part of long logs is tried
 EXCERPT_SEGMENTS = 1000  # of an excerpt
 MIN_LENGTH_RATIO = 2.5  # [1] length of a log over that of an excerpt, from which on it has one
 MAX_SEGMENTS = 20_000  # of logs whose states are filtered one node after the other
@@ -110,11 +106,6 @@ BEST = 2  # sets that descend
 LEVELS = ((1e-3, 4, 2), (3e-4, 6, 1), (1e-4, 6, 1), (3e-5, 6, 1))
 MAX_COST = 1.3  # [1] cost a sample at which no set goes on; of what would lead to the noise .9
 DECIDING = LEVELS[1][0]  # [nominal sizes] deviation from which on that cost counts
-# [1] squared residuals over the noise's and the gaps' share of them, above which windows are tried: a sensor's lag has
-# 60 and .17, a plant that runs away from its log .9
-MAX_CLOSED_MISFIT, MAX_CLOSED_SHARE = 100.0, 0.3
-GAP_FACTOR = 0.3  # [1] gap of each tightening stage over that of the one before
-MAX_STAGES = 3  # that tighten gaps
 
 # Select model
 
