@@ -212,6 +212,8 @@ def _fit_and_review(
         search = partial(fit_from_starts, loss=loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
         is_plain = loss is None and not estimate_noise
         held, fit, label = fit_logs(problem, search) if is_plain else search(problem)
+        if not (fit.status.converged or doubts.tests):  # a wrong value drives widths to where a search does not settle
+            doubts.explains(held, fit)
     else:
         began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"

@@ -305,6 +305,9 @@ class FixedValueTest:
 
 def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     """The fixed value whose freeing explains most of the misfit of a fit; None where none explains enough."""
+    # a wrong value drives widths to their bounds, where short fits do not follow: they stay at their starts
+    given = problem.parameters
+    problem = replace(problem, fixed={**problem.fixed, **{n: given.value(n) for n in estimated_widths(given)}})
     without, freed = _promised_squares(problem, fit)
     excess = (without if fit.jumps is not None else 2 * fit.stats["cost"]) - fit.count
     promised = [((without - squares) / max(excess, without - fit.count), name) for name, squares in freed.items()]
