@@ -65,7 +65,7 @@ def test_a_plant_is_identified_in_its_saturated_loop(h: float, channels: tuple[s
     assert np.mean(np.abs(run["control"]) >= GAINS["pid.upper"]) > 0.03
     start = given(loop).with_values({n: loop.parameters.value(n) for n in TRUTH}).freed(*TRUTH)
     fit = identify(loop, [log], start)
-    for name, row in fit.estimates.iterrows():
+    for name, row in fit.estimates.loc[[*TRUTH]].iterrows():
         assert abs(row["value"] - TRUTH[str(name)]) < 4 * row["stderr"], name
         assert row["value"] == pytest.approx(TRUTH[str(name)], rel=0.02)
     assert fit.stats["chi_square_ratio"] == pytest.approx(1, abs=0.15)
@@ -199,7 +199,7 @@ def test_a_plant_is_identified_under_a_composed_controller(name: str, log_rates:
     log = logged_moves(loop, given, log_rates=log_rates)
     start = given.with_values({n: loop.parameters.value(n) for n in AXIS_TRUTH}).freed(*AXIS_TRUTH)
     fit = identify(loop, [log], start)
-    for parameter, row in fit.estimates.iterrows():
+    for parameter, row in fit.estimates.loc[[*AXIS_TRUTH]].iterrows():
         assert row["value"] == pytest.approx(AXIS_TRUTH[str(parameter)], rel=0.02), parameter
         assert abs(row["value"] - AXIS_TRUTH[str(parameter)]) < 4 * row["stderr"], parameter
     assert fit.stats["chi_square_ratio"] == pytest.approx(1, abs=0.15)

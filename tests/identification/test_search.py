@@ -1080,7 +1080,8 @@ def test_identify_reviews_the_better_fit(monkeypatch: pytest.MonkeyPatch) -> Non
     ) -> tuple[IdentificationResult, tuple[Profile, ...]]:
         result, profiles = review_fit(problem, result, unidentifiable)
         reviewed.append(result.status.code)
-        return result, profiles if len(reviewed) > 1 else (profile(0.05, TRUTH),)
+        width = result.parameters.value("friction.smoothing")
+        return result, profiles if len(reviewed) > 1 else (profile(0.05, TRUTH | {"friction.smoothing": width}),)
 
     def dearer(problem: EstimationProblem, fit: Fit, profiles: tuple[Profile, ...]) -> Fit | None:
         beside = replace(fit, stats={**fit.stats, "cost": fit.stats["cost"] + 10.0})

@@ -135,15 +135,6 @@ def test_a_candidate_at_its_bound_is_not_recommended() -> None:
     assert "no candidate is without a defect, nor is this one: friction.coulomb at a bound" in only.reason
 
 
-def test_all_candidates_have_the_same_widths() -> None:
-    """Coulomb friction alone would take a wide one, and so imitate what the Stribeck curve is for."""
-    found = chosen(STATIC["stribeck"])
-    fits = [fit.parameters for fit in found.fits.values() if "friction.smoothing" in fit.parameters]
-    widths = {parameters.value("friction.smoothing") for parameters in fits}
-    assert len(fits) == 4
-    assert len(widths) == 1
-
-
 def test_a_tie_is_decided_by_held_out_runs_and_the_reason_says_what_would_separate_the_two() -> None:
     rows = {
         "rich": row(free=4, deviance=1000.0, bic=1030.0, held_out=0.20),
