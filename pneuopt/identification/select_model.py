@@ -1,8 +1,7 @@
 """`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs.
 
-`fit_candidates` fits all alike, for residuals compare only so: over whole logs or windows of one length, and at common
-widths; one that each candidate has chosen for itself would be a hidden parameter, by which Coulomb friction can imitate
-presliding or the Stribeck curve. Both are the leader's, the simplest of those that short searches find best.
+`fit_candidates` fits all alike, for residuals compare only so: over whole logs or windows of one length, that of the
+leader, the simplest of those that short searches find best. The widths of its kinks each estimates, and they count.
 
 `try_candidate`, such a search, has loose gaps, which only relax a fit: a model that leaves many times the squares of
 another one's whole fit cannot explain the logs.

@@ -1,6 +1,7 @@
 """The rigs in plain C move as SciPy's integrator with events moves them, and a seed is a rig."""
 
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from problems.shared import foreign_rigs
+from problems.shared.arrays import Array
 from problems.shared.foreign_rigs import SMOOTH, STICKING, draw_servo, record, simulate, wanted
 
 pytestmark = pytest.mark.skipif(not (shutil.which("cc") or shutil.which("gcc")), reason="a C compiler moves the rigs")
@@ -33,7 +35,7 @@ def servo(friction: int) -> foreign_rigs.Rig:
     return replace(draw_servo(0), numbers=numbers, samples=300)
 
 
-def by_events(rig: foreign_rigs.Rig, forces: "foreign_rigs.Array") -> "foreign_rigs.Array":
+def by_events(rig: foreign_rigs.Rig, forces: Array) -> Array:
     """Position and speed at each sample: the mode changes where the speed or the force's margin crosses zero."""
     q, x, mode, rows = rig.numbers, np.zeros(2), 0, []
     for force in forces:
@@ -45,13 +47,13 @@ def by_events(rig: foreign_rigs.Rig, forces: "foreign_rigs.Array") -> "foreign_r
                     break
                 mode = 1 if push > 0 else -1
 
-            def rates(_: float, y: "foreign_rigs.Array", push: float = push, way: int = mode) -> list[float]:
+            def rates(_: float, y: Array, push: float = push, way: int = mode) -> list[float]:
                 v = y[1]
                 level = q["coulomb"] + (q["static"] - q["coulomb"]) * np.exp(-((v / q["stribeck"]) ** 2))
                 sign = way if q["friction"] == STICKING else np.tanh(v / q["smoothing"])
                 return [v, (push - level * sign - q["viscous"] * v) / q["mass"]]
 
-            def stops(_: float, y: "foreign_rigs.Array", way: int = mode) -> float:
+            def stops(_: float, y: Array, way: int = mode) -> float:
                 return float(y[1]) * way + (1e-15 if way else 1.0)
 
             stops.terminal, stops.direction = True, -1  # type: ignore[attr-defined]
@@ -78,7 +80,7 @@ def test_the_rigs_in_c_agree_with_a_simulation_by_events(friction: int) -> None:
 
 
 @pytest.mark.parametrize("kind", [foreign_rigs.draw_servo, foreign_rigs.draw_cylinder])
-def test_a_seed_is_a_rig_and_a_log(kind: "type[foreign_rigs.Rig]") -> None:
+def test_a_seed_is_a_rig_and_a_log(kind: Callable[[int], foreign_rigs.Rig]) -> None:
     rig = replace(kind(2), samples=200)
     assert rig == replace(kind(2), samples=200)
     assert record(rig) == record(rig)
@@ -86,7 +88,7 @@ def test_a_seed_is_a_rig_and_a_log(kind: "type[foreign_rigs.Rig]") -> None:
 
 
 def test_without_a_compiler_the_script_says_so_in_a_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(foreign_rigs.shutil, "which", lambda _: None)
+    monkeypatch.setattr(shutil, "which", lambda _: None)
     foreign_rigs._library.cache_clear()
     with pytest.raises(RuntimeError, match=r"^foreign rigs are moved by a C program: install a C compiler, cc or gcc$"):
         foreign_rigs.write_rig(replace(draw_servo(2), samples=50), tmp_path)
