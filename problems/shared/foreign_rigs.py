@@ -218,7 +218,7 @@ def record(rig: Rig) -> dict[str, list[str]]:
     else:
         columns = {"valve_voltage [V]": [f"{v:.5f}" for v in run[:, 4] + rig.centre]}
         columns["position [mm]"] = [f"{1e3 * v:.{decimals}g}" for v in counted]
-        for side, k in ((), ()) if rig.position_only else (("a", 2), ("b", 3)):
+        for side, k in () if rig.position_only else (("a", 2), ("b", 3)):
             noisy = run[:, k] + rig.pressure_noise * rng.standard_normal(len(run))
             columns[f"pressure_{side} [bar(a)]"] = [f"{v:.5f}" for v in noisy * 1e-5]
     return {"time [s]": [f"{v:.6f}" for v in t]} | columns

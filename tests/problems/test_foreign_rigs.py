@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from problems.shared import foreign_rigs
 from problems.shared.arrays import Array
-from problems.shared.foreign_rigs import SMOOTH, STICKING, draw_servo, record, simulate, wanted
+from problems.shared.foreign_rigs import SMOOTH, STICKING, draw_cylinder, draw_servo, record, simulate
 
 pytestmark = pytest.mark.skipif(not (shutil.which("cc") or shutil.which("gcc")), reason="a C compiler moves the rigs")
 
@@ -95,6 +95,7 @@ def test_without_a_compiler_the_script_says_so_in_a_sentence(monkeypatch: pytest
     foreign_rigs._library.cache_clear()
 
 
-def test_wanted_references_begin_where_the_rig_rests() -> None:
-    rig = draw_servo(2)
-    assert np.isfinite(wanted(rig, np.random.default_rng(0))).all()
+def test_a_log_of_the_position_alone_is_recorded() -> None:
+    """Its rigs used to end in an error of the script."""
+    rig = replace(draw_cylinder(2), samples=50, position_only=True)
+    assert list(record(rig)) == ["time [s]", "valve_voltage [V]", "position [mm]"]
