@@ -54,6 +54,7 @@ from pneuopt.identification.tolerances import (
     MIN_STOP_FORCE,
     UNIDENTIFIABLE_DEVIATION,
 )
+from pneuopt.identification.widths import estimated_widths, free_widths
 from pneuopt.logs.doctor import PISTON, LogFinding, StatedAxis, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.mending import MendedLog, convert, empty_cells, leave_out
@@ -239,22 +240,24 @@ def _make_verdict(
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
     rows, reasons, hints = {}, {}, with_values_in_words(problem.system.plant.identification_hints, values)
+    widths = estimated_widths(problem.parameters)
     for i, (name, p) in enumerate(free.items()):
         if inside_bounds is not None and not inside_bounds[i]:
             rows[name] = [p.value, *[math.nan] * 4, True]
-            reasons[name] = "the best fit is at its bound, and the other intervals hold for that value only"
+            if name not in widths:
+                reasons[name] = "the best fit is at its bound, and the other intervals hold for that value only"
             continue
         unit, given, least = p.value if p.log else 1.0, problem.parameters[name.partition("[")[0]], float(p.unit == "1")
         is_offset = p.lower < 0 and not least  # whose usual size is unknown
         size = 1.0 if p.log else 0.0 if is_offset else max(abs(p.value), abs(given.value), least)
         relative = spread[i] / size if size > 0 else math.nan
         lack = None if trusted else missing_excitation(hints, name, names, seen)
-        is_unidentifiable = (
+        is_unidentifiable = name not in widths and (
             lack is not None
             or math.isinf(spread[i])
             or relative > (MAX_EXPECTED_DEVIATION if inside_bounds is None else UNIDENTIFIABLE_DEVIATION)
         )
-        if is_unidentifiable or relative > MAX_RELATIVE_DEVIATION:
+        if is_unidentifiable or (name not in widths and relative > MAX_RELATIVE_DEVIATION):
             reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(hints, [name]))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
@@ -367,13 +370,13 @@ def pose_problem(
     parameters: ParameterSet,
     method: LeastSquares,
 ) -> EstimationProblem:
-    """The estimation problem of logs that `identify` accepts, before any width is chosen."""
+    """The estimation problem of logs that `identify` accepts."""
     model = as_estimation_model(system)
     logs = check_logs(model, experiments, parameters)
     parameters = find_centre(model, logs, parameters)
     check_free(logs, parameters)
     check_content(model, logs, parameters)
-    return EstimationProblem(model, tuple(logs), model.parameters | parameters, method)
+    return free_widths(EstimationProblem(model, tuple(logs), model.parameters | parameters, method))
 
 
 def excerpts(experiments: Sequence[Experiment], stretches: int = 4) -> tuple[Experiment, ...]:

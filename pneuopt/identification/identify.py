@@ -51,7 +51,7 @@ from pneuopt.identification.search import (
     run_freely,
 )
 from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
-from pneuopt.identification.widths import estimated_widths, free_widths, sticking_covariance
+from pneuopt.identification.widths import ESTIMATED_WIDTH, estimated_widths, free_widths, sticking_covariance
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
@@ -197,7 +197,7 @@ def _check_window_time(window: float | None) -> None:
 def _fit_and_review(
     problem: EstimationProblem, loss: Loss | None, start: IdentificationResult | None, *, estimate_noise: bool
 ) -> IdentificationResult:
-    """Choose widths, fit from the model's starts or a given one, in windows if need be, and review the intervals."""
+    """Fit from the model's starts or a given one, in windows if need be, and review the intervals."""
     window = problem.window
     if start is None:
         for sentence in foresee_unidentifiable(problem):
@@ -208,6 +208,8 @@ def _fit_and_review(
         search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
         _, held, fit, label, _ = find_fit(search)
         trail = search.trail
+        if not (fit.status.converged or doubts.tests):  # a wrong value drives widths to where a search does not settle
+            doubts.explains(held, fit)
     else:
         began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
@@ -363,11 +365,13 @@ def _result(
         found = np.array([p.value for p in estimates.values()])
         resting = prior_dominated(covariance, fit.prior_covariance, found, problem.fixed.values())
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
-    asked = set(free) - set(estimated_widths(problem))
+    widths = estimated_widths(problem.parameters)
+    asked = set(free) - set(widths)
     status = NOTHING_IDENTIFIABLE if asked and asked <= set(unidentifiable) else misfit.assess(fit.status)
     matrix = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
+    parameters = problem.parameters.with_values(values)
     result = IdentificationResult(
-        problem.parameters.with_values(values),
+        parameters | ParameterSet({n: replace(parameters[n], source=ESTIMATED_WIDTH) for n in widths}),
         _estimates(estimates, covariance, fit.at_bound, influenced, status, misfit),
         pd.DataFrame(matrix, index=list(free), columns=list(free)),
         fit_table(problem, fit),

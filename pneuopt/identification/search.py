@@ -171,7 +171,7 @@ def _is_beyond_help(search: Search) -> bool:
 def _is_at_noise(search: Search) -> bool:
     """Whether the last try explains the logs to their noise; the first of all holds nothing but widths."""
     last = search.tried[-1]
-    lost = set(last.problem.fixed) - set(estimated_widths(search.problem))
+    lost = set(last.problem.fixed) - set(estimated_widths(search.problem.parameters))
     is_sure = len(search.tried) > 1 or (not lost and is_in_order(last.problem, last.fit))
     return is_sure and explains_to_noise(last.problem, last.fit)
 

@@ -1,8 +1,7 @@
 """`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs.
 
-`fit_candidates` fits all alike, for residuals compare only so: over whole logs or windows of one length, and at common
-widths; one that each candidate has chosen for itself would be a hidden parameter, by which Coulomb friction can imitate
-presliding or the Stribeck curve. Both are the leader's, the simplest of those that short searches find best.
+`fit_candidates` fits all alike, for residuals compare only so: over whole logs or windows of one length, that of the
+leader, the simplest of those that short searches find best. The widths of its kinks each estimates, and they count.
 
 `try_candidate`, such a search, has loose gaps, which only relax a fit: a model that leaves many times the squares of
 another one's whole fit cannot explain the logs.
@@ -36,6 +35,7 @@ from pneuopt.identification.tolerances import (
     NESTED_TEST_LEVEL,
     TIE,
 )
+from pneuopt.identification.widths import estimated_widths
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_argument, check_parameters
@@ -140,7 +140,7 @@ def select_model(
 
     Notes
     -----
-    All are fitted in the same windows and at the same widths (`fit_candidates` says why). The deviance is the squared
+    All are fitted in the same windows, and each estimates the widths of its kinks. The deviance is the squared
     residuals over their variance in the best candidate, and over the factor by which that candidate's variances exceed
     those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
     with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
@@ -522,8 +522,9 @@ def _notes(system: System, fit: IdentificationResult | Refutation) -> tuple[str,
     """Notes on what is unidentifiable, at a bound or unphysical, and the message."""
     if isinstance(fit, Refutation):
         return "", "", "", fit.reason
+    widths = estimated_widths(fit.parameters)
     unknown, bound = (
-        [str(n) for n, own in fit.estimates["note"].items() if own == note]
+        [str(n) for n, own in fit.estimates["note"].drop(widths).items() if own == note]
         for note in (UNIDENTIFIABLE_NOTE, AT_BOUND_NOTE)
     )
     order = system.identification_hints.at_least

@@ -323,7 +323,7 @@ class FitScores:
 
 
 def fit_scores(optimum: Optimum) -> FitScores | None:
-    """The scores of a fit's segments; None where the nodes' equations cannot be eliminated."""
+    """The scores of a fit's segments; None where the nodes' equations cannot be eliminated, or leave something open."""
     equations, keep = optimum.equations, np.flatnonzero(optimum.keep)
     reduced, linear = equations.arrow.eliminate(0.0), equations.linearisation
     if reduced is None or not len(keep):
@@ -333,4 +333,7 @@ def fit_scores(optimum: Optimum) -> FitScores | None:
     directions[:, :n] = -reduced.node_sensitivity
     for rows, own, unknowns in equations.segments.blocks:
         directions[rows, n + own, unknowns] = linear.chain[unknowns]
-    return FitScores(optimum, directions[:, :, keep] / linear.chain[keep])
+    scores = FitScores(optimum, directions[:, :, keep] / linear.chain[keep])
+    size = np.sqrt(np.diag(scores.whole_information))
+    rank = np.linalg.matrix_rank(scores.whole_information / np.outer(size, size)) if size.all() else 0
+    return scores if rank == len(keep) else None

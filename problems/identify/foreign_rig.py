@@ -92,7 +92,7 @@ def one_rig(seed: int) -> list[Claim]:
         warnings.simplefilter("always")
         fit = po.identify(drive.system(), [log], given, throw=False)
     seconds = time.process_time() - began
-    print(f"seed {seed}: {fit.status}", *fit.widths, *(str(w.message) for w in said), sep="\n  ")
+    print(f"seed {seed}: {fit.status}", *(str(w.message) for w in said), sep="\n  ")
     told = any("closed near 5 V" in str(w.message) for w in said)
     claims = [Claim(f"{seed}.converged", float(fit.status.converged), "1", None, ">= 1")]
     claims.append(Claim(f"{seed}.centre_told", float(told), "1", None, ">= 1"))

@@ -17,6 +17,7 @@ Even seeds are for development, odd ones for the judgement (`--first 1 --step 2`
 """
 
 import math
+import shutil
 import sys
 import tempfile
 import time
@@ -90,8 +91,8 @@ def identify_rig(kind: str, given: po.ParameterSet) -> dict[str, Any]:
     seconds = time.process_time() - began
     row = judge(rig, fit) | {"cpu": seconds, "status": str(fit.status), "free_run": free_run_error(fit)}
     worst = f"worst {row['worst']} {row['percent']:.3g} %, {row['sigmas']:.3g} sd, {row['marked']:.0%} marked"
-    line = f"{rig.name}, {rig.samples}: {row['outcome']}, {worst}, {seconds:.1f} s, {'; '.join(fit.status.sentences)[:160]}"
-    print(line, file=sys.stderr)
+    said = "; ".join(fit.status.sentences)[:160]
+    print(f"{rig.name}, {rig.samples}: {row['outcome']}, {worst}, {seconds:.1f} s, {said}", file=sys.stderr)
     return {"rig": rig.name} | row
 
 
@@ -157,4 +158,6 @@ if __name__ == "__main__":
     parser.add_argument("--first", type=int, default=1, metavar="SEED")
     parser.add_argument("--step", type=int, default=2)
     options = parser.parse_args()
+    if not (shutil.which("cc") or shutil.which("gcc")):
+        sys.exit("foreign rigs are moved by a C program: install a C compiler, cc or gcc")
     sys.exit(finish(main(options.drives, options.servos, options.first, options.step, options.out), options))

@@ -277,7 +277,7 @@ def _library() -> ctypes.CDLL:
     """The compiled simulation."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
-        raise RuntimeError("the plain simulation needs a C compiler, cc")
+        raise RuntimeError("foreign rigs are moved by a C program: install a C compiler, cc or gcc")
     target = Path(tempfile.mkdtemp()) / "plain_rigs.so"
     subprocess.run([compiler, "-O2", "-shared", "-fPIC", str(SOURCE), "-o", str(target), "-lm"], check=True)
     return ctypes.CDLL(str(target))

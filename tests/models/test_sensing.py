@@ -70,7 +70,7 @@ def test_skew_and_zero_points_are_recovered_with_their_intervals() -> None:
     free = free.with_bounds({"sensor.speed.offset": (-0.1, 0.1)})
     fit = identify(system, [logs[0], logs[1]], free)
     truth = {**TRUTH, "sensor.position.delay": 5e-3, **{f"sensor.speed.offset[{n}]": z for n, z in zeros.items()}}
-    for name, row in fit.estimates.iterrows():
+    for name, row in fit.estimates.loc[[*truth]].iterrows():
         assert abs(row["value"] - truth[str(name)]) < 4 * row["stderr"], name
     assert fit.estimates["value"]["sensor.position.delay"] == pytest.approx(5e-3, abs=5e-4)
     alone = identify(system, [logs[2]], system.parameters.freed(*TRUTH, "sensor.position.delay"))
