@@ -264,15 +264,23 @@ def fit_fixing_unidentifiable(
     """
     method = replace(problem.method, max_misfit=max_misfit, known_costs=known_costs)
     first = solve_least_squares(problem.transcription(start), method)
-    if not first.unidentifiable or first.status.code is Code.INTERRUPTED:
+    if not _open_names(problem, first) or first.status.code is Code.INTERRUPTED:
         return problem, first
-    for is_given in (True, False) if not first.status.converged else (True,):
+    for is_given in (True, False) if first.unidentifiable and not first.status.converged else (not first.unsettled,):
         held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
         is_settled = fit.status.converged and not fit.unidentifiable
         is_taken = is_settled and not rejects_fixed_values(fit, first, len(held.fixed))
         if fit.status.code is Code.INTERRUPTED or is_taken:
             return held, fit
     return problem, first
+
+
+def _open_names(problem: EstimationProblem, fit: Fit) -> tuple[str, ...]:
+    """The parameters to hold: those that the data do not determine, or a width in which alone a search did not settle.
+
+    Nobody asks for a width: where it still moves, the others have their answer.
+    """
+    return fit.unidentifiable or tuple(n for n in fit.unsettled if n in estimated_widths(problem.parameters))
 
 
 def _hold_unidentifiable(
@@ -282,8 +290,8 @@ def _hold_unidentifiable(
     held, fit, given = problem, first, problem.unknowns()
     warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
     source = given if is_given else first.parameters
-    while fit.unidentifiable and len(held.fixed) + len(fit.unidentifiable) < len(given.free_names):
-        held = replace(held, fixed={**held.fixed, **{n: source.value(n) for n in fit.unidentifiable}})
+    while (names := _open_names(held, fit)) and len(held.fixed) + len(names) < len(given.free_names):
+        held = replace(held, fixed={**held.fixed, **{n: source.value(n) for n in names}})
         before, fit = fit, solve_least_squares(held.transcription(held.start_from(fit, label)), warm)
         fit = fit.with_effort_of(before)
         if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):

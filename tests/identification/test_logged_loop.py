@@ -110,7 +110,6 @@ def test_a_delay_and_a_feedforward_are_part_of_the_loop() -> None:
     assert fit.estimates["value"]["load.mass"] == pytest.approx(3.0, rel=0.01)
 
 
-@pytest.mark.xfail(reason="with a free width no start converges: the data do not determine the states")
 def test_what_compensators_add_is_part_of_the_loop() -> None:
     """Their pulses and their inverse are replayed from the log's first sample on."""
     drive = ForceDrive(Coulomb()).system()
