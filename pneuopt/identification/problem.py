@@ -32,7 +32,7 @@ from pneuopt.identification.tolerances import (
 )
 from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiment import Experiment
-from pneuopt.logs.noise import estimate_noise, noise_level
+from pneuopt.logs.noise import estimate_noise, find_refresh, noise_level
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import (
@@ -337,9 +337,10 @@ def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Inter
 def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tuple[str, ...]]:
     """Bridge the short holes of a log's inputs and cut it at the long ones (`holes`); the log and sentences on that.
 
-    A sampled loop is refused at a long one, for its controller goes on.
+    A sampled loop is refused at a long one, for its controller goes on. What a sensor repeats is no sample.
     """
-    log, inputs = experiment.trajectory, names(system.inputs)
+    fresh, sentences = _without_repeats(system, experiment)
+    log, inputs = fresh.trajectory, names(system.inputs)
     known: Mask = np.asarray(np.isfinite(log.matrix(inputs)).all(axis=1))
     holes = _find_holes(log, known, system) if system.states else []
     lost = np.zeros(len(log), dtype=bool) if system.states else ~known
@@ -355,16 +356,30 @@ def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tu
         message = f"{experiment.name}: inputs are unknown {where}, and a sampled controller goes on meanwhile"
         raise LogError(f"{message}; cut the log in two there")
     short = ~known & ~lost
-    sentences = [f"{experiment.name}: inputs are unknown {where}; the log is cut there"] if holes else []
+    sentences += [f"{experiment.name}: inputs are unknown {where}; the log is cut there"] if holes else []
     if short.any():
         edges = np.flatnonzero(np.diff(np.concatenate([[False], short, [False]]).astype(int)))
         longest = int(np.max(edges[1::2] - edges[::2]))
         gaps = f"{experiment.name}: {int(short.sum())} samples lack an input, {longest} in a row at most"
         sentences.append(f"{gaps}; they are bridged")
-    if not (sentences or lost.any()):
-        return experiment, ()
+    if not (holes or short.any() or lost.any()):
+        return fresh, tuple(sentences)
     values = _bridge(log, input_behaviour(system, experiment), lost)
     return replace(experiment, trajectory=log.with_columns(values), holes=tuple(holes)), tuple(sentences)
+
+
+def _without_repeats(system: Fittable, experiment: Experiment) -> tuple[Experiment, list[str]]:
+    """The log without the values that sensors slower than it repeat from row to row, and a sentence on each sensor."""
+    log, columns, sentences = experiment.trajectory, dict[str, Array](), list[str]()
+    for channel in outputs_in_log(system, experiment):
+        found = find_refresh(log[channel], log.t)
+        if found is not None and np.isfinite(log[channel][~found.fresh]).any():
+            columns[channel] = np.where(found.fresh, log[channel], np.nan)
+            period = f"{found.period:.3g}"
+            every = f"{period}{dict(zip('23', ('nd', 'rd'), strict=True)).get(period, 'th')} row"
+            every = every if period.isdecimal() else f"{period} rows"
+            sentences.append(f"{experiment.name}: {channel} is new every {every}; what the log repeats does not count")
+    return replace(experiment, trajectory=log.with_columns(columns)) if columns else experiment, sentences
 
 
 def known_runs(experiment: Experiment) -> list[tuple[int, int]]:

@@ -499,3 +499,28 @@ def test_a_search_starts_at_the_centre_that_the_pressures_show() -> None:
     assert start[CENTRE] == pytest.approx(5.06, abs=0.02)
     assert start["valve.conductance"] == pytest.approx(truth.value("valve.conductance"), rel=0.2)
     assert list(system.log_warnings(logs)) == []
+
+
+def test_a_sensor_slower_than_its_log_counts_where_it_is_new() -> None:
+    """Repeated values once made the noise 3.3e-7 for .05, and a stated noise a doubt; inputs keep all their rows."""
+    t = np.arange(0, 4, 1e-3)
+    force, rng = 40 * np.sin(6 * t) + 25 * np.sin(17 * t), np.random.default_rng(2)
+    truth = DRIVE.parameters.with_values({"load.mass": 4.0, "friction.viscous": 30.0})
+    run = simulate(DRIVE.system(), Trajectory(t, {"force": force}), truth, intersample={"force": Intersample.LINEAR})
+    sampled = run["position"] + 1e-4 * rng.standard_normal(t.size)
+    held = sampled[np.maximum(5 * ((np.arange(t.size) - 3) // 5) + 3, 0)]
+    log = Experiment(Trajectory(t, {"force": force, "position": held}), name="slow")
+    (checked,) = check_logs(DRIVE.system(), log, truth)
+    known = np.flatnonzero(np.isfinite(checked.trajectory["position"]))
+    assert set(known % 5) == {3}
+    assert np.isfinite(checked.trajectory["force"]).all()
+    assert checked.noise["position"] == pytest.approx(1e-4, rel=0.1)
+    sentence = "slow: position is new every 5th row; what the log repeats does not count"
+    assert log_remarks(DRIVE.system(), [log], [checked]) == (sentence,)
+    stated = log.with_noise({"position": 1e-4})
+    assert log_remarks(DRIVE.system(), [stated], check_logs(DRIVE.system(), stated, truth)) == (sentence,)
+    assert log_remarks(DRIVE.system(), [checked], [checked]) == ()  # nothing is left that repeats
+    fit = identify(DRIVE, log, DRIVE.parameters.freed("load.mass", "friction.viscous"))
+    for name in ("load.mass", "friction.viscous"):
+        assert abs(fit.parameters.value(name) - truth.value(name)) < 4 * fit.estimates["stderr"][name]
+    assert sentence in str(fit.status)
