@@ -65,6 +65,7 @@ class EstimationProblem:
     # time after which a log starts anew with a state of its own [s]; math.inf where it never does
     window: float = math.inf
     is_whole: bool = False  # whether logs stay whole also where the model does not follow them
+    unseen: frozenset[str] = frozenset()  # of those that stay fixed, the ones that act only together with others
 
     @property
     def has_gaps(self) -> bool:
@@ -460,14 +461,23 @@ def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters:
         message = f"{shown[0]}, but {about[0]}; subtract the valve's centre in the sidecars of all logs, or of none"
         raise LogError(message)
     rest, most = float(np.median([c.rest for c in shown])), MAX_REST_DISTANCE * shown[0].half
-    found = replace(stated, value=rest, lower=rest - most, upper=rest + most, free=True, source="where the log rests")
+    whole = shown[0]._replace(low=min(c.low for c in shown), high=max(c.high for c in shown))
+    is_unseen = not whole.is_two_way(0.0) and every[element.dead_zone].free
+    value, source = (shown[0].half, UNSEEN_CENTRE) if is_unseen else (rest, "where the log rests")
+    found = replace(stated, value=value, lower=rest - most, upper=rest + most, free=True, source=source)
+    middle = f"{shown[0].half:g} {stated.unit}"
+    fate = f"is taken as {middle}, for the log uses one side of it only" if is_unseen else "is estimated with the rest"
     warnings.warn(
-        f"{shown[0]}: the {element.name} is closed near {shown[0].half:g} {stated.unit}; {name} is estimated with the "
-        f'rest, or state it, centre = "{shown[0].half:g} {stated.unit}", under [{name.partition(".")[0]}]',
+        f"{shown[0]}: the {element.name} is closed near {middle}; {name} {fate}, or state it, "
+        f'centre = "{middle}", under [{name.partition(".")[0]}]',
         PhysicsWarning,
         stacklevel=3,
     )
     return parameters | ParameterSet({name: found})
+
+
+UNSEEN_CENTRE = "the middle of its range: the log uses one side of it only"
+"""Source of a valve's centre that acts only together with its dead zone."""
 
 
 class _Command(NamedTuple):
@@ -482,11 +492,17 @@ class _Command(NamedTuple):
     half: float
 
     def is_counted_from(self, zero: float) -> bool:
-        """Whether the command runs from a voltage to both sides of half the range above it, and rests near there."""
+        """Whether the command runs about half the range above a voltage, and rests near there."""
         low, high, rest = ((v - zero) / self.half for v in (self.low, self.high, self.rest))
         is_within = low >= -RANGE_TOLERANCE and high <= 2 + RANGE_TOLERANCE
-        is_two_way = low < 1 - RANGE_TOLERANCE and high > 1 + RANGE_TOLERANCE
-        return is_within and is_two_way and abs(rest - 1) < MAX_REST_DISTANCE
+        # one way it never comes near the zero, where the valve would have to be closed for the drive to rest
+        is_far = low > 1 - MAX_REST_DISTANCE and high - low > RANGE_TOLERANCE
+        return is_within and (self.is_two_way(zero) or is_far) and abs(rest - 1) < MAX_REST_DISTANCE
+
+    def is_two_way(self, zero: float) -> bool:
+        """Whether the command runs to both sides of half the range above a voltage."""
+        low, high = ((v - zero) / self.half for v in (self.low, self.high))
+        return low < 1 - RANGE_TOLERANCE and high > 1 + RANGE_TOLERANCE
 
     def __str__(self) -> str:
         run = f"runs from {self.low:.3g} to {self.high:.3g} {self.unit}"

@@ -78,7 +78,7 @@ def review_fit(
     if unidentifiable:
         local = _verdict_at(problem, start, result)
         given = problem.unknowns()
-        unchanged = [n for n, v in problem.fixed.items() if v == given.value(n)]
+        unchanged = [n for n, v in problem.fixed.items() if v == given.value(n) and n not in problem.unseen]
         verdict = add_unidentifiable(verdict, unidentifiable, local, unchanged)
     estimates = _blank_intervals(result.estimates, verdict.unidentifiable)
     for name, found in profiles.items():
