@@ -123,8 +123,8 @@ def verdict_from_sensitivities(problem: EstimationProblem, start: Start, varianc
 
 def foresee(problem: EstimationProblem) -> Verdict:
     """The verdict before a fit at the first start, with all widths that the fit estimates, which nobody asks for."""
-    wide = free_widths(problem) if not estimated_widths(problem) else problem
-    start, free, widths = wide.candidates[0], wide.unknowns().free_names, estimated_widths(wide)
+    wide = free_widths(problem)
+    start, free, widths = wide.candidates[0], wide.unknowns().free_names, estimated_widths(wide.parameters)
     others = [n not in widths for n in free]
     order = np.argsort(others, kind="stable")  # widths first: what is left behind them is what they leave of the rest
     asked = replace(problem, parameters=wide.parameters.fixed(*widths))
@@ -285,6 +285,7 @@ def _make_verdict(
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
     rows, reasons, hints = {}, {}, with_values_in_words(_hints(problem), values)
+    widths = estimated_widths(problem.parameters)
     lacks = {n: None if trusted else missing_excitation(hints, n, names, seen) for n in names}
     unseen = {n: find_partners(hints, n, names) for n, lack in lacks.items() if lack is not None and lack.is_strict}
     for name, (lack, partners) in (together or {}).items():
@@ -292,7 +293,8 @@ def _make_verdict(
     for i, (name, p) in enumerate(free.items()):
         if inside_bounds is not None and not inside_bounds[i]:
             rows[name] = [p.value, *[math.nan] * 4, True]
-            reasons[name] = "the best fit is at its bound, and the other intervals hold for that value only"
+            if name not in widths:
+                reasons[name] = "the best fit is at its bound, and the other intervals hold for that value only"
             continue
         unit, given, least = p.value if p.log else 1.0, problem.parameters[name.partition("[")[0]], float(p.unit == "1")
         is_offset = p.lower < 0 and not least  # whose usual size is unknown
@@ -300,7 +302,7 @@ def _make_verdict(
         relative = spread[i] / size if size > 0 else math.nan
         lack = lacks[name]
         with_it = [n for n, partners in unseen.items() if name in partners]
-        is_unidentifiable = (
+        is_unidentifiable = name not in widths and (
             lack is not None
             or bool(with_it)
             or math.isinf(spread[i])
@@ -308,7 +310,7 @@ def _make_verdict(
         )
         if with_it and name not in unseen:
             reasons[name] = f"it {ACTS_ONLY_TOGETHER} with {join_names(with_it)}"
-        elif is_unidentifiable or relative > MAX_RELATIVE_DEVIATION:
+        elif is_unidentifiable or (name not in widths and relative > MAX_RELATIVE_DEVIATION):
             reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(hints, [name]), unseen.get(name, ()))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
@@ -406,13 +408,13 @@ def pose_problem(
     parameters: ParameterSet,
     method: LeastSquares,
 ) -> EstimationProblem:
-    """The estimation problem of logs that `identify` accepts, before any width is chosen."""
+    """The estimation problem of logs that `identify` accepts."""
     model = as_estimation_model(system)
     logs = check_logs(model, experiments, parameters)
     parameters = find_centre(model, logs, parameters)
     check_free(logs, parameters)
     check_content(model, logs, parameters)
-    return EstimationProblem(model, tuple(logs), model.parameters | parameters, method)
+    return free_widths(EstimationProblem(model, tuple(logs), model.parameters | parameters, method))
 
 
 def check_content(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:

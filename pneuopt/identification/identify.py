@@ -55,7 +55,7 @@ from pneuopt.identification.search import (
     tighten_gaps,
 )
 from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
-from pneuopt.identification.widths import estimated_widths, free_widths, sticking_covariance
+from pneuopt.identification.widths import ESTIMATED_WIDTH, estimated_widths, free_widths, sticking_covariance
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
@@ -201,7 +201,7 @@ def _check_window_time(window: float | None) -> None:
 def _fit_and_review(
     problem: EstimationProblem, loss: Loss | None, start: IdentificationResult | None, *, estimate_noise: bool
 ) -> IdentificationResult:
-    """Choose widths, fit from the model's starts or a given one, in windows if need be, and review the intervals."""
+    """Fit from the model's starts or a given one, in windows if need be, and review the intervals."""
     window, problem = problem.window, free_widths(problem)
     problem, unseen = hold_unseen(problem)
     for sentence in unseen:
@@ -211,6 +211,8 @@ def _fit_and_review(
         search = partial(fit_from_starts, loss=loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
         is_plain = loss is None and not estimate_noise
         held, fit, label = fit_logs(problem, search) if is_plain else search(problem)
+        if not (fit.status.converged or doubts.tests):  # a wrong value drives widths to where a search does not settle
+            doubts.explains(held, fit)
     else:
         began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
@@ -373,11 +375,13 @@ def _result(
         held = [value for n, value in problem.fixed.items() if n not in problem.unseen]
         resting = prior_dominated(covariance, fit.prior_covariance, found, held)
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
-    asked = set(free) - set(estimated_widths(problem))
+    widths = estimated_widths(problem.parameters)
+    asked = set(free) - set(widths)
     status = NOTHING_IDENTIFIABLE if asked and asked <= set(unidentifiable) else misfit.assess(fit.status)
     matrix = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
+    parameters = problem.parameters.with_values(values)
     result = IdentificationResult(
-        problem.parameters.with_values(values),
+        parameters | ParameterSet({n: replace(parameters[n], source=ESTIMATED_WIDTH) for n in widths}),
         _estimates(estimates, covariance, fit.at_bound, influenced, status, misfit),
         pd.DataFrame(matrix, index=list(free), columns=list(free)),
         fit_table(problem, fit),

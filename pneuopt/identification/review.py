@@ -7,7 +7,7 @@ model promises much; so the best are tried, each by a fit with it freed, and nam
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -75,19 +75,21 @@ def review_fit(
     known[names] = math.nan
     verdict = verdict_from_covariance(problem, start, known, trusted=trusted)
     verdict = add_profiles(verdict, profiles)
-    if unidentifiable:
+    widths = estimated_widths(problem.parameters)
+    if asked := [n for n in unidentifiable if n not in widths]:
         local = _verdict_at(problem, start, result)
         given = problem.unknowns()
-        unchanged = [n for n, v in problem.fixed.items() if v == given.value(n) and n not in problem.unseen]
-        verdict = add_unidentifiable(verdict, unidentifiable, local, unchanged)
-    estimates = _blank_intervals(result.estimates, verdict.unidentifiable)
+        unchanged = [n for n in asked if problem.fixed.get(n) == given.value(n) and n not in problem.unseen]
+        verdict = add_unidentifiable(verdict, asked, local, unchanged)
+    unknown = {*unidentifiable, *verdict.unidentifiable}
+    estimates = _blank_intervals(result.estimates, unknown)
     for name, found in profiles.items():
         # the linear interval is that of the curvature at the peak, which says little of the side on which it is flat
         estimates.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
         farther = max(found.high - found.estimate, found.estimate - found.low) / math.sqrt(found.threshold)
         deviation = math.nan if found.is_open else max(farther, float(result.estimates["stderr"][name]))
         estimates.loc[name, "stderr"] = deviation
-    estimates = _add_notes(estimates, verdict)
+    estimates = _add_notes(estimates, unknown)
     covariance, status = _widen_covariance(result.covariance, estimates["stderr"]), result.status
     if waiting:
         words = f"the estimates are found, the interval of {waiting[0]} is not"
@@ -129,7 +131,7 @@ def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple
         return found, []  # an error of the model, or noise of the states: the bias is not in a profile
     unknowns = problem.unknowns()
     doubtful = (n for n in known if unknowns[n].log and rows["stderr"][n] > MAX_LINEAR_DEVIATION * rows["value"][n])
-    waiting = [n for n in doubtful if n not in estimated_widths(problem)]  # of those nobody asks for an interval
+    waiting = [n for n in doubtful if n not in estimated_widths(problem.parameters)]  # nobody asks for their intervals
     try:
         while waiting:
             name = waiting[0]
@@ -173,9 +175,9 @@ def _parameters_outside_interval(profile: Profile, estimates: "pd.DataFrame") ->
             yield str(name)
 
 
-def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
+def _add_notes(estimates: "pd.DataFrame", unidentifiable: Container[str]) -> "pd.DataFrame":
     """A note on each estimate at a bound or unidentifiable; NaN for the value of the latter."""
-    unidentifiable, bound = set(verdict.unidentifiable), estimates["at_bound"]
+    bound = estimates["at_bound"]
     notes = [AT_BOUND_NOTE if bound[n] else UNIDENTIFIABLE_NOTE if n in unidentifiable else "" for n in estimates.index]
     out = estimates.assign(note=notes)
     known = out["note"] != UNIDENTIFIABLE_NOTE
@@ -185,7 +187,7 @@ def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
 def _review_failure(problem: EstimationProblem, start: Start, result: IdentificationResult) -> IdentificationResult:
     """The result without intervals; its status names the worst place and the remedies, unless it was interrupted."""
     verdict, status = _verdict_at(problem, start, result), result.status
-    estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict)
+    estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict.unidentifiable)
     if status.code is not Code.INTERRUPTED:
         status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
         advice = _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
@@ -197,7 +199,7 @@ def _review_failure(problem: EstimationProblem, start: Start, result: Identifica
 def _name_part(problem: EstimationProblem, status: Status, verdict: Verdict) -> Status:
     """The status of a fit with what its logs do not identify, and where that is held; first where it is good."""
     unknowns = problem.unknowns()
-    fixed = {n: v for n, v in problem.fixed.items() if n not in estimated_widths(problem)}
+    fixed = {n: v for n, v in problem.fixed.items() if n not in estimated_widths(problem.parameters)}
     held = [f"{n} at {write_value(fixed[n], p.unit, 3)}" for n, p in unknowns.items() if n in fixed]
     words = f"held: {join_names(held)}; the intervals of the others allow for a factor of ten" if held else ""
     said = tuple(filter(None, (_name_unidentifiable(verdict), words)))
@@ -303,6 +305,9 @@ class FixedValueTest:
 
 def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     """The fixed value whose freeing explains most of the misfit of a fit; None where none explains enough."""
+    # a wrong value drives widths to their bounds, where short fits do not follow: they stay at their starts
+    given = problem.parameters
+    problem = replace(problem, fixed={**problem.fixed, **{n: given.value(n) for n in estimated_widths(given)}})
     without, freed = _promised_squares(problem, fit)
     excess = (without if fit.jumps is not None else 2 * fit.stats["cost"]) - fit.count
     promised = [((without - squares) / max(excess, without - fit.count), name) for name, squares in freed.items()]

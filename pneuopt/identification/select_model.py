@@ -36,6 +36,7 @@ from pneuopt.identification.tolerances import (
     NESTED_TEST_LEVEL,
     TIE,
 )
+from pneuopt.identification.widths import estimated_widths
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_argument, check_parameters
@@ -140,7 +141,7 @@ def select_model(
 
     Notes
     -----
-    All are fitted in the same windows and at the same widths (`fit_candidates` says why). The deviance is the squared
+    All are fitted in the same windows, and each estimates the widths of its kinks. The deviance is the squared
     residuals over their variance in the best candidate, and over the factor by which that candidate's variances exceed
     those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
     with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
@@ -522,8 +523,9 @@ def _notes(system: System, fit: IdentificationResult | Refutation) -> tuple[str,
     """Notes on what is unidentifiable, at a bound or unphysical, and the message."""
     if isinstance(fit, Refutation):
         return "", "", "", fit.reason
+    widths = estimated_widths(fit.parameters)
     unknown, bound = (
-        [str(n) for n, own in fit.estimates["note"].items() if own == note]
+        [str(n) for n, own in fit.estimates["note"].drop(widths).items() if own == note]
         for note in (UNIDENTIFIABLE_NOTE, AT_BOUND_NOTE)
     )
     order = system.identification_hints.at_least

@@ -32,12 +32,12 @@ def free_widths(problem: EstimationProblem) -> EstimationProblem:
         value = width.start or given.value(name)
         lower = max(given[name].lower, value / WIDTH_RANGE)
         edits[name] = replace(given[name], value=value, lower=lower, free=True, log=True, source=ESTIMATED_WIDTH)
-    return replace(problem, parameters=given | ParameterSet(edits))
+    return replace(problem, parameters=given | ParameterSet(edits)) if edits else problem
 
 
-def estimated_widths(problem: EstimationProblem) -> list[str]:
-    """The names of the widths that `free_widths` has freed."""
-    return [n for n, p in problem.parameters.items() if p.source == ESTIMATED_WIDTH]
+def estimated_widths(parameters: ParameterSet) -> list[str]:
+    """The names of the widths that `free_widths` has freed: nobody asks whether the logs identify them."""
+    return [n for n, p in parameters.items() if p.source == ESTIMATED_WIDTH]
 
 
 def sticking_covariance(problem: EstimationProblem, fit: Fit) -> Array:
@@ -52,7 +52,7 @@ def sticking_covariance(problem: EstimationProblem, fit: Fit) -> Array:
         return out
     keep = fit.optimum.keep
     scale = np.array([p.value if p.log else 1.0 for p in (fit.parameters[n] for n in free)])
-    for place in (free.index(n) for n in estimated_widths(problem) if n in free):
+    for place in (free.index(n) for n in estimated_widths(problem.parameters) if n in free):
         if fit.at_bound[place] and not keep[place] and keep.any():
             moved = np.zeros(len(free))
             moved[keep] = (

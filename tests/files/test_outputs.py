@@ -26,7 +26,7 @@ from pneuopt.evaluation.plants import CorrelatedParameters
 from pneuopt.evaluation.scenarios import Factor
 from pneuopt.files.first_files import first_files
 from pneuopt.files.outputs import OUTPUTS, RESULT_KINDS, Holds, Member, load_result, members_of, output_schema
-from pneuopt.identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
+from pneuopt.identification.result import ChosenWindow, IdentificationResult, Mark, Verdict
 from pneuopt.identification.select_model import ModelSelection
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -159,7 +159,6 @@ def fits(draw: st.DrawFn) -> IdentificationResult:
         {n: draw(NUMBER) for n in draw(st.lists(NAME, max_size=3, unique=True))},
         draw(st.dictionaries(NAME, TEXT, max_size=3)),
         Verdict(known, (tuple(names),), {names[0]: "why"}, (names[1],), IdentificationHints(runs=(run,))),
-        (ChosenWidth("w", draw(NUMBER), "m", 1.0),),
         draw(st.none() | st.just(ChosenWindow(1.0, 0.5, math.inf, 0.1))),
     )
 

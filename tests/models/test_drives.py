@@ -298,7 +298,7 @@ def test_the_log_of_a_shaft_is_checked_in_its_own_channels(servo: tuple[RotaryDr
         identify(drive.system(), [against], fit.parameters)
 
 
-def test_the_width_of_its_friction_is_chosen_in_the_axis_units() -> None:
+def test_the_width_of_its_friction_is_estimated_in_the_axis_units() -> None:
     system = RotaryDrive().system()
     assert [(w.name, system.parameters[w.name].unit) for w in system.identification_hints.widths] == [
         ("friction.smoothing", "rad/s")
