@@ -308,23 +308,25 @@ def _make_verdict(
             or math.isinf(spread[i])
             or relative > (MAX_EXPECTED_DEVIATION if inside_bounds is None else UNIDENTIFIABLE_DEVIATION)
         )
-        if with_it and name not in unseen:
+        if with_it and lack is None:
             reasons[name] = f"it {ACTS_ONLY_TOGETHER} with {join_names(with_it)}"
         elif is_unidentifiable or (name not in widths and relative > MAX_RELATIVE_DEVIATION):
-            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(hints, [name]), unseen.get(name, ()))
+            partners = unseen.get(name, ())
+            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(hints, [name]), partners)
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=list(IdentifiableRow.__annotations__))
     groups = [[names[i] for i in np.flatnonzero(row)] for row in weak]
     worst = [table.loc[group, ["inflation", "relative"]].max() for group in groups]
     exceeds = [w["inflation"] > MAX_INFLATION and w["relative"] > HARMLESS_DEVIATION for w in worst]
-    harmful = tuple(tuple(g) for g, is_harmful in zip(groups, exceeds, strict=True) if is_harmful and not {*g} & {*unseen})
+    harmful = tuple(tuple(g) for g, does in zip(groups, exceeds, strict=True) if does and not {*g} & {*unseen})
     return Verdict(table, harmful, reasons, identification_hints=hints, unseen=tuple(unseen))
 
 
 def _hints(problem: EstimationProblem) -> IdentificationHints:
     """The plant's hints, and what a valve's command that stays on one side of its centre lacks."""
-    plant, hints, centre = problem.system.plant, problem.system.plant.identification_hints, centre_name(problem.system.plant)
+    plant = problem.system.plant
+    hints, centre = plant.identification_hints, centre_name(plant)
     element = plant.axis.final_element if plant.axis else None
     if centre is None or element is None or problem.parameters[centre].source != UNSEEN_CENTRE:
         return hints

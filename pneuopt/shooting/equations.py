@@ -140,7 +140,9 @@ class NormalEquations:
         scaled, scale = unit_diagonal(reduced.schur[np.ix_(seen, seen)])
         least = max(RANK_TOLERANCE, SCHUR_ROUNDING / float(left[seen].min(initial=1.0)))
         values, vectors = np.linalg.eigh(scaled)
-        hidden, whole = ((vectors * v) @ vectors.T for v in (np.maximum(least - values, 0.0), np.maximum(values, least)))
+        hidden, whole = (
+            (vectors * v) @ vectors.T for v in (np.maximum(least - values, 0.0), np.maximum(values, least))
+        )
         sizes, axes = np.linalg.eigh(self._meat(reduced)[np.ix_(seen, seen)] * np.outer(scale, scale) + hidden)
         root = np.zeros_like(self.arrow.corner)
         root[: seen.size, seen] = (axes / np.sqrt(np.maximum(sizes, least))).T @ whole / scale

@@ -77,7 +77,7 @@ def test_assumptions_are_what_no_file_states(tmp_path: Path) -> None:
     assert "noise of position" not in assumed  # stated in the log
     assert assumed["friction.viscous"].text == '"70 N*s/m"'
     assert assumed["friction.smoothing"].key == "[friction] smoothing"
-    assert "identify chooses it" in assumed["friction.smoothing"].reason
+    assert "identify estimates it" in assumed["friction.smoothing"].reason
     assert assumed["force between samples"].value == "linear"
     bare = replace(LOG, noise={})
     noise = next(a for a in check(drive, bare, rig).assumptions if a.name == "noise of position")
