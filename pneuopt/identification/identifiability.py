@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -274,7 +275,7 @@ def _make_verdict(
     inside_bounds: Mask | None = None,
     *,
     trusted: bool = False,
-    together: Mapping[str, tuple[Lack, tuple[str, ...]]] | None = None,
+    together: Mapping[str, tuple[Lack, tuple[str, ...]]] = MappingProxyType({}),
 ) -> Verdict:
     """The verdict from a square root of the information matrix and from the logged motion."""
     import pandas as pd
@@ -286,10 +287,10 @@ def _make_verdict(
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
     rows, reasons, hints = {}, {}, with_values_in_words(_hints(problem), values)
     widths = estimated_widths(problem.parameters)
-    lacks = {n: None if trusted else missing_excitation(hints, n, names, seen) for n in names}
-    unseen = {n: find_partners(hints, n, names) for n, lack in lacks.items() if lack is not None and lack.is_strict}
-    for name, (lack, partners) in (together or {}).items():
-        lacks[name], unseen[name] = lack, partners
+    lacks = {} if trusted else {n: lack for n in names if (lack := missing_excitation(hints, n, names, seen))}
+    unseen = {n: find_partners(hints, n, names) for n, lack in lacks.items() if lack.is_strict}
+    lacks |= {n: lack for n, (lack, _) in together.items()}
+    unseen |= {n: partners for n, (_, partners) in together.items()}
     for i, (name, p) in enumerate(free.items()):
         if inside_bounds is not None and not inside_bounds[i]:
             rows[name] = [p.value, *[math.nan] * 4, True]
@@ -300,27 +301,28 @@ def _make_verdict(
         is_offset = p.lower < 0 and not least  # whose usual size is unknown
         size = 1.0 if p.log else 0.0 if is_offset else max(abs(p.value), abs(given.value), least)
         relative = spread[i] / size if size > 0 else math.nan
-        lack = lacks[name]
+        lack = lacks.get(name)
         with_it = [n for n, partners in unseen.items() if name in partners]
         is_unidentifiable = name not in widths and (
-            lack is not None
-            or bool(with_it)
-            or math.isinf(spread[i])
+            bool(lack or with_it or math.isinf(spread[i]))
             or relative > (MAX_EXPECTED_DEVIATION if inside_bounds is None else UNIDENTIFIABLE_DEVIATION)
         )
         if with_it and lack is None:
             reasons[name] = f"it {ACTS_ONLY_TOGETHER} with {join_names(with_it)}"
         elif is_unidentifiable or (name not in widths and relative > MAX_RELATIVE_DEVIATION):
-            partners = unseen.get(name, ())
-            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(hints, [name]), partners)
+            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, unseen.get(name), remedy(hints, [name]))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=list(IdentifiableRow.__annotations__))
-    groups = [[names[i] for i in np.flatnonzero(row)] for row in weak]
-    worst = [table.loc[group, ["inflation", "relative"]].max() for group in groups]
-    exceeds = [w["inflation"] > MAX_INFLATION and w["relative"] > HARMLESS_DEVIATION for w in worst]
-    harmful = tuple(tuple(g) for g, does in zip(groups, exceeds, strict=True) if does and not {*g} & {*unseen})
+    groups = [tuple(names[i] for i in np.flatnonzero(row)) for row in weak]
+    harmful = tuple(group for group in groups if _does_harm(table.loc[[*group]]) and not {*group} & {*unseen})
     return Verdict(table, harmful, reasons, identification_hints=hints, unseen=tuple(unseen))
+
+
+def _does_harm(group: "pd.DataFrame") -> bool:
+    """Whether parameters act alike so nearly that one of them is not known well."""
+    inflation, relative = group[["inflation", "relative"]].max()
+    return bool(inflation > MAX_INFLATION and relative > HARMLESS_DEVIATION)
 
 
 def _hints(problem: EstimationProblem) -> IdentificationHints:
@@ -337,7 +339,7 @@ def _hints(problem: EstimationProblem) -> IdentificationHints:
 
 
 def _unidentifiable_reason(
-    alone: float, relative: float, lack: Lack | None, usual_remedy: str, partners: Sequence[str]
+    alone: float, relative: float, lack: Lack | None, partners: Sequence[str] | None, usual_remedy: str
 ) -> str:
     """The reason why the logs do not identify a parameter, and the remedy."""
     if lack is not None and partners:

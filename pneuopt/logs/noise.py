@@ -163,7 +163,8 @@ def _refresh_period(at: Array) -> tuple[float, float]:
 
 def _last_digit(values: Array, most: int = 12) -> float:
     """The last digit of the largest value, where all are written with as many significant digits; else 0."""
-    sizes = np.abs(values[values != 0])
+    sizes = np.abs(values)
+    sizes = sizes[sizes > ROUNDING * sizes.max()]
     places = np.floor(np.log10(sizes)).astype(int)
     for digits in range(3, most):
         scaled = sizes * 10.0 ** (digits - 1 - places)
