@@ -460,10 +460,10 @@ def _verdict_parts(found: Checkup) -> Iterator[Line | Table]:
     rows = []
     for name, row in found.verdict.table.iterrows():
         unit = found.parameters[str(name).partition("[")[0]].unit
-        value, relative, stderr = (float(row[k]) for k in ("value", "relative", "stderr"))
-        share = 100 * (relative if math.isfinite(relative) else stderr / abs(value) if value else math.inf)
+        value, stderr = (float(row[k]) for k in ("value", "stderr"))
+        share = 100 * stderr / abs(value) if value else math.inf
         known = f"+-{write_value(stderr, unit, 2)}" if math.isfinite(stderr) else "not computed"
-        if math.isfinite(relative) and share < 100:
+        if share < 100:
             known = f"+-{share:.2g} %"
         known = known if row["identifiable"] else UNIDENTIFIABLE_NOTE
         rows.append((str(name), write_value(value, unit, 4), known))

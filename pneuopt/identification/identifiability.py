@@ -131,7 +131,7 @@ def foresee(problem: EstimationProblem) -> Verdict:
     asked = replace(problem, parameters=wide.parameters.fixed(*widths))
 
     def root(given: EstimationProblem) -> Array:
-        whole = np.linalg.qr(_root_information(given, start)[:, order], mode="r")
+        whole = np.linalg.qr(_root_information(given, start)[:, order]).R
         return np.asarray(whole[len(widths) :, len(widths) :])
 
     still = _still_inputs(problem)
