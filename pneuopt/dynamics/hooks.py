@@ -177,6 +177,8 @@ class Lack(NamedTuple):
 
     reason: str
     remedy: str
+    # whether it counts whatever figures say: at rest a model that rounds stiction creeps, and shows what no drive does
+    is_strict: bool = False
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from pneuopt.identification.identifiability import (
     accept_remedy,
     axis_from_model,
     find_exchange,
+    foresee,
     is_accepted,
     is_refused,
-    verdict_from_sensitivities,
 )
 from pneuopt.identification.problem import (
     EstimationProblem,
@@ -278,7 +278,7 @@ def check(
     ranked.sort(key=lambda f: list(Severity).index(f.severity))
     is_open = any(f.severity is Severity.FAULT for f in ranked)
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
-    verdict = None if is_open else verdict_from_sensitivities(problem, problem.candidates[0])
+    verdict = None if is_open else foresee(problem)
     return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
 
 
@@ -453,19 +453,17 @@ def _log_lines(log: Experiment) -> Iterator[Line]:
     yield from (_line(remark, 4) for remark in log.remarks)
 
 
-def _verdict_parts(found: Checkup, finest: float = 0.1) -> Iterator[Line | Table]:
-    """A row a parameter, then why some are not identifiable; below `finest` [%] the model's errors count."""
+def _verdict_parts(found: Checkup) -> Iterator[Line | Table]:
+    """A row a parameter, then why some are not identifiable."""
     if found.verdict is None:
         return
     rows = []
     for name, row in found.verdict.table.iterrows():
         unit = found.parameters[str(name).partition("[")[0]].unit
-        value, relative, stderr = (float(row[k]) for k in ("value", "relative", "stderr"))
-        share = 100 * (relative if math.isfinite(relative) else stderr / abs(value) if value else math.inf)
+        value, stderr = (float(row[k]) for k in ("value", "stderr"))
+        share = 100 * stderr / abs(value) if value else math.inf
         known = f"+-{write_value(stderr, unit, 2)}" if math.isfinite(stderr) else "not computed"
-        if share < finest:
-            known = f"+-{finest} % or better"
-        elif math.isfinite(relative) and share < 100:
+        if share < 100:
             known = f"+-{share:.2g} %"
         known = known if row["identifiable"] else UNIDENTIFIABLE_NOTE
         rows.append((str(name), write_value(value, unit, 4), known))

@@ -11,28 +11,30 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import chi2
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.hooks import Axis, Lack, Start
-from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
+from pneuopt.dynamics.hooks import Axis, IdentificationHints, Lack, Need, Start
+from pneuopt.dynamics.runnable import Fittable, HasSystem, centre_name, check_smooth
 from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.identification.problem import (
+    UNSEEN_CENTRE,
     EstimationProblem,
     as_estimation_model,
     as_experiments,
     check_free,
     check_logs,
     find_centre,
-    known_runs,
 )
 from pneuopt.identification.profiles import Profile
 from pneuopt.identification.result import (
     IdentifiableRow,
     Verdict,
+    find_partners,
     join_names,
     missing_excitation,
     remedy,
@@ -48,7 +50,6 @@ from pneuopt.identification.tolerances import (
     MAX_PRIOR_DEVIATION,
     MAX_PRIOR_VARIANCE_SHARE,
     MAX_RELATIVE_DEVIATION,
-    MAX_TRIAL_SAMPLES,
     MIN_COMBINATION_SHARE,
     MIN_FORCE_SHARE,
     MIN_STOP_FORCE,
@@ -60,10 +61,10 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.mending import MendedLog, convert, empty_cells, leave_out
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import InputError, LogError, require
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.least_squares import Fit, LeastSquares
-from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
-from pneuopt.shooting.tolerances import MAX_SEARCH_SUBSTEPS
+from pneuopt.quantities.parameters import Intersample, ParameterSet, usual_intersample
+from pneuopt.quantities.units import write_value
+from pneuopt.shooting.least_squares import Fit, LeastSquares, start_search
+from pneuopt.shooting.segments import segment
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,6 +74,7 @@ MAX_RELATIVE_INTERVAL = 4 * MAX_RELATIVE_DEVIATION  # width of a profile's inter
 
 
 UNIDENTIFIED = "the logs do not identify"
+ACTS_ONLY_TOGETHER = "acts only together"
 VAGUER_THAN_PRIOR = "its standard deviation is as wide as a factor of ten"
 
 
@@ -99,9 +101,8 @@ def identifiability(
     Returns
     -------
     Verdict
-        From the sensitivities of the measured outputs along the model's own first start, at the noise that the logs
-        declare or show (Cramer-Rao: no estimate is better), and from what the motion lacks. The
-        deviations of a wrong model are larger.
+        From the equations of the fit at the model's own first start, at the noise that the logs declare or show, and
+        from what the motion lacks: a fit of a right model has these deviations, one of a wrong model larger ones.
 
     Raises
     ------
@@ -110,31 +111,78 @@ def identifiability(
     """
     check_smooth(as_estimation_model(system))
     problem = pose_problem(system, experiments, parameters, method or LeastSquares())
-    return verdict_from_sensitivities(problem, problem.candidates[0])
+    return foresee(problem)
 
 
 def verdict_from_sensitivities(problem: EstimationProblem, start: Start, variance: float = 1.0) -> Verdict:
-    """The verdict from the sensitivities at a start or fit, without gaps; `variance` of residuals in noise variances.
+    """The verdict from the search's own equations at a start or fit; `variance` of residuals in noise variances.
 
-    Where they are not finite, or the start is so stiff that integrating it would take hours, all figures are NaN.
+    Their last stage gives a fit its standard deviations. Where they are not finite all figures are NaN.
     """
-    segments = segment(problem.transcription(start))
-    parameters = segments.transcription.parameters
-    q = np.array([p.value for p in parameters.values()])
-    chain = np.array([p.value if p.log else 1.0 for p in parameters.values() if p.free])
-    nodes = start_nodes(segments)
-    segments, substeps = choose_integration(segments, nodes, q, problem.method.substeps)
-    if substeps > MAX_SEARCH_SUBSTEPS:
-        return _make_verdict(problem, start, np.full((len(chain), len(chain)), np.nan))
-    run = segments.run(nodes, q, substeps, sensitivities=True)
-    assert run.dy is not None
-    assert run.dx_end is not None
-    weighted = np.where(np.isfinite(segments.measured)[..., None], run.dy / segments.noise[..., None], 0.0)
-    roots = [np.zeros((0, len(chain)))]
-    ends = (np.flatnonzero(~segments.linked) + 1).tolist()  # of each chain of linked segments
-    for first, last in zip([0, *ends[:-1]], ends, strict=True):
-        roots.append(_log_root_information(segments, weighted[first:last], run.dx_end[first:last], first, chain))
-    return _make_verdict(problem, start, _triangularise(np.concatenate(roots)) / math.sqrt(variance))
+    return _make_verdict(problem, start, _root_information(problem, start) / math.sqrt(variance))
+
+
+def foresee(problem: EstimationProblem) -> Verdict:
+    """The verdict before a fit at the first start, with all widths that the fit estimates, which nobody asks for."""
+    wide = free_widths(problem)
+    start, free, widths = wide.candidates[0], wide.unknowns().free_names, estimated_widths(wide.parameters)
+    others = [n not in widths for n in free]
+    order = np.argsort(others, kind="stable")  # widths first: what is left behind them is what they leave of the rest
+    asked = replace(problem, parameters=wide.parameters.fixed(*widths))
+
+    def root(given: EstimationProblem) -> Array:
+        whole = np.linalg.qr(_root_information(given, start)[:, order]).R
+        return np.asarray(whole[len(widths) :, len(widths) :])
+
+    still = _still_inputs(problem)
+    frozen = tuple(
+        replace(e, trajectory=e.trajectory.with_columns({n: np.full(len(e.trajectory), v) for n, v in still.items()}))
+        for e in problem.experiments
+    )
+    together = _indistinguishable(asked, root(replace(wide, experiments=frozen)), still) if still else {}
+    return _make_verdict(asked, start, root(wide), together=together)
+
+
+def _still_inputs(problem: EstimationProblem) -> dict[str, float]:
+    """The means of measured inputs that hardly change in any log, but not of what drives the plant.
+
+    A slope over one of them and what it adds to act alike, though the model tells them apart by the little change.
+    """
+    plant, out = problem.system.plant, dict[str, float]()
+    force = plant.axis.force if plant.axis else ""
+    for q in (q for q in plant.inputs if q.unit != force and usual_intersample(q.name, q.unit) is Intersample.LINEAR):
+        values = [e.trajectory[q.name] for e in problem.experiments if q.name in e.trajectory]
+        column = np.concatenate(values) if values else np.zeros(1)
+        if MAX_INFLATION * float(np.std(column)) < abs(float(np.mean(column))):
+            out[q.name] = float(np.mean(column))
+    return out
+
+
+def _indistinguishable(
+    problem: EstimationProblem, root: Array, still: Mapping[str, float], rounding: float = 1e5
+) -> dict[str, tuple[Lack, tuple[str, ...]]]:
+    """Parameters that act only together with others where inputs stand still: which, why, and with which others.
+
+    Of each group the one is named that may have either sign, as a slope has: without it the others have a meaning.
+    """
+    unknowns, (spread, alone, weak) = problem.unknowns(), _standard_deviations(root)
+    free, out = unknowns.free_names, dict[str, tuple[Lack, tuple[str, ...]]]()
+    for group in (np.flatnonzero(row) for row in weak):
+        names, either = [free[i] for i in group], [free[i] for i in group if unknowns[free[i]].lower < 0]
+        if (spread[group] > rounding * alone[group]).all() and either:
+            units = {q.name: q.unit for q in problem.system.plant.inputs}
+            levels = [f"{n} stays near {write_value(v, units[n], 3)}" for n, v in still.items()]
+            lack = Lack(join_names(levels), "fix it, or log other levels", is_strict=True)
+            out[either[-1]] = lack, tuple(n for n in names if n != either[-1])
+    return out
+
+
+def _root_information(problem: EstimationProblem, start: Start) -> Array:
+    """A root of the information about the free parameters as searched, NaN where the model is too stiff to tell."""
+    method = replace(problem.method, stages=problem.method.stages[-1:], progress=None)
+    begun = start_search(segment(problem.transcription(start)), method)
+    root = begun.iterate.equations.root_information()
+    return root * np.nan if begun.setup.is_too_stiff else root
 
 
 def verdict_from_covariance(
@@ -157,26 +205,18 @@ def verdict_from_covariance(
     return _make_verdict(problem, fit, root, inside_bounds=keep, trusted=trusted)
 
 
-def foresee_unidentifiable(problem: EstimationProblem) -> tuple[str, ...]:
-    """Sentences on what logs cannot identify, before the search: motion and outputs show it too little."""
-    if not problem.system.states:  # a static map is fitted as soon
-        return ()
-    start, free = problem.candidates[0], problem.unknowns().free_names
-    hints = problem.system.plant.identification_hints
-    values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
-    seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
-    lacking = [n for n in free if missing_excitation(hints, n, free, seen) is not None]
-    if not lacking:
-        return ()
-    part = replace(problem, experiments=excerpts(problem.experiments))
-    verdict = verdict_from_sensitivities(part, part.candidates[0])
-    alike, table = {n for group in verdict.indistinguishable for n in group}, verdict.table
-    by_reason: dict[str, list[str]] = {}
-    for name in (n for n in lacking if n in verdict.reasons):  # a stretch has own names for what each log has its own
-        relative = table["relative"][name]
-        if name in alike if math.isnan(relative) else relative > MAX_EXPECTED_DEVIATION:
-            by_reason.setdefault(verdict.reasons[name], []).append(name)
-    return tuple(f"before the search: {UNIDENTIFIED} {join_names(n)}: {reason}" for reason, n in by_reason.items())
+def hold_unseen(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[str, ...]]:
+    """The problem with parameters held that act only together with others, and a sentence on each.
+
+    A drive that moves one way shows the sum of friction and a constant force; a fit would part them by how a model that
+    rounds stiction creeps at rest.
+    """
+    verdict, given = foresee(problem), problem.unknowns()
+    if not len(verdict.unseen) < len(verdict.table):
+        return problem, ()
+    held = {n: given.value(n) for n in verdict.unseen}
+    said = tuple(f"before the search: {UNIDENTIFIED} {n}: {verdict.reasons[n]}" for n in held)
+    return replace(problem, fixed={**problem.fixed, **held}, unseen=frozenset(held)), said
 
 
 def add_profiles(verdict: Verdict, profiles: Mapping[str, Profile]) -> Verdict:
@@ -229,7 +269,13 @@ def prior_dominated(covariance: Array, prior_covariance: Array, values: Array, h
 
 
 def _make_verdict(
-    problem: EstimationProblem, start: Start, root: Array, inside_bounds: Mask | None = None, *, trusted: bool = False
+    problem: EstimationProblem,
+    start: Start,
+    root: Array,
+    inside_bounds: Mask | None = None,
+    *,
+    trusted: bool = False,
+    together: Mapping[str, tuple[Lack, tuple[str, ...]]] = MappingProxyType({}),
 ) -> Verdict:
     """The verdict from a square root of the information matrix and from the logged motion."""
     import pandas as pd
@@ -239,8 +285,12 @@ def _make_verdict(
     names, (spread, alone, weak) = list(free), _standard_deviations(root)
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
-    rows, reasons, hints = {}, {}, with_values_in_words(problem.system.plant.identification_hints, values)
+    rows, reasons, hints = {}, {}, with_values_in_words(_hints(problem), values)
     widths = estimated_widths(problem.parameters)
+    lacks = {} if trusted else {n: lack for n in names if (lack := missing_excitation(hints, n, names, seen))}
+    unseen = {n: find_partners(hints, n, names) for n, lack in lacks.items() if lack.is_strict}
+    lacks |= {n: lack for n, (lack, _) in together.items()}
+    unseen |= {n: partners for n, (_, partners) in together.items()}
     for i, (name, p) in enumerate(free.items()):
         if inside_bounds is not None and not inside_bounds[i]:
             rows[name] = [p.value, *[math.nan] * 4, True]
@@ -251,26 +301,49 @@ def _make_verdict(
         is_offset = p.lower < 0 and not least  # whose usual size is unknown
         size = 1.0 if p.log else 0.0 if is_offset else max(abs(p.value), abs(given.value), least)
         relative = spread[i] / size if size > 0 else math.nan
-        lack = None if trusted else missing_excitation(hints, name, names, seen)
+        lack = lacks.get(name)
+        with_it = [n for n, partners in unseen.items() if name in partners]
         is_unidentifiable = name not in widths and (
-            lack is not None
-            or math.isinf(spread[i])
+            bool(lack or with_it or math.isinf(spread[i]))
             or relative > (MAX_EXPECTED_DEVIATION if inside_bounds is None else UNIDENTIFIABLE_DEVIATION)
         )
-        if is_unidentifiable or (name not in widths and relative > MAX_RELATIVE_DEVIATION):
-            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(hints, [name]))
+        if with_it and lack is None:
+            reasons[name] = f"it {ACTS_ONLY_TOGETHER} with {join_names(with_it)}"
+        elif is_unidentifiable or (name not in widths and relative > MAX_RELATIVE_DEVIATION):
+            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, unseen.get(name), remedy(hints, [name]))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=list(IdentifiableRow.__annotations__))
-    groups = [[names[i] for i in np.flatnonzero(row)] for row in weak]
-    worst = [table.loc[group, ["inflation", "relative"]].max() for group in groups]
-    exceeds = [w["inflation"] > MAX_INFLATION and w["relative"] > HARMLESS_DEVIATION for w in worst]
-    harmful = tuple(tuple(group) for group, is_harmful in zip(groups, exceeds, strict=True) if is_harmful)
-    return Verdict(table, harmful, reasons, identification_hints=hints)
+    groups = [tuple(names[i] for i in np.flatnonzero(row)) for row in weak]
+    harmful = tuple(group for group in groups if _does_harm(table.loc[[*group]]) and not {*group} & {*unseen})
+    return Verdict(table, harmful, reasons, identification_hints=hints, unseen=tuple(unseen))
 
 
-def _unidentifiable_reason(alone: float, relative: float, lack: Lack | None, usual_remedy: str) -> str:
+def _does_harm(group: "pd.DataFrame") -> bool:
+    """Whether parameters act alike so nearly that one of them is not known well."""
+    inflation, relative = group[["inflation", "relative"]].max()
+    return bool(inflation > MAX_INFLATION and relative > HARMLESS_DEVIATION)
+
+
+def _hints(problem: EstimationProblem) -> IdentificationHints:
+    """The plant's hints, and what a valve's command that stays on one side of its centre lacks."""
+    plant = problem.system.plant
+    hints, centre = plant.identification_hints, centre_name(plant)
+    element = plant.axis.final_element if plant.axis else None
+    if centre is None or element is None or problem.parameters[centre].source != UNSEEN_CENTRE:
+        return hints
+    lack = Lack(
+        f"the command stays on one side of the {element.name}'s middle", "state it, or log both sides", is_strict=True
+    )
+    return replace(hints, needs={**hints.needs, centre: Need(lambda _: lack, frozenset({element.dead_zone}))})
+
+
+def _unidentifiable_reason(
+    alone: float, relative: float, lack: Lack | None, partners: Sequence[str] | None, usual_remedy: str
+) -> str:
     """The reason why the logs do not identify a parameter, and the remedy."""
+    if lack is not None and partners:
+        return f"{lack.reason}, so that it {ACTS_ONLY_TOGETHER} with {join_names(partners)}; {lack.remedy}"
     if lack is not None:
         return f"{lack.reason}; {lack.remedy}"
     if math.isinf(alone):
@@ -299,37 +372,6 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
         weak = np.zeros((len(member), len(size)), dtype=bool)
         weak[:, informed] = member
     return spread, alone, weak[weak.sum(axis=1) > 1]
-
-
-def _log_root_information(
-    segments: Segments, weighted: Array, end_sensitivities: Array, first: int, chain: Array, at_once: int = 2000
-) -> Array:
-    """Square root of one log's information about the parameters; QR, of so many segments, eliminates the start."""
-    n, k = end_sensitivities.shape[1], len(chain)
-    carried = np.concatenate([np.eye(n), np.zeros((n, k))], axis=1)
-    carried[np.isfinite(segments.fixed_start[first])] = 0.0
-    root, rows = np.zeros((0, n + k)), []
-    index = np.full(len(segments.transcription.parameters), -1, dtype=np.intp)
-    index[segments.transcription.free] = np.arange(k)
-    unknown = index[segments.parameter_positions[first, segments.columns]]
-    by_parameter = np.where(unknown[:, None] == np.arange(k), chain, 0.0)  # of each column, alike in all segments
-    chosen = np.concatenate([np.zeros((len(segments.columns), n)), by_parameter], axis=1)
-    for i, (y, x) in enumerate(zip(weighted, end_sensitivities, strict=True)):
-        moved = np.concatenate([carried, chosen])
-        with np.errstate(over="ignore", invalid="ignore"):
-            rows.append(y.reshape(-1, y.shape[-1]) @ moved)
-            carried = x @ moved
-        if len(rows) == at_once or i == len(weighted) - 1:
-            root, rows = _triangularise(np.concatenate([root, *rows])), []
-    return np.asarray(root[n:, n:])
-
-
-def _triangularise(rows: Array) -> Array:
-    """The square upper triangle (QR) that has the same Gram matrix."""
-    width = rows.shape[1]
-    padded = np.concatenate([rows, np.zeros((max(0, width - len(rows)), width))])
-    finite = bool(np.isfinite(padded).all())
-    return np.asarray(np.linalg.qr(padded, mode="r")) if finite else np.full((width, width), np.nan)
 
 
 QUIET_CHECKS = ("sampling", "dwells")
@@ -377,24 +419,6 @@ def pose_problem(
     check_free(logs, parameters)
     check_content(model, logs, parameters)
     return free_widths(EstimationProblem(model, tuple(logs), model.parameters | parameters, method))
-
-
-def excerpts(experiments: Sequence[Experiment], stretches: int = 4) -> tuple[Experiment, ...]:
-    """The logs, or evenly spread stretches of them where they are long."""
-    total = sum(len(e.trajectory) for e in experiments)
-    if total <= MAX_TRIAL_SAMPLES:
-        return tuple(experiments)
-    share, out = MAX_TRIAL_SAMPLES / total, list[Experiment]()
-    for e in experiments:
-        n = len(e.trajectory)
-        size, each = n // stretches, round(share * n / stretches)
-        for k in range(stretches):
-            begin, end = k * size, k * size + max(10, each)
-            holes = [(max(a, begin) - begin, min(b, end) - begin) for a, b in e.holes if a < end and b > begin]
-            run = e.trajectory.rows(begin, end)
-            part = replace(e, trajectory=run, holes=tuple(holes), name=f"{e.name}@{k}")
-            out += [part] if known_runs(part) else []
-    return tuple(out)
 
 
 def check_content(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:

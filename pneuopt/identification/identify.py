@@ -18,7 +18,7 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
 from pneuopt.identification.identifiability import (
     check_content,
-    foresee_unidentifiable,
+    hold_unseen,
     prior_dominated,
     prior_influenced,
 )
@@ -198,11 +198,10 @@ def _fit_and_review(
     problem: EstimationProblem, loss: Loss | None, start: IdentificationResult | None, *, estimate_noise: bool
 ) -> IdentificationResult:
     """Fit from the model's starts or a given one, in windows if need be, and review the intervals."""
-    window = problem.window
-    if start is None:
-        for sentence in foresee_unidentifiable(problem):
-            warnings.warn(sentence, PhysicsWarning, stacklevel=3)
-    problem = free_widths(problem)
+    window, problem = problem.window, free_widths(problem)
+    problem, unseen = hold_unseen(problem)
+    for sentence in unseen:
+        warnings.warn(sentence, PhysicsWarning, stacklevel=3)
     doubts, trail = FixedValueTest(), None
     if start is None:
         search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
@@ -363,7 +362,8 @@ def _result(
         covariance = covariance + fit.prior_covariance
         influenced = prior_influenced(covariance, fit.prior_covariance)
         found = np.array([p.value for p in estimates.values()])
-        resting = prior_dominated(covariance, fit.prior_covariance, found, problem.fixed.values())
+        held = [value for n, value in problem.fixed.items() if n not in problem.unseen]
+        resting = prior_dominated(covariance, fit.prior_covariance, found, held)
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
     widths = estimated_widths(problem.parameters)
     asked = set(free) - set(widths)

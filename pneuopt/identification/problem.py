@@ -32,7 +32,7 @@ from pneuopt.identification.tolerances import (
 )
 from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiment import Experiment
-from pneuopt.logs.noise import estimate_noise, noise_level
+from pneuopt.logs.noise import estimate_noise, find_refresh, noise_level
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import (
@@ -65,6 +65,7 @@ class EstimationProblem:
     # time after which a log starts anew with a state of its own [s]; math.inf where it never does
     window: float = math.inf
     is_whole: bool = False  # whether logs stay whole also where the model does not follow them
+    unseen: frozenset[str] = frozenset()  # of those that stay fixed, the ones that act only together with others
     # the starts that were made so far, with what they are of: trials of one problem share them
     _made: list[tuple[tuple[object, ...], Sequence[Start]]] = field(default_factory=list, repr=False, compare=False)
 
@@ -345,9 +346,10 @@ def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Inter
 def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tuple[str, ...]]:
     """Bridge the short holes of a log's inputs and cut it at the long ones (`holes`); the log and sentences on that.
 
-    A sampled loop is refused at a long one, for its controller goes on.
+    A sampled loop is refused at a long one, for its controller goes on. What a sensor repeats is no sample.
     """
-    log, inputs = experiment.trajectory, names(system.inputs)
+    fresh, sentences = _without_repeats(system, experiment)
+    log, inputs = fresh.trajectory, names(system.inputs)
     known: Mask = np.asarray(np.isfinite(log.matrix(inputs)).all(axis=1))
     holes = _find_holes(log, known, system) if system.states else []
     lost = np.zeros(len(log), dtype=bool) if system.states else ~known
@@ -363,16 +365,30 @@ def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tu
         message = f"{experiment.name}: inputs are unknown {where}, and a sampled controller goes on meanwhile"
         raise LogError(f"{message}; cut the log in two there")
     short = ~known & ~lost
-    sentences = [f"{experiment.name}: inputs are unknown {where}; the log is cut there"] if holes else []
+    sentences += [f"{experiment.name}: inputs are unknown {where}; the log is cut there"] if holes else []
     if short.any():
         edges = np.flatnonzero(np.diff(np.concatenate([[False], short, [False]]).astype(int)))
         longest = int(np.max(edges[1::2] - edges[::2]))
         gaps = f"{experiment.name}: {int(short.sum())} samples lack an input, {longest} in a row at most"
         sentences.append(f"{gaps}; they are bridged")
-    if not (sentences or lost.any()):
-        return experiment, ()
+    if not (holes or short.any() or lost.any()):
+        return fresh, tuple(sentences)
     values = _bridge(log, input_behaviour(system, experiment), lost)
     return replace(experiment, trajectory=log.with_columns(values), holes=tuple(holes)), tuple(sentences)
+
+
+def _without_repeats(system: Fittable, experiment: Experiment) -> tuple[Experiment, list[str]]:
+    """The log without the values that sensors slower than it repeat from row to row, and a sentence on each sensor."""
+    log, columns, sentences = experiment.trajectory, dict[str, Array](), list[str]()
+    for channel in outputs_in_log(system, experiment):
+        found = find_refresh(log[channel], log.t)
+        if found is not None and np.isfinite(log[channel][~found.fresh]).any():
+            columns[channel] = np.where(found.fresh, log[channel], np.nan)
+            period = f"{found.period:.3g}"
+            every = f"{period}{dict(zip('23', ('nd', 'rd'), strict=True)).get(period, 'th')} row"
+            every = every if period.isdecimal() else f"{period} rows"
+            sentences.append(f"{experiment.name}: {channel} is new every {every}; what the log repeats does not count")
+    return replace(experiment, trajectory=log.with_columns(columns)) if columns else experiment, sentences
 
 
 def known_runs(experiment: Experiment) -> list[tuple[int, int]]:
@@ -453,14 +469,23 @@ def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters:
         message = f"{shown[0]}, but {about[0]}; subtract the valve's centre in the sidecars of all logs, or of none"
         raise LogError(message)
     rest, most = float(np.median([c.rest for c in shown])), MAX_REST_DISTANCE * shown[0].half
-    found = replace(stated, value=rest, lower=rest - most, upper=rest + most, free=True, source="where the log rests")
+    whole = shown[0]._replace(low=min(c.low for c in shown), high=max(c.high for c in shown))
+    is_unseen = not whole.is_two_way(0.0) and every[element.dead_zone].free
+    value, source = (shown[0].half, UNSEEN_CENTRE) if is_unseen else (rest, "where the log rests")
+    found = replace(stated, value=value, lower=rest - most, upper=rest + most, free=True, source=source)
+    middle = f"{shown[0].half:g} {stated.unit}"
+    fate = f"is taken as {middle}, for the log uses one side of it only" if is_unseen else "is estimated with the rest"
     warnings.warn(
-        f"{shown[0]}: the {element.name} is closed near {shown[0].half:g} {stated.unit}; {name} is estimated with the "
-        f'rest, or state it, centre = "{shown[0].half:g} {stated.unit}", under [{name.partition(".")[0]}]',
+        f"{shown[0]}: the {element.name} is closed near {middle}; {name} {fate}, or state it, "
+        f'centre = "{middle}", under [{name.partition(".")[0]}]',
         PhysicsWarning,
         stacklevel=3,
     )
     return parameters | ParameterSet({name: found})
+
+
+UNSEEN_CENTRE = "the middle of its range: the log uses one side of it only"
+"""Source of a valve's centre that acts only together with its dead zone."""
 
 
 class _Command(NamedTuple):
@@ -475,11 +500,17 @@ class _Command(NamedTuple):
     half: float
 
     def is_counted_from(self, zero: float) -> bool:
-        """Whether the command runs from a voltage to both sides of half the range above it, and rests near there."""
+        """Whether the command runs about half the range above a voltage, and rests near there."""
         low, high, rest = ((v - zero) / self.half for v in (self.low, self.high, self.rest))
         is_within = low >= -RANGE_TOLERANCE and high <= 2 + RANGE_TOLERANCE
-        is_two_way = low < 1 - RANGE_TOLERANCE and high > 1 + RANGE_TOLERANCE
-        return is_within and is_two_way and abs(rest - 1) < MAX_REST_DISTANCE
+        # one way it never comes near the zero, where the valve would have to be closed for the drive to rest
+        is_far = low > 1 - MAX_REST_DISTANCE and high - low > RANGE_TOLERANCE
+        return is_within and (self.is_two_way(zero) or is_far) and abs(rest - 1) < MAX_REST_DISTANCE
+
+    def is_two_way(self, zero: float) -> bool:
+        """Whether the command runs to both sides of half the range above a voltage."""
+        low, high = ((v - zero) / self.half for v in (self.low, self.high))
+        return low < 1 - RANGE_TOLERANCE and high > 1 + RANGE_TOLERANCE
 
     def __str__(self) -> str:
         run = f"runs from {self.low:.3g} to {self.high:.3g} {self.unit}"

@@ -41,6 +41,8 @@ class Verdict(Shown):
         By parameter: why the logs do not identify it, or only roughly, and which run would.
     unchanged : tuple of str
         Parameters that a fit left at their given values.
+    unseen : tuple of str
+        Parameters that act only together with others in all that the logs show: a fit holds them at their given values.
     identification_hints : IdentificationHints
         The model's: which runs would show or separate its parameters.
     """
@@ -50,6 +52,7 @@ class Verdict(Shown):
     reasons: Mapping[str, str]
     unchanged: tuple[str, ...] = ()
     identification_hints: IdentificationHints = field(default_factory=IdentificationHints)
+    unseen: tuple[str, ...] = ()
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -444,8 +447,13 @@ def missing_excitation(
     need = hints.needs.get(_base_name(name))
     if need is None or seen is None:
         return None
-    others = {_base_name(n) for n in free} - {_base_name(name)}
-    return need.lack(seen) if need.confused_with & others or not need.confused_with else None
+    return need.lack(seen) if find_partners(hints, name, free) or not need.confused_with else None
+
+
+def find_partners(hints: IdentificationHints, name: str, free: Sequence[str]) -> tuple[str, ...]:
+    """The free parameters with which one is confused where the logs lack the motion that it needs."""
+    need, own = hints.needs.get(_base_name(name)), _base_name(name)
+    return tuple(n for n in free if need is not None and own != _base_name(n) in need.confused_with)
 
 
 def remedy(hints: IdentificationHints, names: Sequence[str]) -> str:

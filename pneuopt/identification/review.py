@@ -79,8 +79,8 @@ def review_fit(
     if asked := [n for n in unidentifiable if n not in widths]:
         local = _verdict_at(problem, start, result)
         given = problem.unknowns()
-        unchanged = [n for n, v in problem.fixed.items() if v == given.value(n)]
-        verdict = add_unidentifiable(verdict, asked, local, [n for n in unchanged if n in asked])
+        unchanged = [n for n in asked if problem.fixed.get(n) == given.value(n) and n not in problem.unseen]
+        verdict = add_unidentifiable(verdict, asked, local, unchanged)
     unknown = {*unidentifiable, *verdict.unidentifiable}
     estimates = _blank_intervals(result.estimates, unknown)
     for name, found in profiles.items():

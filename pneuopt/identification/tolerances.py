@@ -122,7 +122,6 @@ MIN_LOGS = 4  # from which a drift is tested: three leave one degree of freedom,
 
 # Widths
 
-MAX_TRIAL_SAMPLES = 8000  # of all logs
 WIDTH_RANGE = 30.0  # [1] start of a width over its least: less keeps friction from sticking, more integrates slowly
 
 # Windows

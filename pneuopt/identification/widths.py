@@ -32,7 +32,7 @@ def free_widths(problem: EstimationProblem) -> EstimationProblem:
         value = width.start or given.value(name)
         lower = max(given[name].lower, value / WIDTH_RANGE)
         edits[name] = replace(given[name], value=value, lower=lower, free=True, log=True, source=ESTIMATED_WIDTH)
-    return replace(problem, parameters=given | ParameterSet(edits))
+    return replace(problem, parameters=given | ParameterSet(edits)) if edits else problem
 
 
 def estimated_widths(parameters: ParameterSet) -> list[str]:

@@ -98,8 +98,12 @@ def find_columns(
         found["time"] = ChannelColumn(next(iter(table.stamps)), 1.0, 0.0)
         remarks.append(f"the time stamps of column {found['time'].name!r} are read as the time")
     require("time" in found, f'{table.path}: no time; name a column "time [s]", or say which in a sidecar', LogError)
-    require(len(found) > 1, f"{table.path}: no channel but time; known: {', '.join(channels)}", LogError)
+    known = f"{table.path}: no channel but time; known: {', '.join(channels)}"
+    require(len(found) > 1, known + (f"; {OTHER_PLANT}" if channels == CHANNELS else ""), LogError)
     return found, tuple(remarks)
+
+
+OTHER_PLANT = "for a rotary drive, or another plant with channels of its own: read_log(path, plant=drive.system())"
 
 
 class ChannelColumn(NamedTuple):
@@ -139,7 +143,10 @@ def _columns_from_names(
             column = _resolve_column(table, channel, name, where, channels)
         except (LogError, UnitError) as error:
             if not entries:
-                remedy = "" if isinstance(error, LogError) else " (or list the columns to use in a sidecar)"
+                listed = "or list the columns to use in a sidecar" + (
+                    f"; {OTHER_PLANT}" if channels == CHANNELS else ""
+                )
+                remedy = "" if isinstance(error, LogError) else f" ({listed})"
                 raise type(error)(f"{error}{remedy}") from None
             remarks.append(f"{str(error).removeprefix(f'{table.path}: ')}; it is not read")
             continue

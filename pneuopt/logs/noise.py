@@ -15,12 +15,14 @@ from pneuopt.logs.tolerances import (
     BLOCK,
     LATTICE_TOLERANCE,
     MAX_CORRELATION,
+    MAX_OFF_PERIOD,
+    MIN_SAMPLES,
     MIN_VARIED_SHARE,
     ORDERS,
     ROUNDING,
     WHITE_LAGS,
 )
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Mask
 
 
 class NoiseEstimate(NamedTuple):
@@ -65,7 +67,8 @@ def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstima
     resolution = find_resolution(y[known])
     # a lattice leaves medians on its steps; a uniform dither of its step takes them off, and its variance is known
     dithered = y + resolution * (np.random.default_rng(0).random(y.size) - 0.5)
-    levels = _levels(time, dithered) or _levels(time[known], dithered[known])  # every other sample may be missing
+    # a slow sensor has no neighbours, or too few of them for high orders
+    levels = max(_levels(time, dithered), _levels(time[known], dithered[known]), key=len)
     least = min(level.value for level in levels)
     chosen = next(level for level in levels if level.value <= (1 + level.uncertainty) * least)
     random = math.sqrt(max(chosen.value**2 - resolution**2 / 12, 0.0))
@@ -109,9 +112,59 @@ def find_resolution(values: ArrayLike, bins: int = 50, candidates: int = 6) -> f
     return max([decimals, *(_fit_lattice(values, step, written) for step in steps if step > 4 * decimals)])
 
 
+class Refresh(NamedTuple):
+    """When a sensor that is slower than its log has a new value."""
+
+    period: float  # [rows] from one to the next
+    fresh: Mask  # the rows with a new value, shape (n,)
+
+
+def find_refresh(column: ArrayLike, t: ArrayLike | None = None) -> Refresh | None:
+    """The rows at which a sensor slower than its log is new, from a channel (n,); None where it keeps up.
+
+    A slow sensor changes at multiples of its period only, by a count or by many; an encoder that stands or creeps
+    changes at any row, by one count. `t` [s] if rows are missing.
+
+    Examples
+    --------
+    >>> find_refresh(np.repeat(np.sqrt(np.arange(30.0)), 4)).period
+    4.0
+    """
+    y = np.asarray(column, dtype=float)
+    stamps = np.arange(y.size, dtype=float) if t is None else np.asarray(t, dtype=float)
+    rows = np.round((stamps - stamps[0]) / max(float(np.median(np.diff(stamps))), 1e-300))
+    known = np.flatnonzero(np.isfinite(y))
+    jumps = np.diff(y[known])
+    moved = known[1:][(jumps != 0) & (np.diff(rows[known]) == 1)]  # across a lost row nobody knows when it was
+    sizes = np.abs(jumps[jumps != 0])
+    if moved.size < 2 * MIN_SAMPLES or sizes.max() < 1.5 * sizes.min():  # the same count each time: a slow motion
+        return None
+    period, phase = _refresh_period(rows[moved])
+    is_new = np.asarray((rows - phase) % period < 1)
+    off, by_chance = float(np.count_nonzero(~is_new[moved])), moved.size * (1 - 1 / period)
+    return Refresh(period, is_new) if off <= MAX_OFF_PERIOD * by_chance and by_chance > MIN_SAMPLES else None
+
+
+def _refresh_period(at: Array) -> tuple[float, float]:
+    """The period [rows] on whose multiples the numbers of the rows that change lie, and its phase: in [phase, +1)."""
+    gaps, (sizes, counts) = np.diff(at), np.unique(np.diff(at), return_counts=True)
+    usual = sizes[np.argmax(counts)]
+    period = float(gaps[np.abs(gaps - usual) <= 1].mean())
+    for reach in (8.0, 64.0, 512.0, math.inf):  # a long rest is numbered once the period is known so well
+        count = np.concatenate([[0.0], np.cumsum(np.round(gaps / period))])
+        part = np.concatenate([[0], np.cumsum(gaps > reach * usual)])
+        number = np.bincount(part)
+        off, spread = (y - (np.bincount(part, y) / number)[part] for y in (at, count))
+        period = float(off @ spread / (spread @ spread)) if spread.any() else period
+    period = round(period) if abs(period - round(period)) * count[-1] < 0.5 else period
+    low, high = np.quantile(at - period * count, [0.005, 0.995])
+    return max(period, 1.0), float(low + high - 1) / 2
+
+
 def _last_digit(values: Array, most: int = 12) -> float:
     """The last digit of the largest value, where all are written with as many significant digits; else 0."""
-    sizes = np.abs(values[values != 0])
+    sizes = np.abs(values)
+    sizes = sizes[sizes > ROUNDING * sizes.max()]
     places = np.floor(np.log10(sizes)).astype(int)
     for digits in range(3, most):
         scaled = sizes * 10.0 ** (digits - 1 - places)

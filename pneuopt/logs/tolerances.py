@@ -29,6 +29,7 @@ BLOCK = 100  # differences of a block: shorter ones have uncertain levels, longe
 WHITE_LAGS = 20  # [samples] at which white noise is uncorrelated: with one, motion at a quarter of the rate looks white
 MAX_CORRELATION = 0.2  # of differences at these lags, above which they are motion or hum: lower blames filtered noise
 MIN_VARIED_SHARE = 0.01  # of the samples where a sensor's steps change: fewer are a motion at one speed
+MAX_OFF_PERIOD = 0.02  # of the changes that chance puts off a slow sensor's rows: less misses one that slips
 LATTICE_TOLERANCE = 0.02  # distance from a resolution's lattice, in its steps: rounded decimals lie nearer
 ROUNDING = 1e-12  # share of the largest value that is rounding of doubles: above, fine steps are missed
 

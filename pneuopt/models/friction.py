@@ -117,7 +117,7 @@ def lacks_directions(seen: LoggedMotion) -> Lack | None:
     """Lack of the motion in both directions that asymmetric or constant forces need, if any."""
     if min(seen.forward, 1 - seen.forward) < MIN_DIRECTION_SHARE:
         way = "forwards" if seen.forward > 0.5 else "backwards"
-        return Lack(f"the drive moves {way} only", "log both directions")
+        return Lack(f"the drive moves {way} only", "log both directions", is_strict=True)
     return None
 
 

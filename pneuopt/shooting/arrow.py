@@ -36,7 +36,7 @@ class ReducedEquations:
         moved = np.zeros(len(keep))
         try:
             if keep.any():
-                scaled, scale = _unit_diagonal(self.schur[np.ix_(keep, keep)])
+                scaled, scale = unit_diagonal(self.schur[np.ix_(keep, keep)])
                 factor = cho_factor(scaled, check_finite=False)
                 moved[keep] = scale * cho_solve(factor, scale * -self.gradient[keep], check_finite=False)
         except LinAlgError:
@@ -126,7 +126,7 @@ class ArrowEquations:
 
 def positive_definite_inverse(matrix: Array) -> Array:
     """Inverse of a positive definite matrix, whatever the units of its rows."""
-    scaled, scale = _unit_diagonal(matrix)
+    scaled, scale = unit_diagonal(matrix)
     return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale))
 
 
@@ -141,7 +141,7 @@ def indistinguishable_parameters(schur: Array, corner: Array) -> Indices:
     lost = np.flatnonzero(~(left > SCHUR_ROUNDING))
     if lost.size or not np.isfinite(schur).all():
         return lost if lost.size else np.arange(len(schur))
-    values, vectors = np.linalg.eigh(_unit_diagonal(schur)[0])
+    values, vectors = np.linalg.eigh(unit_diagonal(schur)[0])
     if values[0] > max(RANK_TOLERANCE, SCHUR_ROUNDING / float(left.min())):
         return np.arange(0)
     weakest = np.abs(vectors[:, 0])
@@ -150,7 +150,7 @@ def indistinguishable_parameters(schur: Array, corner: Array) -> Indices:
     return members[np.argsort(severity[members], kind="stable")]
 
 
-def _unit_diagonal(matrix: Array) -> tuple[Array, Array]:
+def unit_diagonal(matrix: Array) -> tuple[Array, Array]:
     """The matrix scaled to unit diagonal, so that units do not decide its rank, and the scales."""
     with np.errstate(over="ignore", invalid="ignore"):
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))

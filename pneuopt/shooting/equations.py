@@ -16,6 +16,7 @@ from pneuopt.shooting.arrow import (
     ReducedEquations,
     indistinguishable_parameters,
     positive_definite_inverse,
+    unit_diagonal,
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments
 from pneuopt.shooting.tolerances import (
@@ -26,6 +27,7 @@ from pneuopt.shooting.tolerances import (
     MIN_LOCAL_EXCESS,
     MIN_LOG_INFORMATION,
     MIN_OVERSHOOTING_NODES,
+    RANK_TOLERANCE,
     SCHUR_ROUNDING,
     START_PRIOR_DEVIATION,
     WEAK_PRIOR_DEVIATION,
@@ -112,16 +114,39 @@ class NormalEquations:
             return None
         bread = positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])
         out = np.full((len(keep), len(keep)), np.nan)
-        out[np.ix_(keep, keep)] = bread
-        if not noisy_gaps:
-            n, meat = self.gaps.shape[1], np.zeros_like(reduced.schur)  # of the data alone, the nodes following
-            for rows, columns, unknowns in self.segments.blocks:
-                E = np.zeros((rows.stop - rows.start, self.linearisation.end_sensitivities.shape[2], len(meat)))
-                E[:, :n] = -reduced.node_sensitivity[rows]
-                E[:, n + columns, unknowns] = self.linearisation.chain[unknowns]
-                meat += np.tensordot(E, self.linearisation.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
-            out[np.ix_(keep, keep)] = bread @ meat[np.ix_(keep, keep)] @ bread
+        out[np.ix_(keep, keep)] = bread if noisy_gaps else bread @ self._meat(reduced)[np.ix_(keep, keep)] @ bread
         return np.asarray(out * np.outer(self.linearisation.chain, self.linearisation.chain))
+
+    def _meat(self, reduced: ReducedEquations) -> Array:
+        """The information (k, k) of the data alone, with the nodes following the parameters."""
+        n, meat = self.gaps.shape[1], np.zeros_like(reduced.schur)
+        for rows, columns, unknowns in self.segments.blocks:
+            E = np.zeros((rows.stop - rows.start, self.linearisation.end_sensitivities.shape[2], len(meat)))
+            E[:, :n] = -reduced.node_sensitivity[rows]
+            E[:, n + columns, unknowns] = self.linearisation.chain[unknowns]
+            meat += np.tensordot(E, self.linearisation.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
+        return meat
+
+    def root_information(self) -> Array:
+        """A root R (k, k) of the information R'R in the searched parameters that `covariance` inverts; NaN: none.
+
+        A direction that rounding hides keeps the information of that rounding, so that no other loses its own.
+        """
+        reduced = self.arrow.eliminate(0.0)
+        if reduced is None or not np.isfinite(reduced.schur).all():
+            return np.full_like(self.arrow.corner, np.nan)
+        left = np.diag(reduced.schur) / np.maximum(np.diag(self.arrow.corner), 1e-300)
+        seen = np.flatnonzero(left > SCHUR_ROUNDING)
+        scaled, scale = unit_diagonal(reduced.schur[np.ix_(seen, seen)])
+        least = max(RANK_TOLERANCE, SCHUR_ROUNDING / float(left[seen].min(initial=1.0)))
+        values, vectors = np.linalg.eigh(scaled)
+        hidden, whole = (
+            (vectors * v) @ vectors.T for v in (np.maximum(least - values, 0.0), np.maximum(values, least))
+        )
+        sizes, axes = np.linalg.eigh(self._meat(reduced)[np.ix_(seen, seen)] * np.outer(scale, scale) + hidden)
+        root = np.zeros_like(self.arrow.corner)
+        root[: seen.size, seen] = (axes / np.sqrt(np.maximum(sizes, least))).T @ whole / scale
+        return root
 
     def prior_covariance(self, keep: Mask, fixed: Mask, prior: Array) -> Array | None:
         """Covariance (k, k), own units, that the kept parameters take over from a prior of the fixed ones; or None.

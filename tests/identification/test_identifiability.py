@@ -15,10 +15,9 @@ from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.files.toml import read_toml
 from pneuopt.identification import identify as identify_module
 from pneuopt.identification.identifiability import (
-    _log_root_information,
     axis_from_model,
     examine_logs,
-    foresee_unidentifiable,
+    hold_unseen,
     identifiability,
     pose_problem,
     prior_dominated,
@@ -29,7 +28,7 @@ from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive, MotionDrive, RotaryDrive
-from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck
+from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
@@ -38,8 +37,8 @@ from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarni
 from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares, Stage
-from pneuopt.shooting.segments import segment, start_nodes
+from pneuopt.shooting.least_squares import LeastSquares, Stage, start_search
+from pneuopt.shooting.segments import segment
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 from tests.logs.bad_logs import BAD_LOGS
 
@@ -76,7 +75,7 @@ def test_what_a_rich_log_identifies_is_foreseen() -> None:
     assert verdict.unidentifiable == ()
     assert verdict.indistinguishable == ()
     assert set(result.estimates["mark"]) == {Mark.EXACT}  # one seed in twelve widens them by chance
-    ratio = verdict.table["stderr"] / result.estimates["stderr"]
+    ratio = verdict.table["stderr"] / result.estimates["stderr"][list(free.free_names)]
     assert ratio.between(0.8, 1.25).all(), ratio
     assert (verdict.table["inflation"] >= 1).all()
     assert (result.estimates["note"] == "").all()
@@ -186,7 +185,7 @@ def swinging_log(force: Array, first: int = 0) -> Experiment:
 
 
 def foreseen(run: Experiment, *free: str) -> tuple[str, ...]:
-    return foresee_unidentifiable(pose_problem(DRIVE, run, DRIVE.parameters.freed(*free), LeastSquares()))
+    return hold_unseen(pose_problem(DRIVE, run, DRIVE.parameters.freed(*free), LeastSquares()))[1]
 
 
 def test_nothing_is_said_of_a_log_that_shows_all() -> None:
@@ -195,28 +194,13 @@ def test_nothing_is_said_of_a_log_that_shows_all() -> None:
 
 def test_a_log_that_moves_one_way_does_not_tell_friction_from_a_constant_force() -> None:
     said = foreseen(swinging_log(ONE_WAY, 100), "friction.coulomb", "friction.viscous", "load.mass", "load.force")
-    lack = "before the search: the logs do not identify load.force: the drive moves forwards only; log both directions"
-    assert said == (lack,)
-
-
-def test_a_log_that_never_slides_slowly_does_not_tell_static_friction() -> None:
-    said = foreseen(swinging_log(ONE_WAY, 100), *LEVELS)
-    assert any("friction.static" in sentence for sentence in said)
-    assert all("slower than the Stribeck velocity" in s or "where friction is one level" in s for s in said), said
-    assert not any("friction.coulomb" in sentence.partition(": the logs do not identify")[2] for sentence in said)
+    together = "the drive moves forwards only, so that it acts only together with friction.coulomb; log both directions"
+    assert said == (f"before the search: the logs do not identify load.force: {together}",)
 
 
 def test_what_is_known_is_not_doubted() -> None:
     """One way, too, Coulomb friction and mass are identified where no constant force is free."""
     assert foreseen(swinging_log(ONE_WAY, 100), "friction.coulomb", "load.mass") == ()
-
-
-def test_a_static_map_is_fitted_as_soon_as_it_is_doubted() -> None:
-    rig = MotionDrive(Stribeck(), chamber=False)
-    speed = np.full(100, 0.3)
-    force = 50 + 0.5 * np.random.default_rng(0).standard_normal(100)
-    run = Experiment(Trajectory(SWING_TIME[:100], {"speed": speed, "force": force}), {"force": 0.5}, accept=("motion",))
-    assert foresee_unidentifiable(pose_problem(rig, run, rig.parameters.freed(*LEVELS), LeastSquares())) == ()
 
 
 def test_identify_warns_before_it_searches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,12 +232,9 @@ def test_the_information_about_a_rate_counts_whether_the_start_is_known(known: b
     phase = Phase("log", t, np.full(N, H), np.zeros((N, 1)), regular_nodes(N, 8), start, guess=guess)
     residuals = Residuals(0, ("x",), guess, np.array([NOISE]))
     segments = segment(Transcription(system, system.parameters, (phase,), (residuals,)))
-    run = segments.run(start_nodes(segments), np.array([RATE]), 1, sensitivities=True)
-    assert run.dy is not None
-    assert run.dx_end is not None
-    root = _log_root_information(segments, run.dy / NOISE, run.dx_end, 0, np.ones(1))
+    root = start_search(segments, LeastSquares(stages=(Stage(1e-5, 1),))).iterate.equations.root_information()
     expected = np.sum(t**2) if known else np.sum((t - t.mean()) ** 2)
-    assert_allclose(root.T @ root, [[expected / NOISE**2]], rtol=1e-9)
+    assert_allclose(root.T @ root, [[expected / NOISE**2]], rtol=1e-5)  # gaps of 1e-5 give way a little
 
 
 BRISTLE_FILE = """
@@ -468,3 +449,94 @@ def test_a_stated_mass_is_held_against_the_log_and_a_free_one_is_not() -> None:
     found = float(finding.message.split("those of ")[1].split(" kg")[0])
     assert found == pytest.approx(5 / (0.3 * 2 * np.pi), rel=0.06)
     assert examine_logs(drive, log, stated.freed("load.mass")) == ()
+
+
+PUSHES = 60 * np.sin(2 * np.pi * 1.3 * SWING_TIME) + 40 * np.sin(2 * np.pi * 3.1 * SWING_TIME)
+
+
+def drawn_axes(count: int) -> list[tuple[str, ParameterSet, Experiment]]:
+    """Axes whose parameters are drawn, their widths too and not stated, pushed to and fro; given values 30 % off."""
+    out, rng = list[tuple[str, ParameterSet, Experiment]](), np.random.default_rng(38)
+    for k in range(count):
+        drive = ForceDrive(Coulomb() if k % 2 else Stribeck())
+        free = ["load.mass", "load.force", "friction.coulomb", "friction.viscous"]
+        values = {n: v * math.exp(0.5 * rng.standard_normal()) for n, v in zip(free, (5, 4, 25, 60), strict=True)}
+        values["friction.smoothing"] = 10 ** rng.uniform(-3.5, -2.7)
+        if not k % 2:
+            values |= {"friction.static": 1.5 * values["friction.coulomb"], "friction.stribeck_velocity": 0.02}
+            free += ["friction.static", "friction.stribeck_velocity"]
+        truth = drive.parameters.with_values(values)
+        force = PUSHES * (1 + values["friction.coulomb"] / 30)
+        held = {"force": Intersample.HELD}
+        run = simulate(drive.system(), Trajectory(SWING_TIME, {"force": force}), truth, intersample=held)
+        noisy = run["position"] + 1e-5 * rng.standard_normal(SWING_TIME.size)
+        log = Experiment(Trajectory(SWING_TIME, {"force": force, "position": noisy}), name=f"axis {k}")
+        given = drive.parameters.with_values({n: truth.value(n) * rng.choice([0.7, 1.3]) for n in free}).freed(*free)
+        out.append((type(drive.friction).__name__, given, log.with_intersample(held)))
+    return out
+
+
+@pytest.mark.parametrize(("law", "given", "log"), drawn_axes(6), ids=lambda v: v if isinstance(v, str) else "")
+def test_the_deviations_that_are_foreseen_are_those_of_the_fit(law: str, given: ParameterSet, log: Experiment) -> None:
+    """Within a factor of two; of ten for a Stribeck curve, at which the start has only guessed."""
+    drive = ForceDrive(Coulomb() if law == "Coulomb" else Stribeck())
+    fit = identify(drive, log, given)
+    table = identifiability(drive, log, given).table
+    assert list(table.index) == list(given.free_names)  # nobody asks for widths
+    noise = math.sqrt(max(1.0, fit.stats["chi_square_ratio"]) * fit.stats["variance_inflation"])
+    ratio = noise * table["stderr"] / fit.estimates["stderr"][list(given.free_names)]
+    curve = ratio.index.isin(["friction.static", "friction.stribeck_velocity"])
+    assert ratio[~curve].between(0.5, 2).all(), ratio
+    assert ratio[curve].between(0.1, 10).all(), ratio
+
+
+def test_a_drive_that_moves_one_way_keeps_its_load_and_gives_no_friction() -> None:
+    """Once all were "exact": a model that rounds stiction creeps at rest, and that told both apart."""
+    given = DRIVE.parameters.freed("load.mass", "load.force", "friction.coulomb", "friction.viscous")
+    with pytest.warns(PhysicsWarning, match=r"load\.force: .* acts only together with friction\.coulomb"):
+        fit = identify(DRIVE, swinging_log(ONE_WAY, 100), given.with_values({"load.force": 3.0}))
+    assert fit.verdict is not None
+    assert set(fit.verdict.unidentifiable) == {"load.force", "friction.coulomb"}
+    assert fit.parameters.value("load.force") == 3.0
+    # what was simulated without a load holds together with the one that is held
+    together = fit.parameters.value("friction.coulomb") + 3.0
+    assert together == pytest.approx(DRIVE.parameters.value("friction.coulomb"), rel=0.05)
+    for name in ("load.mass", "friction.viscous"):
+        shift = abs(fit.estimates["value"][name] - DRIVE.parameters.value(name))
+        assert shift < 4 * fit.estimates["stderr"][name]
+    assert "the logs do not identify friction.coulomb: it acts only together with load.force" in str(fit.verdict)
+
+
+def seal_log(*pressures: float, seed: int = 7) -> Experiment:
+    """A seal moved to and fro at pressures that a regulator holds to 0.5 %; friction rises with pressure by 8 N/MPa.
+
+    Its force strays by a slow tenth of a newton, as no model follows.
+    """
+    rng, t = np.random.default_rng(seed), np.arange(0, 12, 1e-2)
+    speed = 0.02 * np.sin(2 * np.pi * 0.5 * t)
+    level = np.repeat(np.asarray(pressures), math.ceil(t.size / len(pressures)))[: t.size]
+    pressure = 1.01325e5 + level * (1 + 5e-3 * np.sin(2 * np.pi * 0.5 * t))
+    stray = 0.1 * np.sin(2 * np.pi * 0.13 * t) * np.sign(speed)
+    force = 3.0 * np.tanh(speed / 1e-3) + 8e-6 * level * np.sign(speed) + 40 * speed + stray
+    columns = {"speed": speed, "pressure_a": pressure, "force": force + 0.05 * rng.standard_normal(t.size)}
+    return Experiment(Trajectory(t, columns), name="seal")
+
+
+def test_a_slope_over_a_pressure_that_hardly_changes_is_held_in_words() -> None:
+    """Once a measured seal at one pressure was given 441.8 [357, 526] N of friction, where 8.6 N was right."""
+    rig = MotionDrive(PressureDependent(Coulomb(), chambers=("pressure_a",)), chamber=False)
+    free = rig.parameters.freed("friction.coulomb", "friction.coulomb_pressure_a", "friction.viscous")
+    verdict = identifiability(rig, seal_log(5e5), free)
+    assert set(verdict.unidentifiable) == {"friction.coulomb", "friction.coulomb_pressure_a"}
+    words = (
+        "pressure_a stays near 6.01 bar(a), so that it acts only together with friction.coulomb; fix it, or log other"
+    )
+    assert words in verdict.reasons["friction.coulomb_pressure_a"]
+    with pytest.warns(PhysicsWarning, match="pressure_a stays near"):
+        fit = identify(rig, seal_log(5e5), free)
+    assert math.isnan(fit.estimates["value"]["friction.coulomb_pressure_a"])
+    assert fit.parameters.value("friction.coulomb") == pytest.approx(3.0 + 8e-6 * 5e5, rel=0.1)  # at that pressure
+    several = seal_log(1e5, 4e5, 7e5)
+    assert identifiability(rig, several, free).unidentifiable == ()
+    slope = identify(rig, several, free).estimates.loc["friction.coulomb_pressure_a"]
+    assert slope["value"] == pytest.approx(8e-6, rel=0.1)

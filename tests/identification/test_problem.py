@@ -23,6 +23,7 @@ from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.losses import Huber
 from pneuopt.identification.problem import (
+    UNSEEN_CENTRE,
     EstimationProblem,
     check_logs,
     find_centre,
@@ -413,6 +414,34 @@ def test_another_command_leaves_the_centre_as_it_is(centre: float, rest: float, 
         assert found(logged_command(centre, rest, swing)) is GIVEN
 
 
+def one_sided(centre: float) -> po.Experiment:
+    """A piston that moves forwards only: its command stays above the valve's middle."""
+    log = logged_command(centre, rest=0.3, swing=0.0)
+    t = log.trajectory.t
+    push = 0.4 * np.maximum(np.sin(10 * t), 0.0) + 0.3
+    position = 0.05 + np.cumsum(np.maximum(np.sin(10 * t), 0.0)) * 2e-3 * 0.1
+    columns = {"valve_voltage": centre + push, "position": position + 1e-6 * np.sin(1e3 * t)}
+    return replace(log, trajectory=log.trajectory.with_columns(columns))
+
+
+def test_a_command_on_one_side_of_5_V_takes_the_middle_and_says_so() -> None:
+    """A valve that closes at 0 V is open all the while there; with 5 V the conductance once 14 times off was right."""
+    words = (
+        "run: valve_voltage runs from 5.3 to 5.7 V and rests at 5.3 V: .* is taken as 5 V, for the log uses one side"
+    )
+    with pytest.warns(po.PhysicsWarning, match=words):
+        centre = found(one_sided(5.0), given=GIVEN.freed("valve.dead_zone"))[CENTRE]
+    assert (centre.free, centre.value, centre.source) == (True, 5.0, UNSEEN_CENTRE)
+    with pytest.warns(po.PhysicsWarning, match="is estimated with the rest"):  # the known dead zone tells it
+        assert found(one_sided(5.0))[CENTRE].value == pytest.approx(5.3)
+    both = one_sided(5.0), logged_command(5.0, name="other")  # which uses both sides
+    with pytest.warns(po.PhysicsWarning, match="is estimated with the rest"):
+        assert found(*both, given=GIVEN.freed("valve.dead_zone"))[CENTRE].source != UNSEEN_CENTRE
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert found(one_sided(0.0)) is GIVEN
+
+
 def test_a_stated_centre_is_kept_of_a_drive_and_of_a_log() -> None:
     given = GIVEN.with_values({CENTRE: 5.1})
     with warnings.catch_warnings():
@@ -499,3 +528,49 @@ def test_a_search_starts_at_the_centre_that_the_pressures_show() -> None:
     assert start[CENTRE] == pytest.approx(5.06, abs=0.02)
     assert start["valve.conductance"] == pytest.approx(truth.value("valve.conductance"), rel=0.2)
     assert list(system.log_warnings(logs)) == []
+
+
+def test_a_sensor_slower_than_its_log_counts_where_it_is_new() -> None:
+    """Repeated values once made the noise 3.3e-7 for .05, and a stated noise a doubt; inputs keep all their rows."""
+    t = np.arange(0, 4, 1e-3)
+    force, rng = 40 * np.sin(6 * t) + 25 * np.sin(17 * t), np.random.default_rng(2)
+    truth = DRIVE.parameters.with_values({"load.mass": 4.0, "friction.viscous": 30.0})
+    run = simulate(DRIVE.system(), Trajectory(t, {"force": force}), truth, intersample={"force": Intersample.LINEAR})
+    sampled = run["position"] + 1e-4 * rng.standard_normal(t.size)
+    held = sampled[np.maximum(5 * ((np.arange(t.size) - 3) // 5) + 3, 0)]
+    log = Experiment(Trajectory(t, {"force": force, "position": held}), name="slow")
+    (checked,) = check_logs(DRIVE.system(), log, truth)
+    known = np.flatnonzero(np.isfinite(checked.trajectory["position"]))
+    assert set(known % 5) == {3}
+    assert np.isfinite(checked.trajectory["force"]).all()
+    assert checked.noise["position"] == pytest.approx(1e-4, rel=0.1)
+    sentence = "slow: position is new every 5th row; what the log repeats does not count"
+    assert log_remarks(DRIVE.system(), [log], [checked]) == (sentence,)
+    stated = log.with_noise({"position": 1e-4})
+    assert log_remarks(DRIVE.system(), [stated], check_logs(DRIVE.system(), stated, truth)) == (sentence,)
+    assert log_remarks(DRIVE.system(), [checked], [checked]) == ()  # nothing is left that repeats
+    fit = identify(DRIVE, log, DRIVE.parameters.freed("load.mass", "friction.viscous"))
+    for name in ("load.mass", "friction.viscous"):
+        assert abs(fit.parameters.value(name) - truth.value(name)) < 4 * fit.estimates["stderr"][name]
+    assert sentence in str(fit.status)
+
+
+def test_a_valve_used_on_one_side_gives_all_but_its_middle_and_dead_zone() -> None:
+    """Of a valve of 0 to 10 V that opens one way: 14 times off, "converged", with the middle at 0 V."""
+    drive = po.PneumaticDrive(po.ProportionalValve(spool=po.Spool.RIGID), po.Viscous())
+    truth = drive.parameters.with_values({CENTRE: 5.1, "valve.dead_zone": 0.06, "valve.rounding": 3e-3})
+    t = np.arange(700) * 2e-3
+    push = 5.1 + 0.15 + 0.6 * np.maximum(np.sin(9 * t), 0) * (1 + 0.3 * np.sin(2.3 * t))
+    run = simulate(drive.system(), Trajectory(t, {"valve_voltage": push}), truth, initial={"position": 0.02})
+    rng = np.random.default_rng(3)
+    noise = {"position": 1e-5, "pressure_a": 300.0, "pressure_b": 300.0}
+    measured = {n: run[n] + sigma * rng.standard_normal(t.size) for n, sigma in noise.items()}
+    log = Experiment(Trajectory(t, {"valve_voltage": push, **measured}), noise, name="one way")
+    free = drive.parameters.freed("valve.conductance", "valve.dead_zone", "friction.viscous")
+    said = pytest.warns(PhysicsWarning, match="is taken as 5 V")
+    with said, pytest.warns(PhysicsWarning, match="on one side of the valve's middle"):
+        fit = identify(drive, log, free)
+    assert fit.verdict is not None
+    assert set(fit.verdict.unidentifiable) == {CENTRE, "valve.dead_zone"}
+    for name in ("valve.conductance", "friction.viscous"):
+        assert fit.parameters.value(name) == pytest.approx(truth.value(name), rel=0.02)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import pneuopt as po
-from pneuopt.identification.identifiability import excerpts
 from pneuopt.identification.problem import EstimationProblem, check_logs
-from pneuopt.identification.tolerances import MAX_TRIAL_SAMPLES, WIDTH_RANGE
+from pneuopt.identification.tolerances import WIDTH_RANGE
 from pneuopt.identification.widths import ESTIMATED_WIDTH, estimated_widths, free_widths, sticking_covariance
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 
@@ -147,22 +146,3 @@ def test_nobody_is_told_that_a_width_is_unidentifiable() -> None:
     assert fit.verdict.unidentifiable == ()
     assert fit.estimates["mark"][WIDTH] == po.Mark.UNIDENTIFIABLE
     assert WIDTH not in str(fit.status)
-
-
-def test_long_logs_are_tried_in_stretches() -> None:
-    t = np.arange(100_000) * 1e-3
-    log = po.Experiment(po.Trajectory(t, {"force": t, "position": t}), name="long")
-    parts = excerpts([log])
-    assert sum(len(e.trajectory) for e in parts) <= MAX_TRIAL_SAMPLES
-    assert [round(e.trajectory.t[0]) for e in parts] == [0, 25, 50, 75]
-    assert excerpts(parts) == parts
-
-
-def test_a_stretch_has_the_holes_that_lie_in_it() -> None:
-    """A hole of the whole log at the stretch's own count of samples would let the model stand still there."""
-    t = np.arange(20_000) * 1e-3
-    holes = ((700, 900), (5500, 5500), (6900, 7400), (10_000, 15_000), (15_500, 15_900))
-    log = po.Experiment(po.Trajectory(t, {"force": t, "position": t}), name="long", holes=holes)
-    parts = excerpts([log])
-    assert [round(e.trajectory.t[0]) for e in parts] == [0, 5, 15]  # nothing is known of the third
-    assert [e.holes for e in parts] == [((700, 900),), ((500, 500), (1900, 2000)), ((500, 900),)]

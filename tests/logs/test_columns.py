@@ -12,8 +12,10 @@ import pytest
 from pneuopt.logs.columns import CHANNELS, ColumnGuess, LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.foreign import parse_log
 from pneuopt.logs.read_log import read_log
+from pneuopt.models.drives import RotaryDrive
+from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import LogError, UnitError
+from pneuopt.quantities.errors import InputError, LogError, UnitError
 from pneuopt.quantities.parameters import Quantity
 
 
@@ -213,3 +215,13 @@ def test_names_of_other_loggers_are_known() -> None:
         "supply_pressure": ["Supply Pressure"],
         "position_reference": ["Setpoint Position"],
     }
+
+
+@pytest.mark.parametrize("names", ["torque [N*m],speed [rad/s]", "torque [N*m],angle [rad]"])
+def test_a_rotary_log_without_its_plant_is_refused_with_the_cure(names: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(f"time [s],{names}\n" + "".join(f"{k / 100},{k},{k}\n" for k in range(20)), "utf-8")
+    with pytest.raises(InputError, match=r"read_log\(path, plant=drive\.system\(\)\)"):
+        read_log(path)
+    log = read_log(path, plant=RotaryDrive(Coulomb()).system())
+    assert "torque" in log.trajectory

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pneuopt.logs.noise import estimate_noise, find_resolution, noise_level
+from pneuopt.logs.noise import estimate_noise, find_refresh, find_resolution, noise_level
 from pneuopt.quantities.arrays import Array
 
 FACTOR = 1.6  # of the level, either way, for logs of 1000 samples and more; a shorter one may be off by `SHORT_FACTOR`
@@ -183,3 +183,58 @@ def test_every_other_sample_may_be_missing() -> None:
 @pytest.mark.parametrize("column", [[1.0] * 10, [math.nan] * 10, [2.0], []])
 def test_a_constant_channel_shows_no_noise(column: list[float]) -> None:
     assert math.isnan(noise_level(column))
+
+
+def held(y: Array, period: float, first: float = 0.0) -> Array:
+    """A channel as a sensor gives it that is new every so many rows, whole or not; the log repeats what it had."""
+    new = (np.arange(y.size) - first) % period < 1
+    return np.asarray(y[np.maximum.accumulate(np.where(new, np.arange(y.size), 0))])
+
+
+def test_a_sensor_slower_than_its_log_is_known_by_the_rows_that_change() -> None:
+    """Whole and broken ratios of both rates, with its noise finer or coarser than its step, dwells, lost rows."""
+    rng, t = np.random.default_rng(3), np.linspace(0, 8, 8000)
+    y = 0.05 * np.clip(np.sin(3 * t), -0.8, 0.8) + 1e-5 * rng.standard_normal(t.size)
+    for step in (0.0, 1e-4):
+        fine = np.round(y / step) * step if step else y
+        for period, first in ((2.0, 0), (4.0, 3), (5.0, 2), (10.0, 7), (10 / 3, 1), (2.5, 0), (4.0007, 2)):
+            column = held(fine, period, first)
+            found = find_refresh(column)
+            assert found is not None, (step, period)
+            assert found.period == pytest.approx(period, rel=1e-3)
+            changed = np.flatnonzero(np.diff(column)) + 1
+            assert found.fresh[changed].mean() > 0.999  # nothing that is new is left out
+            assert found.fresh.mean() == pytest.approx(1 / period, rel=0.01)
+    column = held(y, 5.0, 2)
+    column[rng.random(t.size) < 0.01] = math.nan
+    found, lost = find_refresh(column), rng.random(t.size) > 0.02
+    assert found is not None
+    assert found.period == 5
+    found = find_refresh(held(y, 5.0, 2)[lost], t[lost])
+    assert found is not None
+    assert found.period == pytest.approx(5)
+
+
+def test_an_encoder_that_stands_or_creeps_is_no_slow_sensor() -> None:
+    rng = np.random.default_rng(4)
+    for name, motion in MOTIONS.items():
+        for rate in (100.0, 1000.0, 4000.0):
+            t = np.arange(4000) / rate
+            for step in (1e-3, 1e-4, 1e-5, 1e-6):
+                for noise in (0.0, 0.3 * step):
+                    y = motion(t, rate) + noise * rng.standard_normal(t.size)
+                    assert find_refresh(np.round(y / step) * step) is None, (name, rate, step, noise)
+    creeping = np.round(np.arange(4000) / 4) * 1e-5  # a count every fourth row, by chance
+    assert find_refresh(creeping) is None
+    assert find_refresh(np.zeros(100)) is None
+
+
+def test_the_noise_of_a_slow_sensor_is_that_of_its_new_values() -> None:
+    rng, t = np.random.default_rng(5), np.linspace(0, 6, 6000)
+    y = np.sin(2 * t) + 0.05 * rng.standard_normal(t.size)
+    for period in (1.5, 4.0, 10 / 3):
+        column = held(y, period)
+        found = find_refresh(column)
+        assert found is not None
+        level = noise_level(np.where(found.fresh, column, np.nan), t)
+        assert level == pytest.approx(0.05, rel=0.15)
