@@ -90,6 +90,9 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
                 every = max(1, len(measured) * len(pairs) // STYLE.points)
                 t, y = measured.t[::every], factor * measured[channel][::every]
                 top.plot(t, y, ".", color=GREY, ms=3, label="measured" if first else None)
+                if f"{channel}_low" in run:
+                    ends = [factor * run[f"{channel}_{end}"] for end in ("low", "high")]
+                    top.fill_between(run.t, *ends, color=BLUE, alpha=0.2, lw=0, label="95 % band" if first else None)
                 top.plot(run.t, factor * run[channel], color=BLUE, lw=1.2, label=label if first else None)
                 bottom.plot(t, y - factor * run[channel][::every], ".", color=ORANGE, ms=1.5)
             top.set_ylabel(f"{channel} [{unit}]")
