@@ -93,6 +93,8 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
                 if f"{channel}_low" in run:
                     ends = [factor * run[f"{channel}_{end}"] for end in ("low", "high")]
                     top.fill_between(run.t, *ends, color=BLUE, alpha=0.2, lw=0, label="95 % band" if first else None)
+                    half = (ends[1] - ends[0]) / 2
+                    bottom.fill_between(run.t, -half, half, color=BLUE, alpha=0.2, lw=0)
                 top.plot(run.t, factor * run[channel], color=BLUE, lw=1.2, label=label if first else None)
                 bottom.plot(t, y - factor * run[channel][::every], ".", color=ORANGE, ms=1.5)
             top.set_ylabel(f"{channel} [{unit}]")
