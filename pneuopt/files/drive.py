@@ -354,7 +354,9 @@ def write_fit(path: str | Path, source: str | Path, result: IdentificationResult
         {log: toml_table({str(c): inline_table(row) for c, row in own.items()}) for log, own in agreement.items()}
     )
     if result.forecast_error is not None:
-        document["forecast_error"] = toml_table(result.forecast_error.reset_index().to_dict(orient="list"))
+        document["forecast_error"] = toml_table(
+            {str(n): column for n, column in result.forecast_error.reset_index().to_dict(orient="list").items()}
+        )
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
     if result.verdict is not None:
         document["verdict"] = toml_table(result.verdict.to_dict())

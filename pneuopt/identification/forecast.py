@@ -13,7 +13,7 @@ included. `problems/identify/forecast_band.py` measures the share inside.
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from scipy.optimize import isotonic_regression
@@ -38,7 +38,17 @@ from pneuopt.identification.problem import (
 )
 from pneuopt.identification.search import check_window
 from pneuopt.identification.statistics import agreement, cross_correlation, ljung_box
-from pneuopt.identification.tolerances import FORECAST_LEVELS, FORECAST_STARTS, LEVEL, MIN_WINDOW_SAMPLES, START_SHARE
+from pneuopt.identification.tolerances import (
+    ENDLESS,
+    FORECAST_LANES,
+    FORECAST_LEVELS,
+    FORECAST_STARTS,
+    LEVEL,
+    MIN_WINDOW_SAMPLES,
+    START_ROUNDS,
+    START_SHARE,
+    START_STEP,
+)
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import LogError
@@ -51,9 +61,6 @@ from pneuopt.shooting.segments import Segments, choose_integration, segment, sta
 if TYPE_CHECKING:
     import pandas as pd
 
-START_STEP, START_ROUNDS = 1e-4, 4  # [nominal sizes] of the first differences, and rounds
-HUGE, TINY = 1e200, 1e-9  # square of an error that has no end, and weight of a time without samples
-LANES = 16  # runs at once at most
 QUANTILE = float(norm.ppf(0.5 + LEVEL / 2))
 
 
@@ -162,8 +169,8 @@ def predict_logs(
         check_number("window", window, "a time in seconds, as 0.5, math.inf for whole logs, or None")
     model, method = as_estimation_model(system), LeastSquares(progress=ProgressReporter(progress, verb))
     window = None if window == math.inf else window
-    fit = None if isinstance(parameters, ParameterSet) else parameters
-    given = parameters if isinstance(parameters, ParameterSet) else parameters.parameters
+    fit: Any = parameters if hasattr(parameters, "forecast_error") else None
+    given: Any = parameters if fit is None else fit.parameters
     logs = check_logs(model, [_with_noise(e, fit) for e in as_experiments(experiments)], given)
     known, rows, runs = _fixed_parameters(model, find_centre(model, logs, given)), [], list[Trajectory]()
     share = START_SHARE if fit is not None and fit.forecast_error is not None else 1.0
@@ -188,7 +195,8 @@ def _with_noise(experiment: Experiment, fit: Fitted | None) -> Experiment:
     learned = None if fit is None else fit.forecast_error
     if learned is None:
         return experiment
-    levels = {n: float(learned[n].iloc[0]) for n in learned if n in experiment.trajectory and n not in experiment.noise}
+    unknown = [str(n) for n in learned if n in experiment.trajectory and n not in experiment.noise]
+    levels = {n: float(learned[n].iloc[0]) for n in unknown}
     return experiment.with_noise(levels)
 
 
@@ -234,8 +242,8 @@ class _Forecast:
             found = {n: run[n] for n in run}
             for k, output in enumerate(names(self.system.outputs)):
                 if errors is not None and output in errors:
-                    expected = _expected_error(errors, output, inputs.t - inputs.t[0])
-                    half = QUANTILE * np.sqrt(variance[part, : len(inputs), k] + expected**2)
+                    expected = np.interp(inputs.t - inputs.t[0], errors.index, errors[output] ** 2)
+                    half = QUANTILE * np.sqrt(variance[part, : len(inputs), k] + expected)
                     half[: self.heads[part]] = math.nan
                     found |= {f"{output}_low": run[output] - half, f"{output}_high": run[output] + half}
             begin = int(np.searchsorted(log.trajectory.t, inputs.t[0]))
@@ -268,11 +276,13 @@ class _Forecast:
         steps = START_STEP * nominal * np.eye(len(nominal))[:, None] * np.isnan(head.fixed_start)
         for _ in range(START_ROUNDS if len(nominal) else 0):  # slopes along steps as long as the deviations they show
             halves = self._half_differences(head, [(step, still) for step in steps])
-            moved = [np.clip(np.where(counts, head.weights * half, 0.0), -1 / TINY, 1 / TINY) for half in halves]
+            moved = [np.clip(np.where(counts, head.weights * half, 0.0), -ENDLESS, ENDLESS) for half in halves]
             rows = np.stack([half.reshape(len(half), -1) for half in moved], axis=1)  # (m, n_states, samples)
             prior = np.swapaxes(steps, 0, 1) / nominal  # what shows nothing is known to its nominal size
             information = rows @ np.swapaxes(rows, 1, 2) + prior @ np.swapaxes(prior, 1, 2)
-            information += np.eye(len(nominal)) * (1e-12 * information.max(axis=(1, 2), keepdims=True) + 1 / HUGE)
+            information += np.eye(len(nominal)) * (
+                ENDLESS**-1 * information.max(axis=(1, 2), keepdims=True) + ENDLESS**-4
+            )
             variances, directions = np.linalg.eigh(np.linalg.inv(information))
             steps = np.einsum("mjk,jmi->kmi", directions * np.sqrt(np.maximum(variances, 0.0))[:, None], steps)
         return steps
@@ -281,8 +291,8 @@ class _Forecast:
         """Half the difference of the outputs (m, n, n_outputs) between both signs of each move of starts and values."""
         own, m, parts = segments.transcription.parameters.values(), len(self.nodes), segments
         logs, lower, upper = (np.array([getattr(p, n) for p in own]) for n in ("log", "lower", "upper"))
-        for first in range(0, len(moves), max(1, LANES // m)):
-            few = moves[first : first + max(1, LANES // m)]
+        for first in range(0, len(moves), max(1, FORECAST_LANES // m)):
+            few = moves[first : first + max(1, FORECAST_LANES // m)]
             signed = [(sign * step, sign * change) for step, change in few for sign in (1, -1)]
             with np.errstate(all="ignore"):  # infinite where the model leaves its range
                 nodes = np.concatenate([self.nodes + step for step, _ in signed])
@@ -369,18 +379,14 @@ def learn_forecast_error(
         noise = [e.noise[channel] for e in problem.experiments if channel in outputs_in_log(system, e)]
         counts = later & np.isfinite(measured[..., k])
         if noise and counts.any():
-            own, squares = level[counts], np.minimum(excess[counts, k], HUGE)
+            own, squares = level[counts], np.minimum(excess[counts, k], ENDLESS**2)
             weights, sums = (np.bincount(own, w, FORECAST_LEVELS) for w in (np.ones(len(own)), squares))
             means = sums / np.maximum(weights, 1)
-            rising = isotonic_regression(means, weights=weights + TINY).x  # no forecast becomes surer with time
+            rising = isotonic_regression(
+                means, weights=np.maximum(weights, 1 / ENDLESS)
+            ).x  # no forecast becomes surer with time
             table[channel] = np.sqrt(np.maximum(np.append(0.0, rising), float(np.median(noise)) ** 2))
     return pd.DataFrame(table, index=pd.Index(np.append(0.0, (edges[1:] + edges[:-1]) / 2), name="time"))
-
-
-def _expected_error(table: "pd.DataFrame", channel: str, since: Array) -> Array:
-    """What a fit must expect of its forecast of a channel, by the time since the start [s]."""
-    times, squares = table.index.to_numpy(dtype=float), table[channel].to_numpy(dtype=float) ** 2
-    return np.sqrt(np.interp(since, times, squares))
 
 
 def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSet:

@@ -338,7 +338,7 @@ def report_band(fit: "pd.DataFrame") -> Report:
     """How much of the forecast samples of each channel lies in the 95 % band of `validate`; nothing without one."""
     lines = list[Line]()
     for channel, own in fit.dropna(subset="inside").groupby(level="channel", sort=False):
-        worst, share = own["inside"].idxmin()[0], own["inside"].mean()
+        worst, share = own["inside"].droplevel("channel").idxmin(), own["inside"].mean()
         sizes = [format_number(float(np.sqrt(np.mean(own[n] ** 2))), 3) for n in ("half_band", "forecast_rmse")]
         lead = f"{channel}: {share:.0%} of the forecast samples are inside the 95 % band"
         lead += f" ({own['inside'].min():.0%} in {worst})" if len(own) > 1 else ""

@@ -30,7 +30,11 @@ from problems.shared.claims import Claim, arguments, finish, frame
 DATA = Path(__file__).parents[2] / "data"
 RIGS = {"force_rig": "run_*.csv", "step_rig": "step_*.csv", "pneumatic_rig": "run_*.csv"}
 WINDOW = 1.0  # [s] of forecasts of axes that integrate what no model has
-EMPS = {"time": "time_s", "position": "position_m", "force": {"column": "drive_force_N", "unit": "N"}}
+EMPS: dict[str, str | dict[str, str | float]] = {
+    "time": "time_s",
+    "position": "position_m",
+    "force": {"column": "drive_force_N", "unit": "N"},
+}
 EMPS_FREE = "load.mass", "load.force", "friction.coulomb", "friction.viscous"
 Forecasts = Iterator[tuple[str, "pd.DataFrame"]]
 
