@@ -10,8 +10,7 @@ from scipy.signal import lfilter
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_fit, write_fit
-from pneuopt.identification import forecast
-from pneuopt.identification.forecast import predict, validate
+from pneuopt.identification.forecast import predict, predict_logs, validate
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult, report_band
 from pneuopt.logs.experiment import Experiment
@@ -21,6 +20,7 @@ from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import solve_least_squares
 
 DRIVE, NOISE = ForceDrive(Coulomb()), 1e-5
 TRUTH = {"load.mass": 4.0, "friction.coulomb": 20.0, "friction.viscous": 60.0}
@@ -77,15 +77,15 @@ def test_the_band_does_not_look_at_what_it_forecasts() -> None:
 
 
 def test_a_forecast_fits_its_start_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, solve = list[int](), forecast.solve_least_squares
+    calls = list[int]()
 
     def counted(*given: object) -> object:
         calls.append(1)
-        return solve(*given)  # type: ignore[arg-type]
+        return solve_least_squares(*given)  # type: ignore[arg-type]
 
     fit = fitted(0, exact=True)
-    monkeypatch.setattr(forecast, "solve_least_squares", counted)
-    forecast.predict_logs(DRIVE, record(8), fit)
+    monkeypatch.setattr("pneuopt.identification.forecast.solve_least_squares", counted)
+    predict_logs(DRIVE, record(8), fit)
     assert len(calls) == 1
 
 
