@@ -35,10 +35,6 @@ EMPS: dict[str, str | dict[str, str | float]] = {
     "position": "position_m",
     "force": {"column": "drive_force_N", "unit": "N"},
 }
-    "time": "time_s",
-    "position": "position_m",
-    "force": {"column": "drive_force_N", "unit": "N"},
-}
 EMPS_FREE = "load.mass", "load.force", "friction.coulomb", "friction.viscous"
 Forecasts = Iterator[tuple[str, "pd.DataFrame"]]
 
