@@ -102,8 +102,9 @@ from .files.outputs import load_result
 from .files.tuned import write_tuned
 from .files.tuning import read_path, read_tuning
 from .identification.checkup import Assumption, Checkup, check
+from .identification.forecast import predict, validate
 from .identification.identifiability import examine_logs, identifiability
-from .identification.identify import identify, predict, validate
+from .identification.identify import identify
 from .identification.losses import Huber, SoftL1
 from .identification.profiles import Profile, PropagatedValue, profile, propagate_error
 from .identification.result import ChosenWindow, IdentificationResult, Mark, Verdict

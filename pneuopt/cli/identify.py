@@ -24,8 +24,9 @@ from pneuopt.cli.shared import (
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, read_fit, write_fit
 from pneuopt.identification.checkup import OTHER_CHECKS, check
-from pneuopt.identification.identify import identify, predict, validate
-from pneuopt.identification.result import IdentificationResult, Mark, report_agreement, report_trail
+from pneuopt.identification.forecast import predict_logs
+from pneuopt.identification.identify import identify
+from pneuopt.identification.result import IdentificationResult, Mark, report_agreement, report_band, report_trail
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.doctor import CHECKS, LogFinding
 from pneuopt.logs.experiment import Experiment
@@ -46,7 +47,6 @@ from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
-from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.report.fit_page import PageHead, fit_page, prediction_page, refusal_page
 from pneuopt.report.tuning_page import summary_page, title_of
 from pneuopt.shooting.least_squares import LeastSquares
@@ -169,15 +169,13 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
     experiment = read_log(log, plant=system, ambient_pressure=ambient_pressure(parameters))
     warn_of_status(stored)
     with progress("predicting", quiet=quiet) as report_progress:
-        table = validate(system, [experiment], parameters, window=window, progress=report_progress)
-    runs = list[Trajectory]()
-    if (outputs.output, outputs.plot, outputs.report) != (None, None, None):
-        with progress("simulating", quiet=quiet) as report_progress:
-            runs.append(predict(system, experiment, parameters, window=window, progress=report_progress))
+        table, runs = predict_logs(system, experiment, stored, window=window, progress=report_progress)
     writers: Writers = {}
     if outputs.output is not None:
         given = {q.name: experiment.trajectory[q.name] for q in system.inputs}
         columns = {q.name: (q.name, q.unit) for q in (*system.inputs, *system.outputs)}
+        bands = {f"{n}_{end}": unit for n, unit in columns.values() for end in ("low", "high")}
+        columns |= {n: (n, unit) for n, unit in bands.items() if n in runs[0]}
         writers[outputs.output] = partial(write_csv, run=runs[0].with_columns(given), columns=columns)
     hashes = file_hashes(fit) | {f"sha256[{log.name}]": experiment.sha256}
     tables = {"fit": records(table), "provenance": hashes}
@@ -189,7 +187,7 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
         tables,
         None,
         figures=lambda: {"": plot_prediction(runs, [experiment], label="predicted")},
-        report=report_agreement(table),
+        report=report_agreement(table) + report_band(table),
         page=page,
     )
 

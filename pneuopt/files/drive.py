@@ -133,7 +133,7 @@ def _describe_condition(name: str, kind: DriveKind, variants: Sequence[_DriveOpt
     return " and ".join(parts)
 
 
-FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
+FIT_SECTIONS = ("estimates", "covariance", "agreement", "forecast_error", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
 _AGREEMENT = ["rmse", "nrmse", "free_run_rmse", "free_run_nrmse", "unit"]
@@ -213,6 +213,25 @@ class StoredFit:
         require(bool((abs(matrix - matrix.T) <= COVARIANCE_ROUNDING * scale).all()), message)
         require(bool((abs(matrix) <= (1 + COVARIANCE_ROUNDING) * scale).all()), message)
         return pd.DataFrame(matrix, list(rows), list(rows))
+
+    @property
+    def forecast_error(self) -> "pd.DataFrame | None":
+        """As of `IdentificationResult`; None where the file has none."""
+        import pandas as pd
+
+        columns = self.toml.get("forecast_error")
+        if columns is None:
+            return None
+        message = (
+            f"{self.path}: [forecast_error] must hold times and an error of each output at each; run identify again"
+        )
+        try:
+            table = pd.DataFrame(columns, dtype=float).set_index("time")
+        except (KeyError, TypeError, ValueError):
+            raise InputError(message) from None
+        rises = bool((np.diff(table.index, prepend=-1.0) > 0).all())
+        require(len(table) > 1 and rises and bool((table > 0).all(axis=None)), message)
+        return table
 
     @property
     def estimates(self) -> "pd.DataFrame | None":
@@ -334,6 +353,10 @@ def write_fit(path: str | Path, source: str | Path, result: IdentificationResult
     document["agreement"] = toml_table(
         {log: toml_table({str(c): inline_table(row) for c, row in own.items()}) for log, own in agreement.items()}
     )
+    if result.forecast_error is not None:
+        document["forecast_error"] = toml_table(
+            {str(n): column for n, column in result.forecast_error.reset_index().to_dict(orient="list").items()}
+        )
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
     if result.verdict is not None:
         document["verdict"] = toml_table(result.verdict.to_dict())

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
-from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import names
+from pneuopt.dynamics.runnable import HasSystem, check_smooth
+from pneuopt.identification.forecast import agreement_rows, learn_forecast_error
 from pneuopt.identification.identifiability import (
     check_content,
     hold_unseen,
@@ -26,18 +25,14 @@ from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit
 from pneuopt.identification.problem import (
     EstimationProblem,
-    apply_conditions,
     as_estimation_model,
     as_experiments,
     check_free,
     check_logs,
     emit_log_warnings,
     find_centre,
-    input_behaviour,
-    known_runs,
     log_remarks,
     outputs_in_log,
-    window_runs,
 )
 from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult
 from pneuopt.identification.review import FixedValueTest, review_fit
@@ -50,7 +45,7 @@ from pneuopt.identification.search import (
     mark_order,
     run_freely,
 )
-from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
+from pneuopt.identification.statistics import confidence_interval
 from pneuopt.identification.widths import ESTIMATED_WIDTH, estimated_widths, free_widths, sticking_covariance
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
@@ -58,8 +53,7 @@ from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.output import one_blas_thread
 from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_argument, check_number, wrong_argument
 from pneuopt.quantities.status import Code, Progress, ProgressReporter, Status, provenance
-from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, solve_least_squares
+from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares
 from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
 
 if TYPE_CHECKING:
@@ -221,121 +215,12 @@ def _fit_and_review(
     result = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
     result = replace(mark_order(held, result), window=chosen, trail=trail)
     result = replace(result, status=problem.method.budget.name_end(result.status))
+    if result.status.code not in (Code.INTERRUPTED, Code.BUDGET, Code.DIVERGED):
+        error = learn_forecast_error(problem, result.parameters, LeastSquares(budget=problem.method.budget))
+        result = replace(result, forecast_error=error)
     if doubts.found:
         result = replace(result, status=result.status.with_details(str(doubts.found)))
     return replace(result, status=result.status.with_details(str(chosen))) if chosen else result
-
-
-def validate(
-    system: HasSystem | ClosedLoop,
-    experiments: Experiment | Sequence[Experiment],
-    parameters: ParameterSet,
-    *,
-    window: float | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> "pd.DataFrame":
-    """Predict logs with known parameters: the start state is fitted, then an independent simulation runs freely.
-
-    Parameters
-    ----------
-    system : drive, System or ClosedLoop
-        As of `identify`.
-    experiments : Experiment or sequence of Experiment
-        Preferably runs that no fit has seen.
-    parameters : ParameterSet
-        Those of a fit, for instance; none is estimated.
-    window : float, optional
-        Start the simulation anew after this time [s], from a fitted state: a plant that integrates runs away from a
-        long log for the smallest misfit.
-    progress : callable, optional
-        As of `identify`.
-
-    Returns
-    -------
-    DataFrame
-        A row a log and channel: rmse, nrmse, fit_percent, samples, unit; free_run_rmse and free_run_nrmse, the same of
-        a simulation from end to end, which has no windows; whiteness_p, the probability of residuals so
-        little white by chance (`ljung_box`); of each input how much is left in them (`cross_correlation`, about 3 is
-        what chance reaches) and at which lag in samples: "correlation[force]", "lag[force]".
-    """
-    from pneuopt.quantities.frames import WideFrame
-
-    _check_window_time(window)
-    model = as_estimation_model(system)
-    logs = check_logs(model, experiments, parameters)
-    fixed = _fixed_parameters(model, find_centre(model, logs, parameters))
-    rows, method = [], LeastSquares(progress=ProgressReporter(progress, "validate"))
-    for experiment in logs:
-        free = _predict_log(model, experiment, fixed, None, method)
-        run = free if window is None else _predict_log(model, experiment, fixed, window, method)
-        rows += [
-            row | residual_diagnosis(model, experiment, run, str(row["channel"]))
-            for row in agreement_rows(model, experiment, run, free)
-        ]
-    return WideFrame(rows).set_index(["log", "channel"])
-
-
-def predict(
-    system: HasSystem | ClosedLoop,
-    experiment: Experiment,
-    parameters: ParameterSet,
-    *,
-    window: float | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> Trajectory:
-    """Simulate a log freely with known parameters, as `validate` does to compare.
-
-    Parameters
-    ----------
-    system : drive, System or ClosedLoop
-        As of `identify`.
-    experiment : Experiment
-        Its inputs drive the simulation, its outputs give the start state.
-    parameters : ParameterSet
-        As of `validate`.
-    window, progress
-        As of `validate`.
-
-    Returns
-    -------
-    Trajectory
-        States and outputs on the log's grid; NaN in holes of its inputs, behind which the state is fitted anew.
-    """
-    _check_window_time(window)
-    model = as_estimation_model(system)
-    check_argument("experiment", experiment, Experiment, "an Experiment, as read_log(path) gives it")
-    (log,) = logs = check_logs(model, experiment, parameters)
-    fixed, method = _fixed_parameters(model, find_centre(model, logs, parameters)), LeastSquares()
-    return _predict_log(model, log, fixed, window, replace(method, progress=ProgressReporter(progress, "predict")))
-
-
-def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSet:
-    """Every parameter of the system, none free."""
-    return system.parameters | parameters.fixed(*parameters.free_names)
-
-
-def _predict_log(
-    system: Fittable, experiment: Experiment, fixed: ParameterSet, window: float | None, method: LeastSquares
-) -> Trajectory:
-    inputs, known = experiment.trajectory, apply_conditions(fixed, experiment)
-    behaviour = input_behaviour(system, experiment)
-    if not system.states:
-        return simulate(system, inputs, known, initial={}, intersample=behaviour)
-    problem = EstimationProblem(system, (experiment,), fixed, method)
-    windows = replace(problem, window=math.inf if window is None else window)
-    check_window(windows)
-    fit = solve_least_squares(problem.transcription(problem.candidates[0]), method)
-    if window is not None:  # from that fit: over a whole log in one segment, stiction would trap the start
-        windows = replace(windows, method=replace(method, segment_time=window))
-        fit = solve_least_squares(windows.transcription(windows.start_from(fit)), windows.method)
-    initial, columns = fit.trajectories[0], dict[str, Array]()
-    runs = known_runs(experiment) if window is None else window_runs(experiment, window)
-    for begin, end in runs:
-        state = {s.name: float(initial[s.name][begin]) for s in system.states}
-        run = simulate(system, inputs.rows(begin, end), known, initial=state, intersample=behaviour)
-        for name in run:
-            columns.setdefault(name, np.full(len(inputs), np.nan))[begin:end] = run[name]
-    return Trajectory(inputs.t, columns)
 
 
 def _result(
@@ -420,29 +305,3 @@ def fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":
     runs = zip(problem.experiments, fit.trajectories, run_freely(problem, fit), strict=True)
     rows = [row for e, run, free in runs for row in agreement_rows(problem.system, e, run, free)]
     return WideFrame(rows).set_index(["log", "channel"])
-
-
-def agreement_rows(
-    system: Fittable, experiment: Experiment, run: Trajectory, free_run: Trajectory
-) -> list[dict[str, object]]:
-    """A row a channel of a log: how well a run agrees with it, and a simulation from end to end."""
-    units = {q.name: q.unit for q in system.outputs}
-    rows: list[dict[str, object]] = []
-    for channel in outputs_in_log(system, experiment):
-        figures, measured = agreement(experiment.trajectory[channel], run[channel]), experiment.trajectory[channel]
-        free = agreement(measured, free_run[channel])
-        free_figures = {f"free_run_{n}": free[n] for n in ("rmse", "nrmse")}
-        known = {"noise": experiment.noise[channel], "unit": units[channel]}
-        rows.append({"log": experiment.name, "channel": channel, **figures, **free_figures, **known})
-    return rows
-
-
-def residual_diagnosis(system: Fittable, experiment: Experiment, run: Trajectory, channel: str) -> dict[str, object]:
-    """Whiteness of a channel's residuals, and their correlation with each input."""
-    log = experiment.trajectory
-    residuals = log[channel] - run[channel]
-    found: dict[str, object] = {"whiteness_p": ljung_box(residuals)[1]}
-    for name in (n for n in names(system.inputs) if n in log):
-        size, lag = cross_correlation(residuals, log[name])
-        found |= {f"correlation[{name}]": size, f"lag[{name}]": lag}
-    return found

@@ -157,7 +157,7 @@ class EstimationProblem:
         breaks = [end for begin, end in experiment.holes if begin > 0 and end < len(t)]
         if not math.isinf(self.window):
             breaks = sorted({*breaks, *(begin for begin, _ in window_runs(experiment, self.window) if begin > 0)})
-        if self.system.states:
+        if self.system.states or math.isinf(self.method.segment_time):
             samples = self.method.segment_time / float(np.median(h))
             a_segment = len(h) if math.isinf(samples) else max(2, round(samples))
         else:  # a static map has no gaps, and is cut only for batches and blocks of time

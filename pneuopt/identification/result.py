@@ -291,6 +291,10 @@ class IdentificationResult(Result):
         The windows in which the logs were fitted; None where they were fitted whole.
     trail : DataFrame or None
         What the search has tried, in its order, a row a try, a `TrailRow`; None for a fit from a given one.
+    forecast_error : DataFrame or None
+        A column an output, by the time since the start of a free run [s]: what the fit must expect of its forecasts
+        beyond the uncertainty of parameters and start, noise included, root mean square [unit]. None of a fit that was
+        cut off.
     """
 
     parameters: ParameterSet
@@ -304,6 +308,7 @@ class IdentificationResult(Result):
     verdict: Verdict | None = None
     window: ChosenWindow | None = None
     trail: "pd.DataFrame | None" = field(default=None, metadata=NOT_SAVED)
+    forecast_error: "pd.DataFrame | None" = None
 
     def summary(self) -> Report:
         """The end of the fit, estimates with intervals and marks, what is unidentifiable, agreement with the logs."""
@@ -370,6 +375,18 @@ def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:
         rows.append((str(row["log"]), str(row["channel"]), *figures, str(row["unit"])))
     figures_heads = number_columns("NRMSE [%]", "free run", "RMSE", "free run")
     return Report((Table((*text_columns("log", "channel"), *figures_heads, *text_columns("unit")), tuple(rows)),))
+
+
+def report_band(fit: "pd.DataFrame") -> Report:
+    """How much of the forecast samples of each channel lies in the 95 % band of `validate`; nothing without one."""
+    lines = list[Line]()
+    for channel, own in fit.dropna(subset="inside").groupby(level="channel", sort=False):
+        worst, share = own["inside"].droplevel("channel").idxmin(), own["inside"].mean()
+        sizes = [format_number(float(np.sqrt(np.mean(own[n] ** 2))), 3) for n in ("half_band", "forecast_rmse")]
+        lead = f"{channel}: {share:.0%} of the forecast samples are inside the 95 % band"
+        lead += f" ({own['inside'].min():.0%} in {worst})" if len(own) > 1 else ""
+        lines.append(Line(f"{lead}, which is +-{sizes[0]} {own['unit'].iloc[0]} wide where the error is {sizes[1]}"))
+    return Report(tuple(lines))
 
 
 def join_names(names: Sequence[str]) -> str:

@@ -21,8 +21,9 @@ import numpy as np
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.runnable import HasSystem, as_system
 from pneuopt.dynamics.system import System, names
+from pneuopt.identification.forecast import validate
 from pneuopt.identification.identifiability import pose_problem
-from pneuopt.identification.identify import check_options, identify, validate
+from pneuopt.identification.identify import check_options, identify
 from pneuopt.identification.problem import EstimationProblem, as_experiments
 from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult, remedy
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p

@@ -18,6 +18,17 @@ MIN_RELATIVE_DIFFERENCE = 0.02  # [1] that a disagreement must exceed, too: an i
 MIN_FORCE_SHARE = 1e-3  # [1] force of a signal over the largest one's, from which it counts
 MIN_STOP_FORCE = 10.0  # [N] by which a model's end stop pushes back 1 mm beyond a limit; a spring takes less
 
+# Forecast
+
+START_SHARE = 0.1  # [1] of the time of a log, to which the start of its forecast is fitted
+FORECAST_STARTS = 8  # evenly spread, from which a fit forecasts each of its own logs
+FORECAST_LEVELS = 5  # of time since the start, each twice as long as the one before, with an error each
+
+START_STEP = 1e-4  # [nominal sizes] of the start state, of the first differences by it
+START_ROUNDS = 4  # of differences, each over the deviation that the one before has found
+FORECAST_LANES = 16  # runs at once, at most
+ENDLESS = 1e12  # [noise deviations, or the unit] at which a run counts that has left the model's range
+
 # Identifiability; standard deviations are over the value, or per e-fold of a logarithm
 
 HARMLESS_DEVIATION = 0.01  # [1] up to which a combination of parameters does no harm

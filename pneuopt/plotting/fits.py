@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -90,6 +90,11 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
                 every = max(1, len(measured) * len(pairs) // STYLE.points)
                 t, y = measured.t[::every], factor * measured[channel][::every]
                 top.plot(t, y, ".", color=GREY, ms=3, label="measured" if first else None)
+                if f"{channel}_low" in run:
+                    low, high = (factor * run[f"{channel}_{end}"] for end in ("low", "high"))
+                    shade: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
+                    top.fill_between(run.t, low, high, label="95 % band" if first else None, **shade)
+                    bottom.fill_between(run.t, (low - high) / 2, (high - low) / 2, **shade)
                 top.plot(run.t, factor * run[channel], color=BLUE, lw=1.2, label=label if first else None)
                 bottom.plot(t, y - factor * run[channel][::every], ".", color=ORANGE, ms=1.5)
             top.set_ylabel(f"{channel} [{unit}]")

@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import HasSystem, as_runnable
 from pneuopt.dynamics.system import System
-from pneuopt.identification.identify import predict, validate
-from pneuopt.identification.result import IdentificationResult, Mark, join_names, report_agreement, report_estimates
+from pneuopt.identification.forecast import predict_logs
+from pneuopt.identification.result import (
+    IdentificationResult,
+    Mark,
+    join_names,
+    report_agreement,
+    report_band,
+    report_estimates,
+)
 from pneuopt.logs.doctor import LogFinding
 from pneuopt.logs.experiment import Experiment
 from pneuopt.plotting import (
@@ -118,7 +125,10 @@ def prediction_page(
         place = f"{worst['channel']} of {worst['log']}"
         verdict = Line(f"predicted in open loop: NRMSE at most {100 * worst['nrmse']:.3g} %, {place}")
     sections = (
-        Section("Agreement with the logs", (report_agreement(table), _comparison(runs, experiments, "predicted"))),
+        Section(
+            "Agreement with the logs",
+            (report_agreement(table), report_band(table), _comparison(runs, experiments, "predicted")),
+        ),
         Section("Residuals", (_residual_picture(runs, experiments),)),
         data_section(experiments),
         provenance_section({}, {**log_hashes(experiments), **head.hashes}),
@@ -154,12 +164,11 @@ def _held_out_section(
     if system is None or not held_out:
         return Section("Held-out runs", ())
     try:
-        table = validate(system, held_out, result.parameters)
-        runs = [predict(system, e, result.parameters) for e in held_out]
+        table, runs = predict_logs(system, held_out, result)
     except (ConvergenceError, InputError) as error:
         return Section("Held-out runs", (Report((Line(f"not predicted: {error}", Tone.BAD),)),))
-    lead = Report((Line("logs that the fit has not seen, predicted from their first sample on"),))
-    parts = (lead, report_agreement(table), _comparison(runs, held_out, "predicted"))
+    lead = Report((Line("logs that the fit has not seen, predicted from their first tenth on"),))
+    parts = (lead, report_agreement(table), report_band(table), _comparison(runs, held_out, "predicted"))
     return Section("Held-out runs", parts)
 
 

@@ -21,7 +21,8 @@ from pneuopt.dynamics.compiled.rollout import Gram, Pieces, Rollout
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector
-from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.forecast import predict, validate
+from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.experiment import Experiment

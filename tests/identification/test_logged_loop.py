@@ -22,7 +22,8 @@ from pneuopt.control.pid import PID
 from pneuopt.control.sensor import SensorLag
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.forecast import predict, validate
+from pneuopt.identification.identify import identify
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.catalog import s25

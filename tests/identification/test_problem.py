@@ -18,8 +18,9 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
+from pneuopt.identification.forecast import predict, validate
 from pneuopt.identification.identifiability import check_content
-from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.identify import identify
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.losses import Huber
 from pneuopt.identification.problem import (

@@ -29,7 +29,8 @@ from pneuopt.files.drive import write_fit
 from pneuopt.files.toml import read_toml
 from pneuopt.identification import search
 from pneuopt.identification import search as windows
-from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.forecast import predict, validate
+from pneuopt.identification.identify import identify
 from pneuopt.identification.losses import Huber
 from pneuopt.identification.problem import EstimationProblem, check_logs
 from pneuopt.identification.profiles import profile as profile_of_windows

@@ -12,6 +12,7 @@ from problems.identify import (
     b32_partial,
     bootstrap_bias,
     emps,
+    forecast_band,
     foreign_rig,
     next_experiment,
     real_logs,
@@ -62,6 +63,11 @@ def test_bootstrap_bias() -> None:
 @pytest.mark.slow
 def test_foreign_rig() -> None:
     assert failed(foreign_rig.main(1)) == []
+
+
+@pytest.mark.slow
+def test_forecast_band() -> None:
+    assert failed(forecast_band.main()) == []
 
 
 @pytest.mark.slow
