@@ -5,6 +5,7 @@ the predictions of logs, and the tables of results.
 """
 
 import math
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,6 +18,8 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
+from pneuopt.identification.explanations import explain_misfit
+from pneuopt.identification.free_run import predict_logs
 from pneuopt.identification.identifiability import (
     check_content,
     foresee_unidentifiable,
@@ -55,6 +58,7 @@ from pneuopt.identification.search import (
     tighten_gaps,
 )
 from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
+from pneuopt.identification.tolerances import MODEL_ERROR_LEVEL
 from pneuopt.identification.widths import estimated_widths, free_widths, sticking_covariance
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
@@ -64,7 +68,7 @@ from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_argument
 from pneuopt.quantities.status import Code, Progress, ProgressReporter, Status, provenance
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares, solve_least_squares
-from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,6 +93,7 @@ def identify(
     accept: Sequence[str] = (),
     start: IdentificationResult | None = None,
     cpu_seconds: float = math.inf,
+    explain: bool = True,
     throw: bool = True,
     progress: Callable[[Progress], None] | None = None,
 ) -> IdentificationResult:
@@ -121,6 +126,9 @@ def identify(
     cpu_seconds : float
         CPU time of this process after which the search ends [s], within an iteration, with the best values so far; the
         status then says so first, and is `Code.BUDGET`.
+    explain : bool
+        Where the model misses the logs, try what it may lack (a dead time, friction, a leak), for as much CPU time as
+        the fit took; the status names what explains the misfit. Not with a `start` or a `loss`.
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
     progress : callable, optional
@@ -165,7 +173,7 @@ def identify(
             is_whole=window == math.inf,
         )
         check_window(problem)
-        result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise)
+        result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise, explain=explain)
     if log_warnings:
         result = replace(result, status=result.status.with_remedies(*log_warnings))
     if throw and not result.status.converged:
@@ -199,10 +207,15 @@ def _check_window_time(window: float | None) -> None:
 
 
 def _fit_and_review(
-    problem: EstimationProblem, loss: Loss | None, start: IdentificationResult | None, *, estimate_noise: bool
+    problem: EstimationProblem,
+    loss: Loss | None,
+    start: IdentificationResult | None,
+    *,
+    estimate_noise: bool,
+    explain: bool,
 ) -> IdentificationResult:
-    """Choose widths, fit from the model's starts or a given one, in windows if need be, and review the intervals."""
-    window = problem.window
+    """Free widths, fit from the model's starts or a given one, in windows if need be, and review the intervals."""
+    began, window = time.process_time(), problem.window
     if start is None:
         for sentence in foresee_unidentifiable(problem):
             warnings.warn(sentence, PhysicsWarning, stacklevel=3)
@@ -232,7 +245,19 @@ def _fit_and_review(
     result = replace(result, status=problem.method.budget.name_end(result.status))
     if doubts.found:
         result = replace(result, status=result.status.with_details(str(doubts.found)))
+    elif explain and start is None and loss is None and _is_missed(result):
+        seconds = min(time.process_time() - began, problem.method.budget.part(1.0).seconds)
+        result = replace(result, status=result.status.with_details(*explain_misfit(held, fit, seconds)))
     return replace(result, status=result.status.with_details(str(chosen))) if chosen else result
+
+
+def _is_missed(result: IdentificationResult) -> bool:
+    """Whether the residuals of a search that came to its end, or its gaps, are those of another model."""
+    if result.status.code not in (Code.CONVERGED, Code.PARTIAL, Code.MISFIT, Code.NOT_CONVERGED):
+        return False
+    is_absorbed = not result.status.converged and result.stats["gap_share"] > MAX_GAP_SHARE
+    is_large = result.stats["chi_square_ratio"] > MODEL_ERROR_LEVEL**2
+    return is_absorbed or is_large or result.status.code is Code.MISFIT
 
 
 def validate(
@@ -364,7 +389,10 @@ def _result(
     squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
     dof = degrees_of_freedom(problem, fit)
     variance = squares / dof
-    misfit = replace(diagnose_misfit(problem, fit, variance, dof), restarts=restarts)
+    free_runs = run_freely(problem, fit)
+    prediction = predict_logs(problem, fit, free_runs)
+    misfit = diagnose_misfit(problem, fit, variance, dof)
+    misfit = replace(misfit, restarts=restarts, is_useless=prediction.is_useless)
     covariance = None if misfit.covariance is None else misfit.covariance + sticking_covariance(problem, fit)
     influenced = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
@@ -374,16 +402,22 @@ def _result(
         resting = prior_dominated(covariance, fit.prior_covariance, found, problem.fixed.values())
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
     asked = set(free) - set(estimated_widths(problem))
-    status = NOTHING_IDENTIFIABLE if asked and asked <= set(unidentifiable) else misfit.assess(fit.status)
+    status = prediction.assess(misfit.assess(fit.status))
+    status = NOTHING_IDENTIFIABLE if asked and asked <= set(unidentifiable) else status
     matrix = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
     result = IdentificationResult(
         problem.parameters.with_values(values),
         _estimates(estimates, covariance, fit.at_bound, influenced, status, misfit),
         pd.DataFrame(matrix, index=list(free), columns=list(free)),
-        fit_table(problem, fit),
+        fit_table(problem, fit, free_runs),
         runs,
         status,
-        {**fit.stats, "chi_square_ratio": variance, "variance_inflation": misfit.inflation},
+        {
+            **fit.stats,
+            "chi_square_ratio": variance,
+            "variance_inflation": misfit.inflation,
+            "free_run_share": max(prediction.shares.values(), default=0.0),
+        },
         {
             **provenance(problem.method, *([loss] if loss else [])),
             "start": label,
@@ -419,11 +453,11 @@ def _estimates(
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
 
 
-def fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":
+def fit_table(problem: EstimationProblem, fit: Fit, free_runs: Sequence[Trajectory]) -> "pd.DataFrame":
     """A row a log and channel of a fit (`IdentificationResult.fit`)."""
     from pneuopt.quantities.frames import WideFrame
 
-    runs = zip(problem.experiments, fit.trajectories, run_freely(problem, fit), strict=True)
+    runs = zip(problem.experiments, fit.trajectories, free_runs, strict=True)
     rows = [row for e, run, free in runs for row in agreement_rows(problem.system, e, run, free)]
     return WideFrame(rows).set_index(["log", "channel"])
 

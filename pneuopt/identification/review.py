@@ -188,8 +188,7 @@ def _review_failure(problem: EstimationProblem, start: Start, result: Identifica
     estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict)
     if status.code is not Code.INTERRUPTED:
         status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
-        advice = _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
-        status = status.with_remedies(*(advice if verdict.unidentifiable else ()))
+        status = status.with_remedies(_name_unidentifiable(verdict))
     unknown = result.covariance * math.nan
     return replace(result, estimates=estimates, covariance=unknown, status=status, verdict=verdict)
 

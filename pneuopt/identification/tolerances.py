@@ -19,6 +19,20 @@ MIN_RELATIVE_DIFFERENCE = 0.02  # [1] that a disagreement must exceed, too: an i
 MIN_FORCE_SHARE = 1e-3  # [1] force of a signal over the largest one's, from which it counts
 MIN_STOP_FORCE = 10.0  # [N] by which a model's end stop pushes back 1 mm beyond a limit; a spring takes less
 
+# Explanations of a misfit: what is tried of each
+
+DEAD_TIME_SAMPLES = (1, 2, 4, 8, 16, 32, 64, 128)  # [samples]
+BACKLASH_SHARES = (0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # [1] of an input's range
+STRIBECK_SHARES = (0.3, 0.1, 0.03)  # [1] Stribeck velocity over the root mean square of the speed
+TURN_SHARE = 0.01  # [1] of that speed, over which friction turns round; and of typical forces, where friction starts
+REFINED_AMOUNTS = 3  # further amounts, at the lowest points of parabolas
+
+# Free run
+
+# [1] error of a prediction over the motion, beyond which it is useless: over the horizon, fits of right models left up
+# to .11, with the faults of problems/identify/mismatch.py up to .30, with a valve whose centre was not found .84
+MAX_PREDICTION_SHARE = 0.5
+
 # Identifiability; standard deviations are over the value, or per e-fold of a logarithm
 
 HARMLESS_DEVIATION = 0.01  # [1] up to which a combination of parameters does no harm
