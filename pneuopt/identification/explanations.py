@@ -26,8 +26,10 @@ from pneuopt.identification.tolerances import (
     REFINED_AMOUNTS,
     STRIBECK_SHARES,
     TURN_SHARE,
+    WHOLE_SHARE,
     WINDOW_ITERATIONS,
 )
+from pneuopt.identification.widths import estimated_widths
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -72,12 +74,16 @@ def explain_misfit(problem: EstimationProblem, fit: Fit, cpu_seconds: float) -> 
     method = replace(
         problem.method, segment_time=horizon, stages=(last,), budget=budget, allows_state_noise=False, progress=None
     )
-    problem, trials = replace(problem, window=horizon, method=method), dict[str, Trial]()
+    # a width that is free stops a search from a wrong model's values
+    widths = {n: problem.parameters.value(n) for n in estimated_widths(problem)}
+    problem, trials = replace(problem, window=horizon, method=method, fixed=widths), dict[str, Trial]()
     try:
         without = Trial("", 0.0, _fit_shortly(problem, fit))
         for row in EXPLANATIONS:
             if row.suits(problem):
-                trials[row.name] = _try(row, problem, without)
+                trials[row.name] = found = _try(row, problem, without)
+                if without.squares - found.squares > WHOLE_SHARE * (without.squares - fit.count):
+                    break
     except KeyboardInterrupt:  # the budget, too
         pass
     if not trials:
@@ -189,10 +195,6 @@ def _lacks_friction(kind: str, problem: EstimationProblem) -> bool:
     return problem.system.plant.axis is not None and not any(p.free or p.value for p in own)
 
 
-def _friction_amounts(kind: str, _problem: EstimationProblem) -> Sequence[float]:
-    return STRIBECK_SHARES if kind == "static" else (0.0,)
-
-
 def _add_friction(kind: str, problem: EstimationProblem, fit: Fit, amount: float) -> EstimationProblem:
     """Friction of a kind; `amount` is its Stribeck velocity over the root mean square of the speed."""
     axis, name = problem.system.plant.axis, f"lacking.{kind}"
@@ -256,12 +258,31 @@ def _add_lines(problem: EstimationProblem, _fit: Fit, _amount: float) -> Estimat
 
 
 EXPLANATIONS = (
+    *(
+        Explanation(
+            f"{kind} friction",
+            partial(_lacks_friction, kind),
+            partial(_add_friction, kind),
+            partial(_describe_friction, kind),
+        )
+        for kind in ("coulomb", "viscous")
+    ),
+    Explanation("a leak", lambda problem: bool(_leaks(problem)), _add_leaks, lambda *_: "a leak"),
+    Explanation("an offset of the input", lambda _: True, _add_offset, _describe_offset),
     Explanation(
         "a dead time",
         lambda _: True,
         _with_inputs(_delay),
         lambda _problem, _fit, amount: f"a dead time of {write_value(amount, 's', 2)}",
         _dead_times,
+    ),
+    Explanation("a line in time", lambda _: True, _add_lines, lambda *_: "a straight line in time beside the outputs"),
+    Explanation(
+        "static friction",
+        partial(_lacks_friction, "static"),
+        partial(_add_friction, "static"),
+        partial(_describe_friction, "static"),
+        lambda _: STRIBECK_SHARES,
     ),
     Explanation(
         "backlash",
@@ -270,17 +291,4 @@ EXPLANATIONS = (
         lambda _problem, _fit, amount: f"backlash of {amount:.2g} of the inputs' range",
         lambda _: BACKLASH_SHARES,
     ),
-    *(
-        Explanation(
-            f"{kind} friction",
-            partial(_lacks_friction, kind),
-            partial(_add_friction, kind),
-            partial(_describe_friction, kind),
-            partial(_friction_amounts, kind),
-        )
-        for kind in ("coulomb", "static", "viscous")
-    ),
-    Explanation("a leak", lambda problem: bool(_leaks(problem)), _add_leaks, lambda *_: "a leak"),
-    Explanation("an offset of the input", lambda _: True, _add_offset, _describe_offset),
-    Explanation("a line in time", lambda _: True, _add_lines, lambda *_: "a straight line in time beside the outputs"),
 )

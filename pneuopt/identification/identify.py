@@ -58,7 +58,7 @@ from pneuopt.identification.search import (
     tighten_gaps,
 )
 from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
-from pneuopt.identification.tolerances import MODEL_ERROR_LEVEL
+from pneuopt.identification.tolerances import MIN_EXPLAINING_SECONDS, MODEL_ERROR_LEVEL
 from pneuopt.identification.widths import estimated_widths, free_widths, sticking_covariance
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
@@ -243,12 +243,11 @@ def _fit_and_review(
         reviewed, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
     result = replace(mark_order(held, reviewed), window=chosen)
     result = replace(result, status=problem.method.budget.name_end(result.status))
-    if doubts.found:
-        result = replace(result, status=result.status.with_details(str(doubts.found)))
-    elif explain and start is None and loss is None and _is_missed(result):
-        seconds = min(time.process_time() - began, problem.method.budget.part(1.0).seconds)
-        result = replace(result, status=result.status.with_details(*explain_misfit(held, fit, seconds)))
-    return replace(result, status=result.status.with_details(str(chosen))) if chosen else result
+    why = (str(doubts.found),) if doubts.found else ()
+    if not why and explain and start is None and loss is None and _is_missed(result):
+        seconds = max(time.process_time() - began, MIN_EXPLAINING_SECONDS)
+        why = explain_misfit(held, fit, min(seconds, problem.method.budget.part(1.0).seconds))
+    return replace(result, status=result.status.with_details(*why, str(chosen) if chosen else ""))
 
 
 def _is_missed(result: IdentificationResult) -> bool:
@@ -403,7 +402,8 @@ def _result(
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
     asked = set(free) - set(estimated_widths(problem))
     status = prediction.assess(misfit.assess(fit.status))
-    status = NOTHING_IDENTIFIABLE if asked and asked <= set(unidentifiable) else status
+    if asked and asked <= set(unidentifiable):
+        status = NOTHING_IDENTIFIABLE if misfit.level <= MODEL_ERROR_LEVEL else misfit.refusal
     matrix = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
     result = IdentificationResult(
         problem.parameters.with_values(values),

@@ -82,6 +82,12 @@ class Misfit:
         return Status(Code.MISFIT, (verdict, *status.sentences))
 
     @property
+    def refusal(self) -> Status:
+        """The status of a fit whose residuals leave no parameter identified."""
+        verdict = f"residuals are {self.level:.3g} times the noise, and beside such the logs identify no parameter"
+        return Status(Code.NOT_CONVERGED, (verdict, *self.sentences))
+
+    @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences for the user on the misfit."""
         found = []

@@ -21,6 +21,7 @@ MIN_STOP_FORCE = 10.0  # [N] by which a model's end stop pushes back 1 mm beyond
 
 # Explanations of a misfit: what is tried of each
 
+MIN_EXPLAINING_SECONDS = 2.0  # [CPU s] that all of them may take where the fit took less
 DEAD_TIME_SAMPLES = (1, 2, 4, 8, 16, 32, 64, 128)  # [samples]
 BACKLASH_SHARES = (0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # [1] of an input's range
 STRIBECK_SHARES = (0.3, 0.1, 0.03)  # [1] Stribeck velocity over the root mean square of the speed
