@@ -65,10 +65,17 @@ class Trial(NamedTuple):
         return squares if math.isfinite(squares) else math.inf
 
 
-def explain_misfit(problem: EstimationProblem, fit: Fit, cpu_seconds: float) -> tuple[str, ...]:
-    """A sentence on what explains most of the misfit of a fit, or on what was tried; none where nothing suits."""
+class Found(NamedTuple):
+    """A sentence on what explains most of a misfit, or on what was tried; empty where nothing suits."""
+
+    sentence: str
+    explains: bool
+
+
+def explain_misfit(problem: EstimationProblem, fit: Fit, cpu_seconds: float) -> Found:
+    """Try what the model of a fit may lack."""
     if not isinstance(problem.system, System) or not problem.system.states:
-        return ()
+        return Found("", False)
     horizon, budget = motion_horizon(problem), CpuBudget(max(cpu_seconds, 1e-9))
     last = replace(problem.method.stages[-1], iterations=WINDOW_ITERATIONS, refine=1)
     method = replace(
@@ -87,16 +94,17 @@ def explain_misfit(problem: EstimationProblem, fit: Fit, cpu_seconds: float) -> 
     except KeyboardInterrupt:  # the budget, too
         pass
     if not trials:
-        return ()
+        return Found("", False)
     best = min(trials.values(), key=lambda trial: trial.squares)
     share = (without.squares - best.squares) / (without.squares - fit.count)
     if not share >= MIN_EXPLAINED_SHARE:
-        return (f"tried, but none explains the misfit: {', '.join(trials)}",)
+        return Found(f"tried, but none explains the misfit: {', '.join(trials)}", False)
     scale = max(1.0, best.squares / fit.count)
     most = best.squares + ALIKE_SQUARES * scale
     alike = "".join(f"; {t.words} explains as much" for t in trials.values() if t is not best and t.squares <= most)
     gain = 0.5 * (without.squares - best.squares) / scale
-    return (f"{best.words} explains {min(1.0, share):.0%} of the misfit, the log-likelihood gains {gain:.3g}{alike}",)
+    size = f"explains {min(1.0, share):.0%} of the misfit, the log-likelihood gains {gain:.3g}"
+    return Found(f"{best.words} {size}{alike}", True)
 
 
 def _fit_shortly(problem: EstimationProblem, near: Fit) -> Fit:
@@ -273,7 +281,7 @@ EXPLANATIONS = (
         "a dead time",
         lambda _: True,
         _with_inputs(_delay),
-        lambda _problem, _fit, amount: f"a dead time of {write_value(amount, 's', 2)}",
+        lambda _problem, _fit, amount: f"a dead time of {write_value(amount, 's', 3)}",
         _dead_times,
     ),
     Explanation("a line in time", lambda _: True, _add_lines, lambda *_: "a straight line in time beside the outputs"),

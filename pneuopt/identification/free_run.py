@@ -8,7 +8,8 @@ no harm to a loop, which measures all the time. A free run that is far off is th
 over the horizon of the motion: the time in which an output moves by as much as its spread, where its structure function
 reaches its variance. The model runs over one such window after the other, each from the fitted state, and the error is
 compared with the motion since the window's start. A wrong inertia, a dead time or a lost centre fail there, too: the
-window is as long as the motion takes, where the gaps of a search are a hundred times as near.
+window is as long as the motion takes, where the gaps of a search are a hundred times as near. Nor is a free run excused
+once it is known what the model lacks (`explanations`).
 """
 
 import math
@@ -65,6 +66,14 @@ def predict_logs(problem: EstimationProblem, fit: Fit, runs: Sequence[Trajectory
     return Prediction(shares, True, horizon, _shares(problem, cut, horizon)[0])
 
 
+def refuse_drift(status: Status, share: float) -> Status:
+    """The status of a fit of which it is known what it lacks: a free run that is far off then has no excuse."""
+    if status.code is Code.MISFIT or not (status.converged and share > MAX_PREDICTION_SHARE):
+        return status
+    verdict = f"does not predict its own log: the free run misses {_size(share)} motion"
+    return Status(Code.MISFIT, (verdict, *status.sentences))
+
+
 def motion_horizon(problem: EstimationProblem) -> float:
     """The time in which each output of each log moves by as much as its spread [s]."""
     logs = [(e.trajectory, outputs_in_log(problem.system, e)) for e in problem.experiments]
@@ -110,6 +119,8 @@ def _is_useful(shares: Shares) -> bool:
 def _worst(shares: Shares) -> str:
     """The output with the largest share, and that, in words."""
     name = max(shares, key=lambda n: shares[n])
-    share = shares[name]
-    size = f"{share:.0%} of the" if share < 10 else f"{share:.2g} times the" if share < 1e4 else "far more than the"
-    return f"{name} by {size} motion"
+    return f"{name} by {_size(shares[name])} motion"
+
+
+def _size(share: float) -> str:
+    return f"{share:.0%} of the" if share < 10 else f"{share:.2g} times the" if share < 1e4 else "far more than the"

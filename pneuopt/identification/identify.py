@@ -19,7 +19,7 @@ from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
 from pneuopt.identification.explanations import explain_misfit
-from pneuopt.identification.free_run import predict_logs
+from pneuopt.identification.free_run import predict_logs, refuse_drift
 from pneuopt.identification.identifiability import (
     check_content,
     foresee_unidentifiable,
@@ -243,11 +243,13 @@ def _fit_and_review(
         reviewed, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
     result = replace(mark_order(held, reviewed), window=chosen)
     result = replace(result, status=problem.method.budget.name_end(result.status))
-    why = (str(doubts.found),) if doubts.found else ()
+    why = str(doubts.found) if doubts.found else ""
     if not why and explain and start is None and loss is None and _is_missed(result):
         seconds = max(time.process_time() - began, MIN_EXPLAINING_SECONDS)
-        why = explain_misfit(held, fit, min(seconds, problem.method.budget.part(1.0).seconds))
-    return replace(result, status=result.status.with_details(*why, str(chosen) if chosen else ""))
+        why, explains = explain_misfit(held, fit, min(seconds, problem.method.budget.part(1.0).seconds))
+        if explains:
+            result = replace(result, status=refuse_drift(result.status, result.stats["free_run_share"]))
+    return replace(result, status=result.status.with_details(why, str(chosen) if chosen else ""))
 
 
 def _is_missed(result: IdentificationResult) -> bool:
