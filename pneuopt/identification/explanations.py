@@ -150,14 +150,14 @@ def _lowest(points: Sequence[tuple[float, float]]) -> float | None:
 def _with_inputs(change: Callable[[float, Array, Array], Array]) -> Callable[..., EstimationProblem]:
     """A row's `add` that changes every input, `change(amount, t, values)`, before it reaches the plant."""
 
-    def changed(log: Experiment, inputs: Sequence[str], amount: float) -> Experiment:
+    def change_log(log: Experiment, inputs: Sequence[str], amount: float) -> Experiment:
         run = log.trajectory
         columns = {n: change(amount, run.t, run.fill_gaps(n)) for n in inputs}
         return replace(log, trajectory=run.with_columns(columns))
 
     def add(problem: EstimationProblem, _fit: Fit, amount: float) -> EstimationProblem:
         inputs = names(problem.system.inputs)
-        return replace(problem, experiments=tuple(changed(e, inputs, amount) for e in problem.experiments))
+        return replace(problem, experiments=tuple(change_log(e, inputs, amount) for e in problem.experiments))
 
     return add
 

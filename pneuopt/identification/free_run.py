@@ -39,6 +39,11 @@ class Prediction:
     over_horizon: Shares | None = None  # of the runs over the horizon
 
     @property
+    def stats(self) -> dict[str, float]:
+        """The largest share of a free run, as `IdentificationResult.stats` holds it; zero where nothing moves."""
+        return {"free_run_share": max(self.shares.values(), default=0.0)}
+
+    @property
     def is_useless(self) -> bool:
         """Whether the model predicts the logs neither as a whole nor over the horizon."""
         return self.is_far and not _is_useful(self.over_horizon or self.shares)

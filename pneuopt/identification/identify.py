@@ -215,7 +215,7 @@ def _fit_and_review(
     explain: bool,
 ) -> IdentificationResult:
     """Free widths, fit from the model's starts or a given one, in windows if need be, and review the intervals."""
-    began, window = time.process_time(), problem.window
+    begun, window = time.process_time(), problem.window
     if start is None:
         for sentence in foresee_unidentifiable(problem):
             warnings.warn(sentence, PhysicsWarning, stacklevel=3)
@@ -245,7 +245,7 @@ def _fit_and_review(
     result = replace(result, status=problem.method.budget.name_end(result.status))
     why = str(doubts.found) if doubts.found else ""
     if not why and explain and start is None and loss is None and _is_missed(result):
-        seconds = max(time.process_time() - began, MIN_EXPLAINING_SECONDS)
+        seconds = max(time.process_time() - begun, MIN_EXPLAINING_SECONDS)
         why, explains = explain_misfit(held, fit, min(seconds, problem.method.budget.part(1.0).seconds))
         if explains:
             result = replace(result, status=refuse_drift(result.status, result.stats["free_run_share"]))
@@ -392,8 +392,8 @@ def _result(
     variance = squares / dof
     free_runs = run_freely(problem, fit)
     prediction = predict_logs(problem, fit, free_runs)
-    misfit = diagnose_misfit(problem, fit, variance, dof)
-    misfit = replace(misfit, restarts=restarts, is_useless=prediction.is_useless)
+    diagnosis = diagnose_misfit(problem, fit, variance, dof)
+    misfit = replace(diagnosis, restarts=restarts, is_useless=prediction.is_useless)
     covariance = None if misfit.covariance is None else misfit.covariance + sticking_covariance(problem, fit)
     influenced = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
@@ -414,19 +414,15 @@ def _result(
         fit_table(problem, fit, free_runs),
         runs,
         status,
-        {
-            **fit.stats,
-            "chi_square_ratio": variance,
-            "variance_inflation": misfit.inflation,
-            "free_run_share": max(prediction.shares.values(), default=0.0),
-        },
-        {
-            **provenance(problem.method, *([loss] if loss else [])),
-            "start": label,
-            **{f"sha256[{e.name}]": e.sha256 for e in problem.experiments},
-        },
+        {**fit.stats, "chi_square_ratio": variance, "variance_inflation": misfit.inflation, **prediction.stats},
+        _provenance(problem, label, loss),
     )
     return result, unidentifiable
+
+
+def _provenance(problem: EstimationProblem, label: str, loss: Loss | None) -> dict[str, str]:
+    hashes = {f"sha256[{e.name}]": e.sha256 for e in problem.experiments}
+    return {**provenance(problem.method, *([loss] if loss else [])), "start": label, **hashes}
 
 
 def _estimates(
