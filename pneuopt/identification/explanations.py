@@ -18,6 +18,7 @@ import numpy as np
 from pneuopt.dynamics.system import Symbols, System, names
 from pneuopt.identification.free_run import motion_horizon
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
+from pneuopt.identification.review import promised_squares
 from pneuopt.identification.tolerances import (
     ALIKE_SQUARES,
     BACKLASH_SHARES,
@@ -37,6 +38,7 @@ from pneuopt.quantities.status import Code
 from pneuopt.quantities.units import write_value
 from pneuopt.shooting.least_squares import CpuBudget, Fit, solve_least_squares
 
+FREED = "freed to explain a misfit"  # the source of a fixed parameter that is tried
 Terms = tuple[Symbols, Symbols, Symbols]  # that are added to the rates of states, to inputs and to outputs
 
 
@@ -265,6 +267,22 @@ def _add_lines(problem: EstimationProblem, _fit: Fit, _amount: float) -> Estimat
     return _add_terms(problem, offsets | drifts, terms)
 
 
+def _free_fixed(problem: EstimationProblem, fit: Fit, _amount: float) -> EstimationProblem:
+    """The problem with that fixed value freed which promises most, by the equations linearised at the fit."""
+    squares = {n: s for n, s in promised_squares(problem, fit)[1].items() if math.isfinite(s)}
+    best = sorted(squares, key=lambda n: squares[n])[:1]
+    freed = ParameterSet({n: replace(problem.parameters[n], free=True, source=FREED) for n in best})
+    return replace(problem, parameters=problem.parameters | freed)
+
+
+def _describe_freed(problem: EstimationProblem, fit: Fit, _amount: float) -> str:
+    freed = {n: p for n, p in problem.parameters.items() if p.source == FREED}
+    found = {
+        n: (write_value(fit.parameters.value(n), p.unit, 3), write_value(p.value, p.unit, 3)) for n, p in freed.items()
+    }
+    return " and ".join(f"{n} of {new} in place of {given}" for n, (new, given) in found.items())
+
+
 EXPLANATIONS = (
     *(
         Explanation(
@@ -277,6 +295,7 @@ EXPLANATIONS = (
     ),
     Explanation("a leak", lambda problem: bool(_leaks(problem)), _add_leaks, lambda *_: "a leak"),
     Explanation("an offset of the input", lambda _: True, _add_offset, _describe_offset),
+    Explanation("a fixed value", lambda _: True, _free_fixed, _describe_freed),
     Explanation(
         "a dead time",
         lambda _: True,

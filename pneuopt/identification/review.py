@@ -302,7 +302,7 @@ class FixedValueTest:
 
 def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     """The fixed value whose freeing explains most of the misfit of a fit; None where none explains enough."""
-    without, freed = _promised_squares(problem, fit)
+    without, freed = promised_squares(problem, fit)
     excess = (without if fit.jumps is not None else 2 * fit.stats["cost"]) - fit.count
     promised = [((without - squares) / max(excess, without - fit.count), name) for name, squares in freed.items()]
     worthwhile = sorted((p for p in promised if p[0] >= MIN_PROMISED_SHARE), reverse=True)[:MAX_FREED_TRIALS]
@@ -325,7 +325,7 @@ def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     return replace(best, alike=tuple(t.name for t in alike[1:]), lag=lag)
 
 
-def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
+def promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
     """The squares with tight gaps by the equations linearised at a fit, and those with each fixed value freed."""
     # a fixed parameter may be wrong unless it is a width, or each log has or states one of its own
     widths = {w.name for w in problem.system.plant.identification_hints.widths}

@@ -127,6 +127,20 @@ def test_friction_that_the_model_lacks_is_named_with_its_size() -> None:
     assert explanation(result).startswith("Coulomb friction, 30")
 
 
+def test_a_fixed_value_that_is_wrong_is_named_before_what_looks_like_it() -> None:
+    """A mass of 6.5 kg that is stated as 5 kg: a dead time explains four fifths of what that leaves."""
+    drive = ForceDrive(Coulomb())
+    run = simulate(
+        drive.system(),
+        Trajectory(TIME, {"force": FORCE}),
+        drive.parameters.with_values(FRICTION | {"load.mass": 6.5}),
+        intersample={"force": Intersample.LINEAR},
+    )
+    speed = run["speed"] + NOISE["speed"] * np.random.default_rng(0).standard_normal(TIME.size)
+    log = Experiment(Trajectory(TIME, {"force": FORCE, "speed": speed}), {"speed": NOISE["speed"]}, name="run")
+    assert "load.mass" in explanation(fit(log, free=FREE[1:]))
+
+
 def test_nothing_is_named_where_nothing_explains_the_misfit() -> None:
     """A sensor that now and then shows a wave of its own: nothing in the plant does that."""
     wave = 0.1 * np.sin(400 * TIME) * (np.sin(5 * TIME) > 0.5)
