@@ -98,13 +98,15 @@ def explain_misfit(problem: EstimationProblem, fit: Fit, cpu_seconds: float) -> 
     if not trials:
         return Found("", False)
     best = min(trials.values(), key=lambda trial: trial.squares)
-    share = (without.squares - best.squares) / (without.squares - fit.count)
+    # the fit itself may be better, for its widths are free
+    missed = min(without.squares, 2 * fit.stats["cost"]) if fit.jumps is None else without.squares
+    share = (missed - best.squares) / (missed - fit.count)
     if not share >= MIN_EXPLAINED_SHARE:
         return Found(f"tried, but none explains the misfit: {', '.join(trials)}", False)
     scale = max(1.0, best.squares / fit.count)
     most = best.squares + ALIKE_SQUARES * scale
     alike = "".join(f"; {t.words} explains as much" for t in trials.values() if t is not best and t.squares <= most)
-    gain = 0.5 * (without.squares - best.squares) / scale
+    gain = 0.5 * (missed - best.squares) / scale
     size = f"explains {min(1.0, share):.0%} of the misfit, the log-likelihood gains {gain:.3g}"
     return Found(f"{best.words} {size}{alike}", True)
 
