@@ -28,6 +28,7 @@ LONE_FILES: Mapping[str, str] = {
     "pneuopt/dynamics/compiled/race.py": "the C structure of race.c: no other room holds ctypes",
     "pneuopt/files/first_files.py": "the text of files belongs to files; cli.init says what was written",
     "pneuopt/identification/review.py": "a subject of its own, what fixed values and widths hide",
+    "pneuopt/identification/explanations.py": "a subject of its own, what a model lacks: a row each",
     "pneuopt/models/pneumatic/logs.py": "what a drive's logs show, where it starts in them and what is wrong with them",
     "pneuopt/tuning/gradients.py": "a solver of its own: minimax SQP along responses",
 }

@@ -74,7 +74,7 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
         method, fits = LeastSquares(progress=report), list[IdentificationResult]()
         for log in experiments:
             own = parameters.fixed(*(n for n in log.conditions if n in parameters))
-            fits.append(identify(system, [log], own, method=method, throw=False))
+            fits.append(identify(system, [log], own, method=method, explain=False, throw=False))
             if not fits[-1].status.converged:  # it has no interval
                 warn(f"{log.name}: {fits[-1].status.verdict}; it does not count")
     found = track(fits, dates, parameters=options.parameters, drift=options.drift, horizon=options.horizon)

@@ -5,6 +5,7 @@ the predictions of logs, and the tables of results.
 """
 
 import math
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,7 +15,9 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import HasSystem, check_smooth
+from pneuopt.identification.explanations import explain_misfit
 from pneuopt.identification.forecast import agreement_rows, learn_forecast_error
+from pneuopt.identification.free_run import predict_logs, refuse_drift
 from pneuopt.identification.identifiability import (
     check_content,
     hold_unseen,
@@ -46,6 +49,7 @@ from pneuopt.identification.search import (
     run_freely,
 )
 from pneuopt.identification.statistics import confidence_interval
+from pneuopt.identification.tolerances import MIN_EXPLAINING_SECONDS, MODEL_ERROR_LEVEL
 from pneuopt.identification.widths import ESTIMATED_WIDTH, estimated_widths, free_widths, sticking_covariance
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
@@ -53,8 +57,9 @@ from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.output import one_blas_thread
 from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_argument, check_number, wrong_argument
 from pneuopt.quantities.status import Code, Progress, ProgressReporter, Status, provenance
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import CpuBudget, Fit, LeastSquares
-from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,6 +84,7 @@ def identify(
     accept: Sequence[str] = (),
     start: IdentificationResult | None = None,
     cpu_seconds: float = math.inf,
+    explain: bool = True,
     throw: bool = True,
     progress: Callable[[Progress], None] | None = None,
 ) -> IdentificationResult:
@@ -111,6 +117,9 @@ def identify(
     cpu_seconds : float
         CPU time of this process after which the search ends [s], within an iteration, with the best values so far; the
         status then says so first, and is `Code.BUDGET`.
+    explain : bool
+        Where the model misses the logs, try what it may lack (a dead time, friction, a leak), for as much CPU time as
+        the fit took; the status names what explains the misfit. Not with a `start` or a `loss`.
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
     progress : callable, optional
@@ -155,7 +164,7 @@ def identify(
             is_whole=window == math.inf,
         )
         check_window(problem)
-        result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise)
+        result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise, explain=explain)
     if log_warnings:
         result = replace(result, status=result.status.with_remedies(*log_warnings))
     if throw and not result.status.converged:
@@ -189,10 +198,15 @@ def _check_window_time(window: float | None) -> None:
 
 
 def _fit_and_review(
-    problem: EstimationProblem, loss: Loss | None, start: IdentificationResult | None, *, estimate_noise: bool
+    problem: EstimationProblem,
+    loss: Loss | None,
+    start: IdentificationResult | None,
+    *,
+    estimate_noise: bool,
+    explain: bool,
 ) -> IdentificationResult:
-    """Fit from the model's starts or a given one, in windows if need be, and review the intervals."""
-    window, problem = problem.window, free_widths(problem)
+    """Free widths, fit from the model's starts or a given one, in windows if need be, and review the intervals."""
+    begun, window, problem = time.process_time(), problem.window, free_widths(problem)
     problem, unseen = hold_unseen(problem)
     for sentence in unseen:
         warnings.warn(sentence, PhysicsWarning, stacklevel=3)
@@ -218,9 +232,22 @@ def _fit_and_review(
     if result.status.code not in (Code.INTERRUPTED, Code.BUDGET, Code.DIVERGED):
         error = learn_forecast_error(problem, result.parameters, LeastSquares(budget=problem.method.budget))
         result = replace(result, forecast_error=error)
-    if doubts.found:
-        result = replace(result, status=result.status.with_details(str(doubts.found)))
-    return replace(result, status=result.status.with_details(str(chosen))) if chosen else result
+    why = str(doubts.found) if doubts.found else ""
+    if not why and explain and start is None and loss is None and _is_missed(result):
+        seconds = max(time.process_time() - begun, MIN_EXPLAINING_SECONDS)
+        why, explains = explain_misfit(held, fit, min(seconds, problem.method.budget.part(1.0).seconds))
+        if explains:
+            result = replace(result, status=refuse_drift(result.status, result.stats["free_run_share"]))
+    return replace(result, status=result.status.with_details(why, str(chosen) if chosen else ""))
+
+
+def _is_missed(result: IdentificationResult) -> bool:
+    """Whether the residuals of a search that came to its end, or its gaps, are those of another model."""
+    if result.status.code not in (Code.CONVERGED, Code.PARTIAL, Code.MISFIT, Code.NOT_CONVERGED):
+        return False
+    is_absorbed = not result.status.converged and result.stats["gap_share"] > MAX_GAP_SHARE
+    is_large = result.stats["chi_square_ratio"] > MODEL_ERROR_LEVEL**2
+    return is_absorbed or is_large or result.status.code is Code.MISFIT
 
 
 def _result(
@@ -240,7 +267,10 @@ def _result(
     squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
     dof = degrees_of_freedom(problem, fit)
     variance = squares / dof
-    misfit = replace(diagnose_misfit(problem, fit, variance, dof), restarts=restarts)
+    free_runs = run_freely(problem, fit)
+    prediction = predict_logs(problem, fit, free_runs)
+    diagnosis = diagnose_misfit(problem, fit, variance, dof)
+    misfit = replace(diagnosis, restarts=restarts, is_useless=prediction.is_useless)
     covariance = None if misfit.covariance is None else misfit.covariance + sticking_covariance(problem, fit)
     influenced = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
@@ -252,24 +282,27 @@ def _result(
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
     widths = estimated_widths(problem.parameters)
     asked = set(free) - set(widths)
-    status = NOTHING_IDENTIFIABLE if asked and asked <= set(unidentifiable) else misfit.assess(fit.status)
+    status = prediction.assess(misfit.assess(fit.status))
+    if asked and asked <= set(unidentifiable):
+        status = NOTHING_IDENTIFIABLE if misfit.level <= MODEL_ERROR_LEVEL else misfit.refusal
     matrix = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
     parameters = problem.parameters.with_values(values)
     result = IdentificationResult(
         parameters | ParameterSet({n: replace(parameters[n], source=ESTIMATED_WIDTH) for n in widths}),
         _estimates(estimates, covariance, fit.at_bound, influenced, status, misfit),
         pd.DataFrame(matrix, index=list(free), columns=list(free)),
-        fit_table(problem, fit),
+        fit_table(problem, fit, free_runs),
         runs,
         status,
-        {**fit.stats, "chi_square_ratio": variance, "variance_inflation": misfit.inflation},
-        {
-            **provenance(problem.method, *([loss] if loss else [])),
-            "start": label,
-            **{f"sha256[{e.name}]": e.sha256 for e in problem.experiments},
-        },
+        {**fit.stats, "chi_square_ratio": variance, "variance_inflation": misfit.inflation, **prediction.stats},
+        _provenance(problem, label, loss),
     )
     return result, unidentifiable
+
+
+def _provenance(problem: EstimationProblem, label: str, loss: Loss | None) -> dict[str, str]:
+    hashes = {f"sha256[{e.name}]": e.sha256 for e in problem.experiments}
+    return {**provenance(problem.method, *([loss] if loss else [])), "start": label, **hashes}
 
 
 def _estimates(
@@ -298,10 +331,10 @@ def _estimates(
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
 
 
-def fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":
+def fit_table(problem: EstimationProblem, fit: Fit, free_runs: Sequence[Trajectory]) -> "pd.DataFrame":
     """A row a log and channel of a fit (`IdentificationResult.fit`)."""
     from pneuopt.quantities.frames import WideFrame
 
-    runs = zip(problem.experiments, fit.trajectories, run_freely(problem, fit), strict=True)
+    runs = zip(problem.experiments, fit.trajectories, free_runs, strict=True)
     rows = [row for e, run, free in runs for row in agreement_rows(problem.system, e, run, free)]
     return WideFrame(rows).set_index(["log", "channel"])

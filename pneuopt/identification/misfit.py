@@ -64,10 +64,11 @@ class Misfit:
     is_slow: bool = False  # whether it varies as slowly as the logs, or from log to log
     lone: tuple[str, ...] = ()
     restarts: bool = False  # whether windows that start anew follow the logs where the model, over whole logs, does not
+    is_useless: bool = False  # whether the fit does not predict its own logs (`predict_logs`)
 
     def mark(self, *, is_optimum: bool) -> Mark:
         """The mark of an estimate, which may be at an optimum or at a bound."""
-        is_missed = self.noisy_states or self.restarts or self.level > MODEL_ERROR_LEVEL
+        is_missed = self.noisy_states or self.restarts or self.is_useless or self.level > MODEL_ERROR_LEVEL
         if self.signals or is_missed or not is_optimum:
             return Mark.BIAS_POSSIBLE
         return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
@@ -78,21 +79,28 @@ class Misfit:
         if not (self.is_excessive and status.converged):
             return status
         verdict = f"residuals are {self.level:.3g} times the noise, so that estimates have ranges and no intervals"
-        remedy = "check sensors, units and conditions; then try a richer model"
-        return Status(Code.MISFIT, (verdict, *status.sentences, remedy))
+        return Status(Code.MISFIT, (verdict, *status.sentences))
+
+    @property
+    def refusal(self) -> Status:
+        """The status of a fit whose residuals leave no parameter identified."""
+        verdict = f"residuals are {self.level:.3g} times the noise, and beside such the logs identify no parameter"
+        return Status(Code.NOT_CONVERGED, (verdict, *self.sentences))
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences for the user: the misfit, and the logs that would help."""
+        """Sentences for the user on the misfit."""
         found = []
         if self.signals:
             found.append(f"residuals depend on {join_names(self.signals)}: model error, estimates may be biased")
         if self.restarts:
             found.append("over whole logs the misfit exceeds the noise: estimates from windows may be biased")
         if self.is_slow:
-            found.append("the misfit is as slow as the logs, or different from log to log: log more or longer runs")
+            found.append("the misfit is as slow as the logs, or different from log to log")
         if self.lone:
-            found.append(f"one log alone determines {join_names(self.lone)}: log more runs like it")
+            found.append(
+                f"one log alone determines {join_names(self.lone)}: how it scatters from log to log is unknown"
+            )
         return tuple(found)
 
 

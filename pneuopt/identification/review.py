@@ -189,8 +189,7 @@ def _review_failure(problem: EstimationProblem, start: Start, result: Identifica
     estimates = _add_notes(_blank_intervals(result.estimates, result.estimates.index), verdict.unidentifiable)
     if status.code is not Code.INTERRUPTED:
         status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
-        advice = _name_unidentifiable(verdict.unidentifiable), "fix what is unidentifiable, or log a run that shows it"
-        status = status.with_remedies(*(advice if verdict.unidentifiable else ()))
+        status = status.with_remedies(_name_unidentifiable(verdict.unidentifiable))
     unknown = result.covariance * math.nan
     return replace(result, estimates=estimates, covariance=unknown, status=status, verdict=verdict)
 
@@ -309,7 +308,7 @@ def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     # a wrong value drives widths to their bounds, where short fits do not follow: they stay at their starts
     given = problem.parameters
     problem = replace(problem, fixed={**problem.fixed, **{n: given.value(n) for n in estimated_widths(given)}})
-    without, freed = _promised_squares(problem, fit)
+    without, freed = promised_squares(problem, fit)
     excess = (without if fit.jumps is not None else 2 * fit.stats["cost"]) - fit.count
     promised = [((without - squares) / max(excess, without - fit.count), name) for name, squares in freed.items()]
     worthwhile = sorted((p for p in promised if p[0] >= MIN_PROMISED_SHARE), reverse=True)[:MAX_FREED_TRIALS]
@@ -332,7 +331,7 @@ def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     return replace(best, alike=tuple(t.name for t in alike[1:]), lag=lag)
 
 
-def _promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
+def promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
     """The squares with tight gaps by the equations linearised at a fit, and those with each fixed value freed."""
     # a fixed parameter may be wrong unless it is a width, or each log has or states one of its own
     widths = {w.name for w in problem.system.plant.identification_hints.widths}

@@ -600,16 +600,17 @@ def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
     return best.problem, best.fit.with_effort_of(fit), window
 
 
-def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
+def run_freely(problem: EstimationProblem, fit: Fit, window: float = math.inf) -> tuple[Trajectory, ...]:
     """Each log simulated from its fitted start to its end without gaps; only a hole in its inputs starts anew.
 
-    Not finite where the model diverges.
+    And so does each window of a finite time, from the fitted state. Not finite where the model diverges.
     """
     if not problem.system.states:
         return fit.trajectories
-    if math.isinf(problem.window) and fit.optimum is not None and (y := close_gaps(fit.optimum)) is not None:
+    is_whole = math.isinf(window) and math.isinf(problem.window)
+    if is_whole and fit.optimum is not None and (y := close_gaps(fit.optimum)) is not None:
         return fit.optimum.equations.segments.output_trajectories(y)
-    whole = replace(problem, window=math.inf, method=replace(problem.method, segment_time=math.inf))
+    whole = replace(problem, window=window, method=replace(problem.method, segment_time=window))
     segments = segment(whole.transcription(whole.start_from(fit)))
     nodes, q = start_nodes(segments), np.array([p.value for p in segments.transcription.parameters.values()])
     segments, substeps = choose_integration(segments, nodes, q, int(fit.stats["substeps"]))

@@ -413,7 +413,16 @@ class _Alike:
         given, logs, method = candidate.parameters, self.experiments, self._own_method
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="before the search")  # the table says what is unidentifiable
-            fit = identify(candidate.system, logs, given, method=method, window=self.window, start=start, throw=False)
+            fit = identify(
+                candidate.system,
+                logs,
+                given,
+                method=method,
+                window=self.window,
+                start=start,
+                explain=False,
+                throw=False,
+            )
         if self.window == math.inf and fit.status.converged and _has_jumps(fit, self.method):
             words = "it follows whole logs only with jumps of its states", *fit.status.sentences
             fit = replace(fit, status=Status(Code.NOT_CONVERGED, words))

@@ -29,6 +29,22 @@ START_ROUNDS = 4  # of differences, each over the deviation that the one before 
 FORECAST_LANES = 16  # runs at once, at most
 ENDLESS = 1e12  # [noise deviations, or the unit] at which a run counts that has left the model's range
 
+# Explanations of a misfit: what is tried of each
+
+MIN_EXPLAINING_SECONDS = 2.0  # [CPU s] that all of them may take where the fit took less
+DEAD_TIME_SAMPLES = (1, 2, 4, 8, 16, 32, 64, 128)  # [samples]
+BACKLASH_SHARES = (0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # [1] of an input's range
+STRIBECK_SHARES = (0.3, 0.1, 0.03)  # [1] Stribeck velocity over the root mean square of the speed
+TURN_SHARE = 0.01  # [1] of that speed, over which friction turns round; and of typical forces, where friction starts
+REFINED_AMOUNTS = 3  # further amounts, at the lowest points of parabolas
+
+# Free run
+
+# [1] error of a prediction over the motion, beyond which it is useless: fits of right models left up to .11, those of
+# problems/identify/mismatch.py up to .16, with a valve's centre that was not found .6, a dead time of a third of the
+# motion's horizon .29
+MAX_PREDICTION_SHARE = 0.25
+
 # Identifiability; standard deviations are over the value, or per e-fold of a logarithm
 
 HARMLESS_DEVIATION = 0.01  # [1] up to which a combination of parameters does no harm

@@ -398,7 +398,7 @@ def compare_logs(
     for log in logs:
         own = parameters.fixed(*(n for n in log.conditions if n in parameters))
         if own.free_names:
-            fits[log.name] = identify(system, [log], own, method=method, throw=False)
+            fits[log.name] = identify(system, [log], own, method=method, explain=False, throw=False)
     shared = [n for n in parameters.free_names if not parameters[n].per_log]
     rows = []
     for name in shared:

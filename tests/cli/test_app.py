@@ -18,13 +18,16 @@ from typer.testing import CliRunner, Result
 from pneuopt.cli import identify as identify_module
 from pneuopt.cli import tune as tune_module
 from pneuopt.cli.app import COMMAND_HELP, app
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Coulomb
+from pneuopt.quantities.parameters import Intersample
 from pneuopt.quantities.status import Code, Status
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.tuning.tune import TuningResult, tune
 
@@ -62,6 +65,33 @@ def test_identify_recovers_what_made_the_logs_and_says_so(folder: Path, axis_tru
     }
     assert words == {"sentences": [], "unidentifiable": [], "unchanged": [], "indistinguishable": [], "reasons": {}}
     assert said["verdict"]["table"][0]["name"] == "load.mass"
+
+
+def test_a_fit_that_does_not_predict_its_log_ends_with_1_and_names_what_it_lacks(folder: Path) -> None:
+    """The force acts 40 ms after it is logged."""
+    t = np.arange(2000) * 2e-3
+    force = 120 * np.sign(np.random.default_rng(3).standard_normal(40)).repeat(50)
+    drive = ForceDrive(Coulomb())
+    late = Trajectory(t, {"force": np.interp(t - 0.04, t, force)})
+    speed = simulate(drive.system(), late, drive.parameters, intersample={"force": Intersample.LINEAR})["speed"]
+    log = {
+        "time [s]": t,
+        "force [N]": force,
+        "speed [m/s]": speed + 1e-3 * np.random.default_rng(0).normal(size=t.size),
+    }
+    pd.DataFrame(log).to_csv("late.csv", index=False)
+    result = run("identify drive.toml late.csv -o fit.toml --json fit.json -q")
+    assert result.exit_code == 1
+    words = " ".join(result.stdout.split())
+    assert words.startswith(
+        "converged, but the model misses the logs: does not predict its own log: the free run misses"
+    )
+    assert " a dead time of 39." in words or " a dead time of 40" in words
+    said = json.loads(Path("fit.json").read_text(encoding="utf-8"))
+    assert said["status"]["code"] == "converged, but the model misses the logs"
+    assert said["stats"]["free_run_share"] > 0.25
+    told = run("simulate fit.toml tuning.toml -q").stderr  # as `pneuopt tune fit.toml tuning.toml`
+    assert "does not predict its own log" in " ".join(told.split())
 
 
 def test_a_refused_log_is_accepted_by_the_name_of_its_check(folder: Path) -> None:

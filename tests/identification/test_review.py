@@ -106,7 +106,7 @@ def test_what_a_user_knows_best_is_named_last(
     fit = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
     axis = Axis(final_element=FinalElement("valve", "spool", "air", "", "", "valve.bandwidth", "", ()))
     problem = replace(problem, system=replace(problem.system.plant, axis=axis))
-    monkeypatch.setattr(review, "_promised_squares", lambda *_: (2e6, dict.fromkeys(names, 1e3)))
+    monkeypatch.setattr(review, "promised_squares", lambda *_: (2e6, dict.fromkeys(names, 1e3)))
     monkeypatch.setattr(
         review, "_try_freed", lambda _p, _f, name, _e: WrongValue(name, 50.0, 25.0, "Hz", 0.99, found[name])
     )
