@@ -84,7 +84,7 @@ def explain_misfit(problem: EstimationProblem, fit: Fit, cpu_seconds: float) -> 
         problem.method, segment_time=horizon, stages=(last,), budget=budget, allows_state_noise=False, progress=None
     )
     # a width that is free stops a search from a wrong model's values
-    widths = {n: problem.parameters.value(n) for n in estimated_widths(problem)}
+    widths = {n: problem.parameters.value(n) for n in estimated_widths(problem.parameters)}
     problem, trials = replace(problem, window=horizon, method=method, fixed=widths), dict[str, Trial]()
     try:
         without = Trial("", 0.0, _fit_shortly(problem, fit))
