@@ -25,6 +25,7 @@ from pneuopt.identification.result import (
     EstimateRow,
     IdentifiableRow,
     IdentificationResult,
+    TrailRow,
     Verdict,
 )
 from pneuopt.identification.select_model import ModelSelection
@@ -241,6 +242,7 @@ OUTPUTS: Mapping[str, Member] = {
         fit=_FIT,
         verdict=_VERDICT,
         window=Member("windows in which logs were fitted", Holds.RECORD, members_of(ChosenWindow), is_optional=True),
+        trail=_rows("a row a try of the search", members_of(TrailRow)),
         bootstrap=_optional(_rows("with --bootstrap, a row an estimate", _NAMED, is_open=True)),
         stats=_STATS,
         provenance=_PROVENANCE,

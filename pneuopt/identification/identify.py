@@ -272,13 +272,9 @@ def _result(
     diagnosis = diagnose_misfit(problem, fit, variance, dof)
     misfit = replace(diagnosis, restarts=restarts, is_useless=prediction.is_useless)
     covariance = None if misfit.covariance is None else misfit.covariance + sticking_covariance(problem, fit)
-    influenced = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
-        influenced = prior_influenced(covariance, fit.prior_covariance)
-        found = np.array([p.value for p in estimates.values()])
-        held = [value for n, value in problem.fixed.items() if n not in problem.unseen]
-        resting = prior_dominated(covariance, fit.prior_covariance, found, held)
+    influenced, resting = _weigh_prior(problem, fit, covariance)
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.fixed)
     widths = estimated_widths(problem.parameters)
     asked = set(free) - set(widths)
@@ -298,6 +294,17 @@ def _result(
         _provenance(problem, label, loss),
     )
     return result, unidentifiable
+
+
+def _weigh_prior(problem: EstimationProblem, fit: Fit, covariance: Array | None) -> tuple[Mask, Mask]:
+    """Which free parameters the prior of what is held influences, and which rest on it, shapes (k,)."""
+    free = fit.parameters.free_names
+    if covariance is None or fit.prior_covariance is None:
+        return np.zeros(len(free), dtype=bool), np.zeros(len(free), dtype=bool)
+    found = np.array([fit.parameters.value(n) for n in free])
+    held = [value for n, value in problem.fixed.items() if n not in problem.unseen]
+    resting = prior_dominated(covariance, fit.prior_covariance, found, held)
+    return prior_influenced(covariance, fit.prior_covariance), resting
 
 
 def _provenance(problem: EstimationProblem, label: str, loss: Loss | None) -> dict[str, str]:

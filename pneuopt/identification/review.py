@@ -85,7 +85,8 @@ def review_fit(
     estimates = _blank_intervals(result.estimates, unknown)
     for name, found in profiles.items():
         # the linear interval is that of the curvature at the peak, which says little of the side on which it is flat
-        estimates.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
+        value = float(result.estimates["value"][name])  # a profile may lead to where the fit is as good
+        estimates.loc[name, ["ci_low", "ci_high"]] = [min(found.low, value), max(found.high, value)]
         farther = max(found.high - found.estimate, found.estimate - found.low) / math.sqrt(found.threshold)
         deviation = math.nan if found.is_open else max(farther, float(result.estimates["stderr"][name]))
         estimates.loc[name, "stderr"] = deviation

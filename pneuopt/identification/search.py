@@ -1,11 +1,20 @@
-"""`fit_from_starts`: the best fit from the model's own starts, with the parameters held that logs cannot identify.
+"""`find_fit`: the best fit from the model's own starts, with the parameters held that logs cannot identify.
 
-The first start is tried alone, then the parameters to which the prediction errors of a filter lead, then the others by
-their cost after a few iterations with their guesses held. A parameter that the data do not determine is held at its
-given value: that needs no weight for a prior beside that of the data, and the prior's spread is counted in the
-covariance of the others (`Fit.prior_covariance`).
+One table, `ATTEMPTS`, is the search: each row says where it suits, how it comes to fits, and when its last try is the
+answer. They are made in their order until one is enough; `IdentificationResult.trail` shows what was tried.
 
-`fit_logs`: the short ways of long logs first; most need no more (`problems/identify/random_plants.py --kind other`).
+    attempt              leads to
+    first start          most answers, in one search
+    excerpt              those of long logs, from their liveliest part
+    prediction errors    those of drives that stick, from the best of many hypotheses that a filter follows
+    filtered states      those of rough starts, whose nodes would close slowly
+    other starts         those of the guesses that the first start did not make
+    tighter gaps         the optimum of a model that misses the logs by a little, as by the lag of a sensor
+    noise of the states  the best that a model does which misses the logs, marked
+
+A parameter that the data do not determine is held at its given value: that needs no weight for a prior beside that of
+the data, and the prior's spread is counted in the covariance of the others (`Fit.prior_covariance`). What each row is
+worth is measured by problems/identify/ablation.py.
 
 `fit_in_windows`: a plant that integrates adds up whatever its model misses: the position runs away from the log, and
 the gaps of a fit that links its segments take the misfit in their place. In windows with a start state each the model
@@ -32,15 +41,20 @@ from pneuopt.identification.problem import EstimationProblem, outputs_in_log
 from pneuopt.identification.result import ChosenWindow, IdentificationResult, Mark, TrailRow
 from pneuopt.identification.tolerances import (
     ACCEPTED_CHI_SQUARE_RATIO,
+    ALIKE_SQUARES,
     BEST,
     CLEAR_DEVIATIONS,
     DECIDING,
     EXCERPT_SEGMENTS,
+    GAP_FACTOR,
     GUESS_STAGES,
     HOPELESS_MISFIT,
     LEVELS,
+    MAX_CLOSED_MISFIT,
+    MAX_CLOSED_SHARE,
     MAX_COST,
     MAX_SEGMENTS,
+    MAX_STAGES,
     MIN_DOUBTED,
     MIN_EXCESS,
     MIN_KNOWN_SHARE,
@@ -95,8 +109,13 @@ class Search:
 
     @property
     def best(self) -> Tried:
-        """The best try so far."""
-        return min(self.tried, key=lambda each: rank(each.fit, self.problem.method.stages[-1].gap))
+        """The best try so far; of those that the logs do not tell apart, one with the fewest values at their bounds."""
+        tightest = self.problem.method.stages[-1].gap
+        first, *others = sorted(self.tried, key=lambda each: rank(each.fit, tightest))
+        (order, cost), alike = rank(first.fit, tightest), [first]
+        for place, other in ((rank(each.fit, tightest), each) for each in others):
+            alike += [other] if place[0] == order and 2 * (place[1] - cost) <= ALIKE_SQUARES else []
+        return min(alike, key=lambda each: int(each.fit.at_bound.sum()))
 
     @property
     def guesses(self) -> list[Start]:
@@ -222,6 +241,25 @@ def _from_other_starts(search: Search) -> Iterator[Candidate]:
         if fit.end is SearchEnd.DUPLICATE:
             return
         yield replace(held, method=problem.method), fit, start.label
+
+
+def _from_tighter_gaps(search: Search) -> Iterator[Candidate]:
+    """The best fit with tighter gaps, where it is an optimum whose gaps absorb what the model misses by a little.
+
+    None where they lead to no optimum, or to residuals so large that the model does not follow the logs.
+    """
+    best, problem = search.best, search.problem
+    found, stage = best.fit, replace(problem.method.stages[-1], refine=1)  # steps are refined where it has converged
+    for _ in range(MAX_STAGES if found.stats["gap_share"] < MAX_CLOSED_SHARE else 0):
+        if not (is_optimum(found) and 2 * found.stats["cost"] <= MAX_CLOSED_MISFIT * found.count):
+            return
+        stage = replace(stage, gap=GAP_FACTOR * stage.gap)
+        method = replace(problem.method, stages=(stage,), allows_state_noise=False)
+        before, found = found, solve_least_squares(best.problem.transcription(problem.start_from(found)), method)
+        found = found.with_effort_of(before)
+        if found.status.converged:
+            yield best.problem, found, f"{best.label}, tighter gaps"
+            return
 
 
 def _from_state_noise(search: Search) -> Iterator[Candidate]:
@@ -442,7 +480,7 @@ def liveliest_part(columns: Array, count: int) -> int:
 RATIOS = np.geomspace(1.1, 2.4, 8)
 
 
-def _bounded(problem: EstimationProblem) -> dict[str, str]:
+def _order_of_unknowns(problem: EstimationProblem) -> dict[str, str]:
     """The free parameters that another free one bounds from below, as Coulomb friction bounds static friction."""
     free = set(problem.parameters.free_names) - set(problem.fixed)
     order = problem.system.plant.identification_hints.at_least
@@ -454,7 +492,7 @@ def _can_predict(search: Search) -> bool:
     problem = search.problem
     is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
     is_plain = is_whole and bool(problem.system.states) and not problem.weights and search.loss is None
-    return is_plain and bool(_bounded(problem)) and len(search.guesses) > 1
+    return is_plain and bool(_order_of_unknowns(problem)) and len(search.guesses) > 1
 
 
 def _from_predictions(search: Search) -> Iterator[Candidate]:
@@ -464,7 +502,7 @@ def _from_predictions(search: Search) -> Iterator[Candidate]:
     scaling = ParameterScaling(segments.transcription)
     with check_during_runs(problem.method.budget.check):
         errors = PredictionErrors(segments, start_nodes(segments), scaling, _liveliest(segments, problem))
-        z = _best_sets(errors, list(_hypotheses(guesses, _bounded(problem))), problem)
+        z = _best_sets(errors, list(_hypotheses(guesses, _order_of_unknowns(problem))), problem)
         for gathered, steps, count in LEVELS:
             if problem.method.progress is not None:
                 problem.method.progress(f"prediction errors, states may gather {gathered:g} of their nominal size")
@@ -526,9 +564,14 @@ def _has_filter(search: Search) -> bool:
 
 
 def _gaps_absorb_misfit(search: Search) -> bool:
-    """Whether gaps absorb what the model misses in the best fit, and may stand for noise of its states."""
-    fit, allows = search.best.fit, search.problem.method.allows_state_noise
-    return allows and not fit.status.converged and fit.stats["gap_share"] > MAX_GAP_SHARE
+    """Whether gaps absorb what the model misses in the best fit."""
+    fit = search.best.fit
+    return not fit.status.converged and fit.stats["gap_share"] > MAX_GAP_SHARE
+
+
+def _allows_state_noise(search: Search) -> bool:
+    """Whether gaps absorb what the model misses, and may stand for noise of its states."""
+    return search.problem.method.allows_state_noise and _gaps_absorb_misfit(search)
 
 
 ATTEMPTS: tuple[Attempt, ...] = (
@@ -537,7 +580,8 @@ ATTEMPTS: tuple[Attempt, ...] = (
     Attempt("prediction errors", _can_predict, _from_predictions, _is_followed),
     Attempt("filtered states", _has_filter, _from_filtered, _is_at_noise),
     Attempt("other starts", lambda search: len(search.problem.candidates) > 1, _from_other_starts, _is_confirmed),
-    Attempt("noise of the states", _gaps_absorb_misfit, _from_state_noise, lambda _: True),
+    Attempt("tighter gaps", _gaps_absorb_misfit, _from_tighter_gaps, _is_followed),
+    Attempt("noise of the states", _allows_state_noise, _from_state_noise, lambda _: True),
 )
 """In their order: what leads to the answer most often, for the least, comes first."""
 

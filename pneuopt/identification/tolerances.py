@@ -132,6 +132,11 @@ BEST = 2  # sets that descend
 # deviation that the states gather along a segment [nominal sizes], the steps at most, and the sets that go on
 LEVELS = ((1e-3, 4, 2), (3e-4, 6, 1), (1e-4, 6, 1), (3e-5, 6, 1))
 MAX_COST = 1.3  # [1] cost a sample at which no set goes on; of what would lead to the noise .9
+# [1] squared residuals over the noise's and the gaps' share of them, above which gaps are not tightened: a sensor's lag
+# has 60 and .17, a plant that runs away from its log .9
+MAX_CLOSED_MISFIT, MAX_CLOSED_SHARE = 100.0, 0.3
+GAP_FACTOR = 0.3  # [1] gap of each tightening stage over that of the one before
+MAX_STAGES = 3  # that tighten gaps
 DECIDING = LEVELS[1][0]  # [nominal sizes] deviation from which on that cost counts
 
 # Select model

@@ -163,7 +163,7 @@ def test_no_advice_is_given_by_rote() -> None:
 def test_a_position_that_drifts_away_is_excused_by_its_motion() -> None:
     """A small force that is not logged: over 4 s the position runs away from the log, and over its motion hardly."""
     drive = ForceDrive(Viscous())
-    log = log_of(Viscous(), change=lambda force: force + 4 * np.sin(TIME / 2), output="position", viscous=1.0)
+    log = log_of(Viscous(), change=lambda force: force + 4 * np.sin(TIME), output="position", viscous=1.0)
     known = drive.parameters.with_values({"friction.viscous": 1.0})
     result = identify(drive.system(), log, known.freed("load.mass"), throw=False)
     assert result.stats["free_run_share"] > MAX_PREDICTION_SHARE

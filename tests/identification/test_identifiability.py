@@ -207,7 +207,7 @@ def test_identify_warns_before_it_searches(monkeypatch: pytest.MonkeyPatch) -> N
     def search(*_: object, **__: object) -> None:
         raise RuntimeError("the search has begun")
 
-    monkeypatch.setattr(identify_module, "fit_logs", search)
+    monkeypatch.setattr(identify_module, "find_fit", search)
     given = DRIVE.parameters.freed("friction.coulomb", "load.force")
     with (
         pytest.warns(PhysicsWarning, match=r"before the search: .*load\.force: the drive moves forwards only"),

@@ -445,7 +445,7 @@ def test_noise_of_the_states_is_tried_last_and_where_gaps_absorb_the_misfit_alon
     ):
         held, fit, label = tried(code, 1.0, "any")
         made.tried = [search.Tried("", held, replace(fit, stats={**fit.stats, "gap_share": share}), label, 0.0)]
-        assert search._gaps_absorb_misfit(made) is allowed
+        assert search._allows_state_noise(made) is allowed
 
 
 def test_each_guess_is_tried_with_each_ratio_and_no_two_neighbours_descend() -> None:
@@ -589,9 +589,14 @@ def pushed(seed: int | None = 1) -> Experiment:
     return log.with_intersample({"force": Intersample.LINEAR})
 
 
+def with_stated_width(parameters: ParameterSet) -> ParameterSet:
+    """The parameters with friction's smoothing as one who knows it says it: it is then not estimated."""
+    return parameters | ParameterSet({"friction.smoothing": replace(parameters["friction.smoothing"], source="known")})
+
+
 @cache
 def fitted(seed: int | None = 1) -> IdentificationResult:
-    return identify(DRIVE.system(), pushed(seed), DRIVE.parameters.freed(*FREE_WINDOWS), throw=False)
+    return identify(DRIVE.system(), pushed(seed), with_stated_width(DRIVE.parameters.freed(*FREE_WINDOWS)), throw=False)
 
 
 def far_off(result: IdentificationResult, truth: ParameterSet = TRUTH_WINDOWS) -> float:
@@ -661,11 +666,6 @@ def test_a_wrong_model_has_no_estimate_in_windows_that_is_not_marked() -> None:
     result = identify(model.system(), pushed(), model.parameters.freed("load.mass", "friction.viscous"), throw=False)
     assert result.window is not None
     assert set(result.estimates["mark"]) == {Mark.BIAS_POSSIBLE}
-
-
-def with_stated_width(parameters: ParameterSet) -> ParameterSet:
-    """The parameters with friction's smoothing as one who knows it says it: it is then not estimated."""
-    return parameters | ParameterSet({"friction.smoothing": replace(parameters["friction.smoothing"], source="known")})
 
 
 def test_a_log_in_one_segment_has_a_covariance() -> None:

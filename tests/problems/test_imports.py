@@ -21,6 +21,7 @@ INSIDE = {
     "problems/shared/b32.py": "makes its logs by machine code, and times one simulation of it as the unit of cost",
     "problems/shared/random_problems.py": "finds feasible designs by brute force on the search's batched simulator",
     "problems/paper/paper_rivals.py": "tunes designs that hunt, which tune refuses, on the search's simulator",
+    "problems/identify/ablation.py": "takes an attempt or a number out of the search",
     "problems/identify/good_logs.py": "asks the log doctor itself, which identify asks first",
     "problems/shared/mismatched_rig.py": "makes its logs by machine code, of the library's valve and chambers",
     "problems/speed/benchmark_identification.py": "times the full-space solver from the start that the log gives",
