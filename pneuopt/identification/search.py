@@ -224,7 +224,8 @@ def _from_first_start(search: Search) -> Iterator[Candidate]:
     """The model's first start, left after its first stage where that is far from the logs and others are to come."""
     problem, start = search.problem, search.problem.candidates[0]
     may_wait = search.loss is None and problem.has_gaps and len(search.guesses) > 1
-    tried = replace(problem, method=replace(problem.method, allows_state_noise=False))
+    allows = problem.method.allows_state_noise and not may_wait  # with other starts to come, these are tried before
+    tried = replace(problem, method=replace(problem.method, allows_state_noise=allows))
     held, fit = fit_fixing_unidentifiable(tried, start, HOPELESS_MISFIT if may_wait else math.inf)
     yield replace(held, method=problem.method), fit, start.label
 
