@@ -128,7 +128,7 @@ def find_refresh(column: ArrayLike, t: ArrayLike | None = None) -> Refresh | Non
     Examples
     --------
     >>> find_refresh(np.repeat(np.sqrt(np.arange(30.0)), 4)).period
-    4.0
+    4
     """
     y = np.asarray(column, dtype=float)
     stamps = np.arange(y.size, dtype=float) if t is None else np.asarray(t, dtype=float)
