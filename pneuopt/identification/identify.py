@@ -42,8 +42,10 @@ from pneuopt.identification.review import FixedValueTest, review_fit
 from pneuopt.identification.search import (
     Search,
     check_window,
+    enforce_ordering,
     find_fit,
     fit_fixing_unidentifiable,
+    fit_from_profiles,
     fit_in_windows,
     mark_order,
     run_freely,
@@ -226,7 +228,11 @@ def _fit_and_review(
         restarts = 2 * fit.stats["cost"] > MAX_CHI_SQUARE_RATIO * fit.count
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
-    result = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
+    held, fit = enforce_ordering(held, fit, label)
+    result, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
+    while better := fit_from_profiles(held, fit, profiles):
+        fit = better
+        result, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
     result = replace(mark_order(held, result), window=chosen, trail=trail)
     result = replace(result, status=problem.method.budget.name_end(result.status))
     if result.status.code not in (Code.INTERRUPTED, Code.BUDGET, Code.DIVERGED):

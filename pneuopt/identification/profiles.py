@@ -202,11 +202,11 @@ class _Refits:
         """The parameter's value at a searched one."""
         return math.exp(z) if self.parameter.log else z
 
-    def refit_at(self, z: float) -> _ProfilePoint:
-        """The fit with the parameter held there; raises `KeyboardInterrupt` if it was interrupted."""
+    def refit_at(self, z: float, begin: _ProfilePoint | None = None) -> _ProfilePoint:
+        """The fit with the parameter held there, from a refit or the nearest; `KeyboardInterrupt` if interrupted."""
         start = self.start
         if self.points:
-            start = self.problem.start_from(min(self.points, key=lambda known: abs(known.z - z)).fit)
+            start = self.problem.start_from((begin or min(self.points, key=lambda known: abs(known.z - z))).fit)
         transcription = self.problem.transcription(start)
         held = replace(self.parameter, value=self.value(z), lower=self.value(z), upper=self.value(z))
         transcription = replace(transcription, parameters=transcription.parameters | ParameterSet({self.name: held}))
@@ -216,6 +216,12 @@ class _Refits:
         point = _ProfilePoint(z, fit)
         self.points.append(point)
         return point
+
+    def retry(self, point: _ProfilePoint, begin: _ProfilePoint) -> _ProfilePoint:
+        """The better of a refit and another one there that begins elsewhere."""
+        again = self.refit_at(point.z, begin)
+        self.points.remove(point if again.cost < point.cost else again)
+        return min(point, again, key=lambda each: each.cost)
 
     def deviance_root(self, point: _ProfilePoint) -> float:
         """Distance from the best fit, in standard deviations were the model linear; infinite where nothing fits."""
@@ -266,8 +272,11 @@ def _bracket(refits: _Refits, side: int, target: float) -> None:
         is_probe = bool(probes)
         point = probes.pop() if is_probe else refits.refit_at(z)
         if refits.deviance_root(point) >= target:
-            _locate_crossing(refits, inside, point, target)
-            return
+            within = _locate_crossing(refits, inside, point, target)
+            if within is None:
+                return
+            inside, step = within, first  # it was no crossing: on from there
+            continue
         if _is_at_level(refits, point, target):
             return
         gained = refits.deviance_root(point) - refits.deviance_root(inside)
@@ -296,19 +305,27 @@ def _is_at_level(refits: _Refits, point: _ProfilePoint, target: float) -> bool:
     return abs(refits.deviance_root(point) - target) < END_TOLERANCE * target
 
 
-def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePoint, target: float) -> None:
-    """Locate a crossing of the level by false position on the deviance's root, nearly linear; or its jump."""
+def _locate_crossing(
+    refits: _Refits, inside: _ProfilePoint, outside: _ProfilePoint, target: float
+) -> _ProfilePoint | None:
+    """Locate a crossing of the level by false position on the deviance's root, nearly linear; or its jump.
+
+    A refit beyond a jump may have been caught on its way: it is made again from this side, and is returned where it
+    then lies within the level.
+    """
     for _ in range(MAX_REFITS_A_SIDE):
         if abs(outside.z - inside.z) <= END_TOLERANCE * abs(outside.z - refits.centre):
-            return
+            again = refits.retry(outside, inside)
+            return again if refits.deviance_root(again) < target else None
         if _is_at_level(refits, outside, target) or _is_at_level(refits, inside, target):
-            return
+            return None
         a, b = refits.deviance_root(inside), refits.deviance_root(outside)
         if not a < target <= b:  # a refit has found a better fit, from which all are counted now
-            return
+            return None
         share = (target - a) / (b - a) if math.isfinite(b) else 0.5
         point = refits.refit_at(inside.z + min(max(share, 0.05), 0.95) * (outside.z - inside.z))
         inside, outside = (point, outside) if refits.deviance_root(point) < target else (inside, point)
+    return None
 
 
 ParameterValues = Mapping[str, float]

@@ -58,14 +58,14 @@ if TYPE_CHECKING:
 
 def review_fit(
     problem: EstimationProblem, result: IdentificationResult, unidentifiable: Sequence[str] = ()
-) -> IdentificationResult:
-    """Review the intervals of a fit, by profiles where the linear ones are doubtful, and mark what is not identified.
+) -> tuple[IdentificationResult, tuple[Profile, ...]]:
+    """Review the intervals of a fit, mark what its logs do not identify, and return the profiles traced on the way.
 
     Without convergence no interval stays, and the status names the worst place.
     """
     start = problem.start_from(result)
     if not result.status.converged:
-        return _review_failure(problem, start, result)
+        return _review_failure(problem, start, result), ()
     result = replace(result, estimates=_blank_intervals(result.estimates, unidentifiable))
     profiles, waiting = _profiles(problem, result)
     result = _widen_dragged(result, profiles)
@@ -85,8 +85,7 @@ def review_fit(
     estimates = _blank_intervals(result.estimates, unknown)
     for name, found in profiles.items():
         # the linear interval is that of the curvature at the peak, which says little of the side on which it is flat
-        value = float(result.estimates["value"][name])  # a profile may lead to where the fit is as good
-        estimates.loc[name, ["ci_low", "ci_high"]] = [min(found.low, value), max(found.high, value)]
+        estimates.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
         farther = max(found.high - found.estimate, found.estimate - found.low) / math.sqrt(found.threshold)
         deviation = math.nan if found.is_open else max(farther, float(result.estimates["stderr"][name]))
         estimates.loc[name, "stderr"] = deviation
@@ -97,7 +96,8 @@ def review_fit(
         detail = f"the intervals of {join_names(waiting)} are of the linear model, which is doubtful here"
         status = Status(Code.INTERRUPTED, (words, detail, *status.sentences[1:], "run again for the intervals"))
     status = _name_part(problem, status, verdict)
-    return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
+    result = replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
+    return result, tuple(profiles.values())
 
 
 def _widen_covariance(covariance: "pd.DataFrame", stderr: "pd.Series[float]") -> "pd.DataFrame":

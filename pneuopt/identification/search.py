@@ -25,7 +25,7 @@ of Probability and its Applications 35(3), 1991; problems/identify/windows.py ho
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
@@ -34,10 +34,11 @@ import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.identifiability import rejects_fixed_values
+from pneuopt.identification.identifiability import rejects_fixed_values, verdict_from_sensitivities
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, t_quantile
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log
+from pneuopt.identification.profiles import Profile
 from pneuopt.identification.result import ChosenWindow, IdentificationResult, Mark, TrailRow
 from pneuopt.identification.tolerances import (
     ACCEPTED_CHI_SQUARE_RATIO,
@@ -585,6 +586,52 @@ ATTEMPTS: tuple[Attempt, ...] = (
     Attempt("noise of the states", _allows_state_noise, _from_state_noise, lambda _: True),
 )
 """In their order: what leads to the answer most often, for the least, comes first."""
+
+
+def fit_from_profiles(problem: EstimationProblem, fit: Fit, profiles: Iterable[Profile]) -> Fit | None:
+    """The fit that begins with the best values of the first profile whose interval does not hold the estimate.
+
+    None where every estimate lies in its interval; the given fit, not converged, where no better one is found.
+    """
+    found = next((p for p in profiles if not p.low <= p.estimate <= p.high), None)
+    if found is None:
+        return None
+    start, best = problem.start_from(fit), found.curve.sort_values("deviance").iloc[0]
+    value = float(best["value"])
+    values = {n: float(best[n]) for n in start.parameters if n != found.name} | {found.name: value}
+    method = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
+    start = replace(start, parameters={**start.parameters, **values})
+    better = solve_least_squares(problem.transcription(start), method).with_effort_of(fit)
+    is_better = better.stats["cost"] < fit.stats["cost"]
+    if better.status.code is Code.INTERRUPTED:
+        return better if is_better else replace(fit, status=better.status)
+    if is_better and better.status.converged:
+        return better
+    verdict = f"{found.name} fits better at {value:.4g} {found.unit}, from where the search finds no better optimum"
+    return replace(fit, status=Status(Code.NOT_CONVERGED, (verdict, "try other start values, or fix a parameter")))
+
+
+def enforce_ordering(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
+    """Hold parameters that no plant has below another one at that one's value, where the logs do not show them."""
+    found, bound = fit.parameters, dict(zip(fit.parameters.free_names, fit.at_bound, strict=True))
+    order = problem.system.plant.identification_hints.at_least
+    below = {n: m for n, m in order.items() if bound.get(n) or n in problem.fixed}
+    given = problem.unknowns()
+    known = {n: m for n, m in below.items() if m in found and found.value(n) < found.value(m) <= given[n].upper}
+    values = {n: found.value(m) for n, m in known.items()}
+    if not values or not fit.status.converged:
+        return problem, fit
+    start = problem.start_from(fit, label)
+    start = replace(start, parameters={**start.parameters, **values})
+    begun = given.with_values(start.parameters)
+    unseen = {n: begun.value(n) for n in verdict_from_sensitivities(problem, start).unidentifiable}
+    ordered = replace(problem, fixed={**problem.fixed, **unseen, **values})
+    if len(ordered.fixed) >= len(found.free_names):
+        return problem, fit
+    held, other = fit_fixing_unidentifiable(ordered, start)
+    settled = other.status.converged and not other.unidentifiable and (other.jumps is None or fit.jumps is not None)
+    rejected = not settled or rejects_fixed_values(other, fit, len(held.fixed))
+    return (problem, fit) if rejected else (held, other.with_effort_of(fit))
 
 
 def mark_order(problem: EstimationProblem, result: IdentificationResult) -> IdentificationResult:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -73,10 +74,11 @@ def test_of_a_drive_with_soft_gaps_it_is_the_linear_interval(seed: int) -> None:
     run = simulate(system, Trajectory(t, {"force": force}), truth, intersample={"force": Intersample.LINEAR})
     noisy = run["position"] + 2e-5 * np.random.default_rng(seed).standard_normal(t.size)
     log = Experiment(Trajectory(t, {"force": force, "position": noisy}), {"position": 2e-5}, name="run")
-    known = truth | ParameterSet({"friction.smoothing": replace(truth["friction.smoothing"], source="stated")})
-    result = identify(system, [log], known.freed("load.mass", "friction.coulomb", "friction.viscous"))
-    found, row = profile(system, [log], result, "friction.viscous"), result.estimates.loc["friction.viscous"]
-    assert found.high - found.low == pytest.approx(row["ci_high"] - row["ci_low"], rel=0.03)
+    stated = ParameterSet({"friction.smoothing": replace(truth["friction.smoothing"], source="known")})
+    for known, near in ((truth | stated, 0.03), (truth, 0.05)):  # a width that is estimated bends the valley
+        result = identify(system, [log], known.freed("load.mass", "friction.coulomb", "friction.viscous"))
+        found, row = profile(system, [log], result, "friction.viscous"), result.estimates.loc["friction.viscous"]
+        assert found.high - found.low == pytest.approx(row["ci_high"] - row["ci_low"], rel=near)
 
 
 def test_a_weakly_identifiable_stribeck_velocity_has_unequal_sides() -> None:
@@ -119,11 +121,8 @@ def test_a_curve_that_is_not_there_has_open_ends_and_no_interval() -> None:
     said = f"the logs do not identify {name}: anything from 0.0001 to 1 m/s fits as well; log"
     assert said in " ".join(result.verdict.sentences)
     assert np.isnan(result.covariance[name]).all()
-    assert f"the logs do not identify {name}" in result.status.sentences
-    # nor its static friction: where the curve is narrower than all speeds, anything below Coulomb friction will do
-    static = result.estimates.to_dict(orient="index")["friction.static"]
-    assert static["ci_low"] == -math.inf
-    assert float(static["ci_high"]) >= float(static["value"])
+    # nor its static friction: what leads to other values of one leads to other values of both
+    assert f"the logs do not identify friction.static and {name}" in result.status.sentences
     assert result.estimates["ci_low"]["friction.coulomb"] < 30.0 < result.estimates["ci_high"]["friction.coulomb"]
 
 
@@ -195,11 +194,22 @@ def test_a_profile_that_jumps_over_its_level_is_not_followed_into_the_jump() -> 
             return SimpleNamespace(z=z)
 
         def deviance_root(self, point: SimpleNamespace) -> float:
-            return 1.0 if point.z < math.pi / 4 else 3.0
+            return 1.0 if point.z < math.pi / 4 or id(point) in again else 3.0
 
-    profiles._locate_crossing(Jump(), SimpleNamespace(z=0.0), SimpleNamespace(z=1.0), 2.0)  # type: ignore[arg-type]
+        def retry(self, point: SimpleNamespace, begin: SimpleNamespace) -> SimpleNamespace:
+            assert begin.z < point.z
+            return mended or point
+
+    mended: Any = None
+    again = set[int]()
+    jump, near, far = cast("Any", (Jump(), SimpleNamespace(z=0.0), SimpleNamespace(z=1.0)))
+    assert profiles._locate_crossing(jump, near, far, 2.0) is None
     assert len(tried) <= 8
     assert abs(tried[-1] - math.pi / 4) < 2 * END_TOLERANCE
+    # a refit that was caught beyond the jump is no end: from this side it lies within
+    mended = SimpleNamespace(z=0.8)
+    again.add(id(mended))
+    assert profiles._locate_crossing(jump, near, far, 2.0) is mended
 
 
 class LinearRefits:
@@ -277,7 +287,7 @@ def test_what_a_closed_profile_drags_has_an_interval_that_holds_where_it_went(mo
     monkeypatch.setattr(review, "_profiles", lambda *_: ({name: closed}, []))
     logs = tuple(check_logs(system, [log], result.parameters))
     problem = EstimationProblem(system, logs, system.parameters | result.parameters, LeastSquares())
-    reviewed = review.review_fit(problem, result)
+    reviewed, _ = review.review_fit(problem, result)
     assert reviewed.estimates["ci_high"]["friction.static"] == 50.0
     kept = review._widen_dragged(result, {name: closed, "friction.static": own}).estimates
     assert kept.to_dict(orient="index")["friction.static"] == before["friction.static"]
