@@ -25,7 +25,7 @@ from pneuopt.identification.identifiability import (
     prior_influenced,
 )
 from pneuopt.identification.losses import Loss, fit_robustly
-from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit
+from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, suspect_widths
 from pneuopt.identification.problem import (
     EstimationProblem,
     as_estimation_model,
@@ -235,7 +235,7 @@ def _fit_and_review(
         result, profiles = review_fit(held, *_result(held, fit, label, loss, restarts=restarts))
     result = replace(mark_order(held, result), window=chosen, trail=trail)
     result = replace(result, status=problem.method.budget.name_end(result.status))
-    if result.status.code not in (Code.INTERRUPTED, Code.BUDGET, Code.DIVERGED):
+    if result.status.converged and not problem.method.budget.is_spent:  # no other fit forecasts
         error = learn_forecast_error(problem, result.parameters, LeastSquares(budget=problem.method.budget))
         result = replace(result, forecast_error=error)
     why = str(doubts.found) if doubts.found else ""
@@ -275,7 +275,7 @@ def _result(
     variance = squares / dof
     free_runs = run_freely(problem, fit)
     prediction = predict_logs(problem, fit, free_runs)
-    diagnosis = diagnose_misfit(problem, fit, variance, dof)
+    diagnosis = suspect_widths(diagnose_misfit(problem, fit, variance, dof), problem, fit, variance)
     misfit = replace(diagnosis, restarts=restarts, is_useless=prediction.is_useless)
     covariance = None if misfit.covariance is None else misfit.covariance + sticking_covariance(problem, fit)
     if covariance is not None and fit.prior_covariance is not None:
@@ -338,7 +338,7 @@ def _estimates(
             (p.value * math.exp(min(change / p.value, 700.0)) if p.log else p.value + change)
             for change in misfit.ranges[i].tolist()
         ]
-        mark = misfit.mark(is_optimum=status.converged and math.isfinite(deviation) and not influenced[i])
+        mark = misfit.mark(i, is_optimum=status.converged and math.isfinite(deviation) and not influenced[i])
         shown = [p.value, low, high, p.unit, mark]
         rows[name] = [*shown, deviation, dof, *ends, p.lower, p.upper, bool(at_bound[i]), p.source]
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)

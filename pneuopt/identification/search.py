@@ -185,7 +185,8 @@ def _is_beyond_help(search: Search) -> bool:
     best = search.best
     if search.tried[-1].fit.status.code is Code.INTERRUPTED:
         return True
-    return (is_optimum(best.fit) or len(search.tried) == MIN_DOUBTED) and search.gives_up(best.problem, best.fit)
+    is_doubtful = best.fit.status.converged or len(search.tried) == MIN_DOUBTED
+    return is_doubtful and search.gives_up(best.problem, best.fit)
 
 
 def _is_at_noise(search: Search) -> bool:
@@ -580,10 +581,10 @@ ATTEMPTS: tuple[Attempt, ...] = (
     Attempt("first start", lambda _: True, _from_first_start, _is_at_noise),
     Attempt("excerpt", _is_long, _from_excerpt, _is_at_noise),
     Attempt("prediction errors", _can_predict, _from_predictions, _is_followed),
+    Attempt("tighter gaps", _gaps_absorb_misfit, _from_tighter_gaps, _is_followed),
+    Attempt("noise of the states", _allows_state_noise, _from_state_noise, lambda s: s.tried[-1].fit.status.converged),
     Attempt("filtered states", _has_filter, _from_filtered, _is_at_noise),
     Attempt("other starts", lambda search: len(search.problem.candidates) > 1, _from_other_starts, _is_confirmed),
-    Attempt("tighter gaps", _gaps_absorb_misfit, _from_tighter_gaps, _is_followed),
-    Attempt("noise of the states", _allows_state_noise, _from_state_noise, lambda _: True),
 )
 """In their order: what leads to the answer most often, for the least, comes first."""
 

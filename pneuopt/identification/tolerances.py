@@ -7,6 +7,7 @@ CLEAR_DEVIATIONS = 4.0  # [1] standard deviations beyond which a difference or a
 MODEL_ERROR_LEVEL = 2.0  # [1] residuals over the noise from which most of their power is an error of the model
 MOVING_SPEED_SHARE = 0.05  # [1] of the largest speed, below which a sample counts as standing still
 REFIT_STAGES = 3  # last stages of a method that a refit runs, near its answer
+SIGNIFICANT_FALL = 10.8  # [variances] fall of squared residuals that counts: chance exceeds it once in a thousand
 MIN_WINDOW_SAMPLES = 20  # measured samples of the shortest window: of fewer its start state takes most
 
 # Compare logs
@@ -21,7 +22,7 @@ MIN_STOP_FORCE = 10.0  # [N] by which a model's end stop pushes back 1 mm beyond
 # Forecast
 
 START_SHARE = 0.1  # [1] of the time of a log, to which the start of its forecast is fitted
-FORECAST_STARTS = 8  # evenly spread, from which a fit forecasts each of its own logs
+FORECAST_STARTS = 4  # evenly spread, from which a fit forecasts each of its own logs
 FORECAST_LEVELS = 5  # of time since the start, each twice as long as the one before, with an error each
 
 START_STEP = 1e-4  # [nominal sizes] of the start state, of the first differences by it
@@ -85,6 +86,7 @@ MOTION_LEVEL = 0.001  # [1] probability, over all signals and outputs, below whi
 # friction that depends on load or position 2 to 8
 MAX_MISFIT = 20.0
 MAX_NRMSE = 0.2  # [1] the same over the channel's own variation, where the noise is estimated
+HARMLESS_SHIFT = 0.5  # [deviations] by a rejected width: a 95 % interval so far off holds the truth 92 times in 100
 MIN_SIGNAL_SPREAD = 1e-6  # [1] of a signal over its size: a smaller one is rounding, and has no classes
 
 # Problem
@@ -121,7 +123,7 @@ ALIKE_SQUARES = 20.0  # [variances of the residuals] above the best, up to which
 GUESS_STAGES = 3  # of a search with guesses held
 HOPELESS_MISFIT = 3.0  # [noise variances a sample] beyond which the first start waits for the others
 ACCEPTED_CHI_SQUARE_RATIO = 1.05  # [1] up to which no other start is tried: a wrong basin of bristles has left 1.1
-MIN_DOUBTED = 2  # fits after which the problem is doubted
+MIN_DOUBTED = 3  # fits after which the problem is doubted: noise of the states comes before
 MIN_EXCESS = 0.03  # [1] of a parameter over one that bounds it, below which another start is tried
 SAME_COST_RATIO = 1.001  # [1] costs of two fits up to which both are one optimum
 EXCERPT_SEGMENTS = 1000  # of an excerpt

@@ -20,29 +20,36 @@ from scipy.stats import ttest_1samp
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_fit, write_fit
 from pneuopt.identification import identify as identification
+from pneuopt.identification import misfit
 from pneuopt.identification.identify import identify
 from pneuopt.identification.misfit import (
     Clusters,
     Misfit,
+    RejectedWidth,
     RobustCovariance,
     _hotelling_p,
     between_clusters,
+    diagnose_misfit,
     disagreement_p,
     jackknife,
     robust_covariance,
+    score_widths,
+    suspect_widths,
     t_quantile,
 )
+from pneuopt.identification.problem import EstimationProblem, check_logs, input_behaviour
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.identification.tolerances import TIME_BLOCKS
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Coulomb
+from pneuopt.models.friction import Coulomb, FrictionModel, Viscous
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Intersample, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
 
 TIME = np.arange(0, 4.0, 2e-3)
 FORCE = 150 * np.sin(2 * np.pi * 1.3 * TIME) + 60 * np.sin(2 * np.pi * 3.1 * TIME + 1)
@@ -109,8 +116,8 @@ def test_white_residuals_are_exact() -> None:
 
 def test_the_mark_of_an_estimate_is_the_gravest_that_anything_gives() -> None:
     whole = Misfit(np.eye(1), np.ones(1), 1.0, np.zeros((1, 2)), 1.0, noisy_states=False, is_excessive=False)
-    assert whole.mark(is_optimum=True) is Mark.EXACT
-    assert whole.mark(is_optimum=False) is Mark.BIAS_POSSIBLE  # at a bound, or a fit that did not converge
+    assert whole.mark(0, is_optimum=True) is Mark.EXACT
+    assert whole.mark(0, is_optimum=False) is Mark.BIAS_POSSIBLE  # at a bound, or a fit that did not converge
     for changed, mark in (
         ({"widened": True}, Mark.WIDENED),
         ({"level": 1.3}, Mark.WIDENED),
@@ -119,7 +126,7 @@ def test_the_mark_of_an_estimate_is_the_gravest_that_anything_gives() -> None:
         ({"signals": ("speed",), "widened": True}, Mark.BIAS_POSSIBLE),
     ):
         given: Any = changed
-        assert replace(whole, **given).mark(is_optimum=True) is mark, changed
+        assert replace(whole, **given).mark(0, is_optimum=True) is mark, changed
 
 
 def test_a_slow_residual_below_the_noise_widens_the_intervals() -> None:
@@ -220,6 +227,13 @@ def test_a_mark_that_is_none_is_refused(tmp_path: Path) -> None:
         read_fit(path).marks  # noqa: B018
 
 
+def test_a_width_that_the_logs_reject_marks_what_it_moves() -> None:
+    plain = Misfit(None, np.full(2, 9.0), 1.0, np.zeros((2, 2)), 1.0, noisy_states=False, is_excessive=False)
+    wide = replace(plain, widened=True, rejected_widths=("friction.smoothing",), biased=np.array([True, False]))
+    assert [wide.mark(i, is_optimum=True) for i in range(2)] == [Mark.BIAS_POSSIBLE, Mark.WIDENED]
+    assert "friction.smoothing that the logs reject" in wide.sentences[0]
+
+
 def test_an_estimate_without_a_deviation_is_not_exact() -> None:
     """Static friction of 29.99 N in a one-way log was, without a deviation."""
     plain = Misfit(None, np.full(2, 9.0), 1.0, np.zeros((2, 2)), 1.0, noisy_states=False, is_excessive=False)
@@ -232,9 +246,9 @@ def test_an_estimate_without_a_deviation_is_not_exact() -> None:
 def test_windows_that_start_anew_where_whole_logs_do_not_fit_leave_a_bias_possible() -> None:
     """Short windows hide what adds up over a log: their residuals are noise, and five of six intervals were wrong."""
     plain = Misfit(None, np.full(2, 9.0), 1.0, np.zeros((2, 2)), 1.0, noisy_states=False, is_excessive=False)
-    assert plain.mark(is_optimum=True) is Mark.EXACT
+    assert plain.mark(0, is_optimum=True) is Mark.EXACT
     anew = replace(plain, restarts=True)
-    assert anew.mark(is_optimum=True) is Mark.BIAS_POSSIBLE
+    assert anew.mark(0, is_optimum=True) is Mark.BIAS_POSSIBLE
     assert anew.sentences == ("over whole logs the misfit exceeds the noise: estimates from windows may be biased",)
 
 
@@ -413,3 +427,87 @@ def test_intervals_hold_where_those_of_white_residuals_do_not(
     assert plain.min() < 75
     assert robust.min() >= 90 - 6  # two binomial deviations of 100 draws
     assert widened > 0.7
+
+
+WIDTH = "friction.smoothing"
+SLIDING = ("friction.coulomb", "friction.viscous")
+FINE_NOISE = 2e-6  # of the position [m]
+
+
+def fitted(friction: FrictionModel, width: float = 1.0) -> tuple[EstimationProblem, Fit]:
+    """Friction found in a pushed drive's log by a model whose width is so many times the drive's."""
+    system, t = ForceDrive(friction).system(), np.arange(1000) * 1e-3
+    truth = {n: v for n, v in {"friction.coulomb": 30.0, "friction.viscous": 60.0}.items() if n in system.parameters}
+    own = system.parameters.with_values(truth)
+    force = Trajectory(t, {"force": 60 * np.sin(2 * np.pi * 4 * t)})
+    behaviour = input_behaviour(system, Experiment(force.with_columns({"position": t}), {}, name="run"))
+    run = simulate(system, force, own, initial={"position": 0.0, "speed": 0.0}, intersample=behaviour)
+    position = run["position"] + FINE_NOISE * np.random.default_rng(3).standard_normal(1000)
+    log = Experiment(force.with_columns({"position": position}), {"position": FINE_NOISE}, name="run")
+    given = own.freed(*truth)
+    if WIDTH in given:
+        given = given.with_values({WIDTH: width * own.value(WIDTH)})
+    problem = EstimationProblem(system, tuple(check_logs(system, [log], given)), given, LeastSquares())
+    return problem, solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
+
+
+def test_the_width_that_made_the_log_is_not_rejected() -> None:
+    (found,) = score_widths(*fitted(Coulomb()))
+    assert found.name == WIDTH
+    assert found.fall < 10.8
+
+
+def test_the_fall_and_the_shifts_are_those_of_a_fit_that_estimates_the_width() -> None:
+    problem, fit = fitted(Coulomb(), 1.1)
+    (found,) = score_widths(problem, fit)
+    freed = replace(problem, parameters=problem.parameters.freed(WIDTH))
+    refit = solve_least_squares(freed.transcription(freed.start_from(fit)), freed.method)
+    assert refit.parameters.value(WIDTH) == pytest.approx(problem.system.parameters.value(WIDTH), rel=0.02)
+    assert found.fall > 10.8
+    assert found.fall == pytest.approx(2 * (fit.stats["cost"] - refit.stats["cost"]), rel=0.2)
+    shifts = [refit.parameters.value(n) - fit.parameters.value(n) for n in SLIDING]
+    assert dict(zip(SLIDING, found.shifts, strict=True)) == pytest.approx(
+        dict(zip(SLIDING, shifts, strict=True)), rel=0.2
+    )
+
+
+def test_noise_of_the_states_has_other_weights_and_a_model_without_a_width_none_to_reject() -> None:
+    problem, fit = fitted(Coulomb())
+    assert not list(score_widths(problem, replace(fit, jumps=np.zeros((1, 2)))))
+    assert not list(score_widths(*fitted(Viscous())))
+    free = replace(problem, parameters=problem.parameters.freed(WIDTH))
+    assert not list(score_widths(free, solve_least_squares(free.transcription(free.start_from(fit)), free.method)))
+
+
+@pytest.mark.parametrize(
+    ("fall", "shift", "inflation", "marked"),
+    [
+        (10.9, 0.6, 1.0, True),
+        (10.7, 0.6, 1.0, False),  # chi-square with one degree of freedom exceeds 10.8 once in a thousand
+        (10.9, 0.4, 1.0, False),  # no harm
+        (10.9, 0.6, 1.1, False),  # what scatters more between parts of the logs is told apart with more
+        (-1.0, 0.6, 1.0, False),
+    ],
+)
+def test_a_rejected_width_marks_the_estimates_that_it_moves(
+    fall: float, shift: float, inflation: float, marked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, fit = fitted(Coulomb())
+    plain = diagnose_misfit(problem, fit, 1.0, 900.0)
+    assert plain.covariance is not None
+    spread = np.sqrt(np.diag(plain.covariance))
+    suspect = replace(plain, widened=True, signals=(), inflation=inflation)
+    moved = RejectedWidth(WIDTH, fall, np.array([shift, 0.1]) * spread)
+    monkeypatch.setattr(misfit, "score_widths", lambda *_: iter([moved]))
+    found = suspect_widths(suspect, problem, fit, 1.0)
+    assert (found.rejected_widths == (WIDTH,)) is marked
+    assert (None if found.biased is None else found.biased.tolist()) == ([True, False] if marked else None)
+    told = any(WIDTH in sentence for sentence in found.sentences)
+    assert told is marked
+
+
+def test_a_signal_that_residuals_show_asks_for_no_width(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, fit = fitted(Coulomb())
+    signalled: Misfit = replace(diagnose_misfit(problem, fit, 1.0, 900.0), widened=True, signals=("speed",))
+    monkeypatch.setattr(misfit, "score_widths", lambda *_: pytest.fail("asked"))
+    assert suspect_widths(signalled, problem, fit, 1.0) is signalled
