@@ -7,10 +7,10 @@ answer. They are made in their order until one is enough; `IdentificationResult.
     first start          most answers, in one search
     excerpt              those of long logs, from their liveliest part
     prediction errors    those of drives that stick, from the best of many hypotheses that a filter follows
-    filtered states      those of rough starts, whose nodes would close slowly
-    other starts         those of the guesses that the first start did not make
     tighter gaps         the optimum of a model that misses the logs by a little, as by the lag of a sensor
     noise of the states  the best that a model does which misses the logs, marked
+    filtered states      those of rough starts, whose nodes would close slowly
+    other starts         those of the guesses that the first start did not make
 
 A parameter that the data do not determine is held at its given value: that needs no weight for a prior beside that of
 the data, and the prior's spread is counted in the covariance of the others (`Fit.prior_covariance`). What each row is
@@ -307,21 +307,31 @@ def fit_fixing_unidentifiable(
     first = solve_least_squares(problem.transcription(start), method)
     if not _open_names(problem, first) or first.status.code is Code.INTERRUPTED:
         return problem, first
-    for is_given in (True, False) if first.unidentifiable and not first.status.converged else (not first.unsettled,):
+    loose = () if first.unidentifiable else _loose_widths(problem, first)
+    for is_given in (True, False) if not first.status.converged else (True,):
         held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
         is_settled = fit.status.converged and not fit.unidentifiable
-        is_taken = is_settled and not rejects_fixed_values(fit, first, len(held.fixed))
+        is_taken = is_settled and (bool(loose) or not rejects_fixed_values(fit, first, len(held.fixed)))
         if fit.status.code is Code.INTERRUPTED or is_taken:
             return held, fit
     return problem, first
 
 
 def _open_names(problem: EstimationProblem, fit: Fit) -> tuple[str, ...]:
-    """The parameters to hold: those that the data do not determine, or a width in which alone a search did not settle.
+    """The parameters to hold: those that the data do not determine, or widths that keep a search from settling."""
+    return fit.unidentifiable or _loose_widths(problem, fit)
 
-    Nobody asks for a width: where it still moves, the others have their answer.
+
+def _loose_widths(problem: EstimationProblem, fit: Fit) -> tuple[str, ...]:
+    """The estimated widths that still move, or at whose lower bound the kinks of the law keep others moving.
+
+    Nobody asks for a width: with it held, the others have their answer.
     """
-    return fit.unidentifiable or tuple(n for n in fit.unsettled if n in estimated_widths(problem.parameters))
+    if not fit.unsettled:
+        return ()
+    free, widths = fit.parameters.free_names, estimated_widths(problem.parameters)
+    sharp = [n for n in widths if n in free and fit.at_bound[free.index(n)]]
+    return tuple(n for n in widths if n in fit.unsettled or n in sharp if n not in problem.fixed)
 
 
 def _hold_unidentifiable(
