@@ -2,12 +2,12 @@
 
 The start state is fitted to that tenth; from there on the inputs alone drive the run, and so nothing in run or band
 rests on what is forecast. The band's variance is a sum: of the parameters, by runs at one deviation to both
-sides along each principal direction of their covariance, and of the start state alike (central differences, which stay
-finite where a linearised stick-slip does not); and of what neither explains. That is a model of the model's error
-(Ljung, Model validation and model error modeling, 1999), learned as split conformal prediction calibrates (Lei et al.,
-J. Am. Stat. Assoc. 113, 2018): the fit forecasts parts of its own logs by the same rule, and the mean square of the
-errors by time since the start, less the start state's share, is what it must expect of itself elsewhere, its noise
-included. `problems/identify/forecast_band.py` measures the share inside.
+sides along each principal direction of their covariance (central differences, which stay finite where a linearised
+stick-slip does not), and of what the start state, the noise and the model's error add. These are learned (Ljung, Model
+validation and model error modeling, 1999) as split conformal prediction calibrates (Lei et al., J. Am. Stat. Assoc.
+113, 2018): the fit forecasts parts of its own logs by the same rule, from starts that are fitted alike, and the mean
+square of the errors by time since the start is what it must expect of itself elsewhere.
+`problems/identify/forecast_band.py` measures the share inside.
 """
 
 import math
@@ -45,9 +45,7 @@ from pneuopt.identification.tolerances import (
     FORECAST_STARTS,
     LEVEL,
     MIN_WINDOW_SAMPLES,
-    START_ROUNDS,
     START_SHARE,
-    START_STEP,
 )
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Indices
@@ -233,7 +231,7 @@ class _Forecast:
         """The run of a log along its parts, by an independent simulation, with its band."""
         errors, columns = None if fit is None else fit.forecast_error, dict[str, Array]()
         covariance = None if fit is None else fit.covariance
-        variance = np.zeros(self.y.shape) if errors is None else self.variance(covariance)
+        variance = np.zeros(self.y.shape) if covariance is None else self.variance(covariance)
         known, behaviour = apply_conditions(self.parameters, log), input_behaviour(self.system, log)
         for part, own in enumerate(self.experiments):
             inputs = own.trajectory
@@ -251,58 +249,36 @@ class _Forecast:
                 columns.setdefault(name, np.full(len(log.trajectory), np.nan))[begin : begin + len(inputs)] = column
         return Trajectory(log.trajectory.t, columns)
 
-    def variance(self, covariance: "pd.DataFrame | None" = None) -> Array:
-        """Variance of the outputs (m, n, n_outputs) by the start states, and by the parameters."""
+    def variance(self, covariance: "pd.DataFrame") -> Array:
+        """Variance of the outputs (m, n, n_outputs) by the parameters."""
         order, total = list(self.segments.transcription.parameters), np.zeros(self.y.shape)
-        moves = [(step, np.zeros(len(order))) for step in self._start_steps()]
-        if covariance is not None:
-            matrix = covariance.to_numpy(dtype=float)
-            rows = [i for i, n in enumerate(covariance.index) if n in order and matrix[i, i] > 0]
-            place, scale = [order.index(str(covariance.index[i])) for i in rows], np.sqrt(np.diag(matrix)[rows])
-            shares, directions = np.linalg.eigh(matrix[np.ix_(rows, rows)] / np.outer(scale, scale))
-            changes = np.zeros((len(rows), len(order)))
-            changes[:, place] = (directions * np.sqrt(np.maximum(shares, 0.0)) * scale[:, None]).T
-            moves += [(np.zeros(self.nodes.shape), change) for change in changes]
-        for half in self._half_differences(self.segments, moves):
+        matrix = covariance.to_numpy(dtype=float)
+        rows = [i for i, n in enumerate(covariance.index) if n in order and matrix[i, i] > 0]
+        place, scale = [order.index(str(covariance.index[i])) for i in rows], np.sqrt(np.diag(matrix)[rows])
+        shares, directions = np.linalg.eigh(matrix[np.ix_(rows, rows)] / np.outer(scale, scale))
+        changes = np.zeros((len(rows), len(order)))
+        changes[:, place] = (directions * np.sqrt(np.maximum(shares, 0.0)) * scale[:, None]).T
+        for half in self._half_differences(changes):
             total += half**2
         return total
 
-    def _start_steps(self) -> Array:
-        """One deviation of the start states along each principal direction, (n_states, m, n_states)."""
-        nominal, n = self.segments.nominal, int(self.heads.max())
-        head, still = self.segments.first_samples(n), np.zeros(len(self.values))
-        counts = np.isfinite(head.measured) & (np.arange(n) < self.heads[:, None])[..., None]
-        # a state that no output shows is not fitted, and moves none
-        steps = START_STEP * nominal * np.eye(len(nominal))[:, None] * np.isnan(head.fixed_start)
-        for _ in range(START_ROUNDS if len(nominal) else 0):  # slopes along steps as long as the deviations they show
-            halves = self._half_differences(head, [(step, still) for step in steps])
-            moved = [np.clip(np.where(counts, head.weights * half, 0.0), -ENDLESS, ENDLESS) for half in halves]
-            rows = np.stack([half.reshape(len(half), -1) for half in moved], axis=1)  # (m, n_states, samples)
-            prior = np.swapaxes(steps, 0, 1) / nominal  # what shows nothing is known to its nominal size
-            information = rows @ np.swapaxes(rows, 1, 2) + prior @ np.swapaxes(prior, 1, 2)
-            information += np.eye(len(nominal)) * (
-                ENDLESS**-1 * information.max(axis=(1, 2), keepdims=True) + ENDLESS**-4
-            )
-            variances, directions = np.linalg.eigh(np.linalg.inv(information))
-            steps = np.einsum("mjk,jmi->kmi", directions * np.sqrt(np.maximum(variances, 0.0))[:, None], steps)
-        return steps
-
-    def _half_differences(self, segments: Segments, moves: Sequence[tuple[Array, Array]]) -> Iterator[Array]:
-        """Half the difference of the outputs (m, n, n_outputs) between both signs of each move of starts and values."""
-        own, m, parts = segments.transcription.parameters.values(), len(self.nodes), segments
+    def _half_differences(self, changes: Array) -> Iterator[Array]:
+        """Half the difference of the outputs (m, n, n_outputs) between both signs of each change of the values."""
+        own, m, parts = self.segments.transcription.parameters.values(), len(self.nodes), self.segments
         logs, lower, upper = (np.array([getattr(p, n) for p in own]) for n in ("log", "lower", "upper"))
-        for first in range(0, len(moves), max(1, FORECAST_LANES // m)):
-            few = moves[first : first + max(1, FORECAST_LANES // m)]
-            signed = [(sign * step, sign * change) for step, change in few for sign in (1, -1)]
+        lanes = max(1, FORECAST_LANES // m)
+        for first in range(0, len(changes), lanes):
+            signed = np.repeat(changes[first : first + lanes], 2, axis=0)
+            signed[1::2] *= -1
             with np.errstate(all="ignore"):  # infinite where the model leaves its range
-                nodes = np.concatenate([self.nodes + step for step, _ in signed])
-                changed = np.array([change for _, change in signed])
-                factors = np.exp(np.where(logs, changed / self.values, 0.0))
-                values = np.clip(np.where(logs, self.values * factors, self.values + changed), lower, upper)
-                p = values[:, parts.parameter_positions].reshape(len(nodes), -1)
-                u, t, h = (np.concatenate([a] * len(signed)) for a in (parts.inputs, parts.t, parts.h))
-                y = parts.plain_rollout.run(nodes, u, p, t, h, substeps=self.substeps).y
-                high, low = np.swapaxes(y.reshape(len(few), 2, m, *y.shape[1:]), 0, 1)
+                factors = np.exp(
+                    np.where(logs, np.clip(signed / self.values, -1.0, 1.0), 0.0)
+                )  # as far as that reaches
+                values = np.clip(np.where(logs, self.values * factors, self.values + signed), lower, upper)
+                p = values[:, parts.parameter_positions].reshape(len(signed) * m, -1)
+                x, u, t, h = (np.concatenate([a] * len(signed)) for a in (self.nodes, parts.inputs, parts.t, parts.h))
+                y = parts.plain_rollout.run(x, u, p, t, h, substeps=self.substeps).y
+                high, low = np.swapaxes(y.reshape(len(signed) // 2, 2, m, *y.shape[1:]), 0, 1)
                 half = (high - low) / 2
             yield from np.where(np.isfinite(half), half, math.inf)
 
@@ -371,7 +347,7 @@ def learn_forecast_error(
         return None
     run = _forecast(system, parts, _fixed_parameters(system, parameters), method, START_SHARE)
     measured, since = run.segments.measured, run.segments.t - run.segments.t[:, :1]
-    excess = np.where(np.isfinite(run.y), measured - run.y, math.inf) ** 2 - np.nan_to_num(run.variance())
+    missed = np.where(np.isfinite(run.y), measured - run.y, math.inf) ** 2
     later = np.arange(since.shape[1]) >= run.heads[:, None]
     edges = float(since.max()) * np.append(0.0, 0.5 ** np.arange(FORECAST_LEVELS - 1, -1, -1))
     level, table = np.searchsorted(edges, since) - 1, dict[str, Array]()
@@ -379,7 +355,7 @@ def learn_forecast_error(
         noise = [e.noise[channel] for e in problem.experiments if channel in outputs_in_log(system, e)]
         counts = later & np.isfinite(measured[..., k])
         if noise and counts.any():
-            own, squares = level[counts], np.minimum(excess[counts, k], ENDLESS**2)
+            own, squares = level[counts], np.minimum(missed[counts, k], ENDLESS**2)
             weights, sums = (np.bincount(own, w, FORECAST_LEVELS) for w in (np.ones(len(own)), squares))
             means = sums / np.maximum(weights, 1)
             rising = isotonic_regression(

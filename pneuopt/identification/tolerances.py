@@ -25,8 +25,6 @@ START_SHARE = 0.1  # [1] of the time of a log, to which the start of its forecas
 FORECAST_STARTS = 4  # evenly spread, from which a fit forecasts each of its own logs
 FORECAST_LEVELS = 5  # of time since the start, each twice as long as the one before, with an error each
 
-START_STEP = 1e-4  # [nominal sizes] of the start state, of the first differences by it
-START_ROUNDS = 4  # of differences, each over the deviation that the one before has found
 FORECAST_LANES = 16  # runs at once, at most
 ENDLESS = 1e12  # [noise deviations, or the unit] at which a run counts that has left the model's range
 

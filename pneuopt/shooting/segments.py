@@ -136,11 +136,6 @@ class Segments:
         """The same segments, integrated implicitly in this state, or by RK4."""
         return replace(self, implicit_state=state)
 
-    def first_samples(self, n: int) -> "Segments":
-        """The first n samples of each segment."""
-        own = {k: getattr(self, k)[:, :n] for k in ("t", "h", "inputs", "measured", "noise")}
-        return replace(self, **own, lengths=np.minimum(self.lengths, n))
-
     @property
     def _pieces(self) -> Pieces:
         return replace(self.system.pieces, implicit=self.implicit_state)
