@@ -93,16 +93,21 @@ def test_a_fit_that_does_not_predict_its_log_is_a_misfit_and_says_so_first(tmp_p
 @pytest.mark.parametrize(
     ("log", "named"),
     [
-        (lambda: log_of(change=lambda force: force + 20), "an offset of force, 20 N,"),
         (lambda: log_of(Stribeck(), static=60.0, stribeck_velocity=0.05), "static friction above Coulomb's, "),
         (lambda: log_of(sense=lambda speed: speed + 0.1 * TIME - 0.2), "a straight line in time beside the outputs"),
     ],
-    ids=["offset", "static", "line"],
+    ids=["static", "line"],
 )
 def test_what_the_model_lacks_is_named_with_its_gain(log: Callable[[], Experiment], named: str) -> None:
     sentence = explanation(fit(log()))
     assert sentence.startswith(named)
     assert " of the misfit, the log-likelihood gains " in sentence
+
+
+def test_an_offset_of_the_force_is_named_as_the_load_that_it_is() -> None:
+    """A force that acts 20 N beside its log is a load of -20 N, which the plant has as a fixed value."""
+    sentence = explanation(fit(log_of(change=lambda force: force + 20)))
+    assert sentence.startswith("freeing load.force explains 100% of the misfit, with -20 N in place of 0 N")
 
 
 @pytest.mark.parametrize(("delay", "force"), [(0.15, FORCE), (0.04, FORCE), (0.04, RANDOM_STEPS)])
