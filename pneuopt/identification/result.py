@@ -21,7 +21,7 @@ from pneuopt.quantities.report import TIED, Line, Report, Table, format_number, 
 from pneuopt.quantities.results import NOT_SAVED, Result, Shown
 from pneuopt.quantities.status import Status, report_status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import write_value
+from pneuopt.quantities.units import difference_unit, write_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -383,10 +383,11 @@ def report_band(fit: "pd.DataFrame") -> Report:
     lines = list[Line]()
     for channel, own in fit.dropna(subset="inside").groupby(level="channel", sort=False):
         worst, share = own["inside"].droplevel("channel").idxmin(), own["inside"].mean()
-        sizes = [format_number(float(np.sqrt(np.mean(own[n] ** 2))), 3) for n in ("half_band", "forecast_rmse")]
+        unit = difference_unit(str(own["unit"].iloc[0]))
+        sizes = [write_value(float(np.sqrt(np.mean(own[n] ** 2))), unit, 3) for n in ("half_band", "forecast_rmse")]
         lead = f"{channel}: {share:.0%} of the forecast samples are inside the 95 % band"
         lead += f" ({own['inside'].min():.0%} in {worst})" if len(own) > 1 else ""
-        lines.append(Line(f"{lead}, which is +-{sizes[0]} {own['unit'].iloc[0]} wide where the error is {sizes[1]}"))
+        lines.append(Line(f"{lead}, +-{sizes[0]} on average; the error is {sizes[1]}"))
     return Report(tuple(lines))
 
 
