@@ -197,10 +197,14 @@ def _is_at_noise(search: Search) -> bool:
     return is_sure and explains_to_noise(last.problem, last.fit)
 
 
+def _has_converged(search: Search) -> bool:
+    """Whether the last try converged."""
+    return search.tried[-1].fit.status.converged
+
+
 def _is_followed(search: Search) -> bool:
     """Whether the last try converged with tight gaps: it began at the best of many hypotheses."""
-    fit = search.tried[-1].fit
-    return fit.status.converged and fit.jumps is None
+    return _has_converged(search) and search.tried[-1].fit.jumps is None
 
 
 def _is_confirmed(search: Search) -> bool:
@@ -455,7 +459,7 @@ def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
 
 
 def filter_states(problem: EstimationProblem, start: Start, gathered: float = GATHERED_DEVIATION) -> Start:
-    """The start with states along the logs that fit its parameters (`shooting.state_filter`)."""
+    """The start with states along the logs that fit its parameters (`shooting.filters`)."""
     segments = segment(problem.transcription(start))
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     try:
@@ -592,7 +596,7 @@ ATTEMPTS: tuple[Attempt, ...] = (
     Attempt("excerpt", _is_long, _from_excerpt, _is_at_noise),
     Attempt("prediction errors", _can_predict, _from_predictions, _is_followed),
     Attempt("tighter gaps", _gaps_absorb_misfit, _from_tighter_gaps, _is_followed),
-    Attempt("noise of the states", _allows_state_noise, _from_state_noise, lambda s: s.tried[-1].fit.status.converged),
+    Attempt("noise of the states", _allows_state_noise, _from_state_noise, _has_converged),
     Attempt("filtered states", _has_filter, _from_filtered, _is_at_noise),
     Attempt("other starts", lambda search: len(search.problem.candidates) > 1, _from_other_starts, _is_confirmed),
 )
