@@ -26,7 +26,7 @@ from pneuopt.files.drive import ambient_pressure, read_drive, read_fit, write_fi
 from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.forecast import predict_logs
 from pneuopt.identification.identify import identify
-from pneuopt.identification.result import IdentificationResult, Mark, report_agreement, report_band, report_trail
+from pneuopt.identification.result import IdentificationResult, report_agreement, report_band, report_trail
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.doctor import CHECKS, LogFinding
 from pneuopt.logs.experiment import Experiment
@@ -121,7 +121,7 @@ def _try_bootstrap(
     if not draws or not result.status.converged:
         return None, {}
     # a log that the smooth model explains to its noise is of an axis that creeps, and not one that sticks
-    rig = stick_slip_drive(model) if (result.estimates["mark"] == Mark.BIAS_POSSIBLE).any() else model
+    rig = stick_slip_drive(model) if (result.estimates["bias"] > 0).any() else model
     what = "the drive as fitted" if rig == model else "a drive that truly sticks, as the fit misses the logs"
     with progress("simulating and identifying", quiet=quiet) as report_progress:
         tried = bootstrap(model.system(), experiments, result, rig=rig, count=draws, progress=report_progress)

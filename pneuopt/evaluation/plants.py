@@ -1,7 +1,7 @@
 """`monte_carlo` and `expected_plants`: plants within what a fit leaves open and what hardware varies by.
 
 A parameter that a fit has estimated is drawn from the fit's covariance, by Student's t where few degrees of freedom
-tell it; one that the fit gave a range in place of an interval is drawn from anywhere in that range. `monte_carlo` draws
+tell it; one that the fit gave no interval is drawn from as far as errors of its model may reach. `monte_carlo` draws
 the others as stated. Of `expected_plants`, which a design has not seen, those named in `TOLERANCES` vary by the usual
 tolerance of such hardware, and each tuned gain by `GAIN_TOLERANCE`.
 """
@@ -31,7 +31,7 @@ from pneuopt.evaluation.scenarios import (
 )
 from pneuopt.evaluation.tolerances import GAIN_TOLERANCE, PLANT_COUNT
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.results import Shown
 
@@ -58,7 +58,7 @@ def monte_carlo(
     count : int
     covariance, estimates : DataFrame, optional
         `IdentificationResult.covariance`, and `.estimates`: with these the draws are as wide as the confidence
-        intervals (Student's t), and a parameter that has a range in place of an interval is drawn from anywhere in it.
+        intervals (Student's t), and a parameter without an interval is drawn from as far as its `bias` reaches.
     spreads : mapping, optional
         As for `samples`; a parameter in it is drawn by it, whatever the fit estimates.
     seed : int or tuple
@@ -121,16 +121,17 @@ def degrees_of_freedom(estimates: "pd.DataFrame | None") -> dict[str, float]:
 def select_ranges(
     parameters: ParameterSet, estimates: "pd.DataFrame | None", others: Collection[str]
 ) -> dict[str, tuple[float, float]]:
-    """The ranges within the bounds of what a fit has given one in place of an interval, without the others."""
-    if estimates is None or "range_low" not in estimates:
+    """As far as errors of the model may reach, within the bounds, where a fit has no interval, without the others."""
+    if estimates is None or "bias" not in estimates:
         return {}
-    rows = estimates[estimates["stderr"].isna() & estimates["range_low"].notna() & estimates["range_high"].notna()]
-    ends = {str(n): (float(row["range_low"]), float(row["range_high"])) for n, row in rows.iterrows()}
-    return {
-        n: (max(low, parameters[n].lower), min(high, parameters[n].upper))
-        for n, (low, high) in ends.items()
-        if n in parameters and n not in others and low < high
-    }
+    wide = estimates["bias"][estimates["stderr"].isna() & (estimates["bias"] > 0)].to_dict()
+    return {str(n): _ends(parameters[n], b) for n, b in wide.items() if n in parameters and n not in others}
+
+
+def _ends(p: Parameter, width: float) -> tuple[float, float]:
+    """Both ends of a parameter within its bounds that is known to +-width, by its logarithm where it is searched so."""
+    low, high = (p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1))
+    return float(max(low, p.lower)), float(min(high, p.upper))
 
 
 def draw_in_ranges(
@@ -192,7 +193,7 @@ class ExpectedPlants(Shown):
     axes : tuple of CorrelatedParameters
         What varies, without the parameters of the scenarios that a tuning knows already.
     from_fit : tuple of str
-        Parameters that are drawn from a fit's covariance, or from its ranges.
+        Parameters that are drawn from a fit's covariance, or within its bounds of the bias.
     known : tuple of str
         Parameters that vary as the tuning's own scenarios have them.
     """
@@ -242,7 +243,7 @@ def expected_plants(
         `IdentificationResult.covariance`, which also says which parameters the logs have identified.
     estimates : DataFrame, optional
         `IdentificationResult.estimates`: with its degrees of freedom the draws are as wide as the confidence intervals,
-        and a parameter that has a range in place of an interval is drawn from anywhere in it.
+        and a parameter without an interval is drawn from as far as its `bias` reaches.
     scenarios : mapping of str to mapping, optional
         Plants that the design is meant for, the search's own or others from the same boxes: plant k differs from the
         model as the k-th of them does, over and above what else varies; after the last one comes the first.
@@ -286,8 +287,7 @@ def expected_plants(
         deviations = dict(zip(map(str, estimated.index), np.sqrt(np.diag(estimated)).tolist(), strict=True))
         for n, deviation in deviations.items():
             p, width = parameters[n], float(t.ppf(0.975, dof.get(n, math.inf))) * deviation  # half an interval of 95 %
-            ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
-            least, most = (float(min(max(end, p.lower), p.upper)) for end in ends)
+            least, most = _ends(p, width)
             share = width / abs(p.value) if p.value else 0.0
             axes.append(CorrelatedParameters((n,), share, {n: least}, {n: most}))
     for n, (least, most) in ranges.items():

@@ -237,12 +237,11 @@ class StoredFit:
     def estimates(self) -> "pd.DataFrame | None":
         """The estimates with what is uncertain about them; None for a file that no fit has written.
 
-        A row a parameter with stderr, dof, range_low and range_high as in `IdentificationResult.estimates`; NaN where
-        the file has none.
+        A row a parameter with stderr, dof and bias as in `IdentificationResult.estimates`; NaN where the file has none.
         """
         import pandas as pd
 
-        columns = ("stderr", "dof", "range_low", "range_high")
+        columns = ("stderr", "dof", "bias")
         table = pd.DataFrame.from_dict(self._estimates, orient="index").reindex(columns=columns)
         return table.apply(pd.to_numeric, errors="coerce") if self._estimates else None
 

@@ -25,7 +25,7 @@ from pneuopt.identification.identifiability import (
     prior_influenced,
 )
 from pneuopt.identification.losses import Loss, fit_robustly
-from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, suspect_widths
+from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, suspect_widths, t_quantile
 from pneuopt.identification.problem import (
     EstimationProblem,
     as_estimation_model,
@@ -37,7 +37,7 @@ from pneuopt.identification.problem import (
     log_remarks,
     outputs_in_log,
 )
-from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult
+from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult, Mark
 from pneuopt.identification.review import FixedValueTest, review_fit
 from pneuopt.identification.search import (
     Search,
@@ -51,7 +51,7 @@ from pneuopt.identification.search import (
     run_freely,
 )
 from pneuopt.identification.statistics import confidence_interval
-from pneuopt.identification.tolerances import MIN_EXPLAINING_SECONDS, MODEL_ERROR_LEVEL
+from pneuopt.identification.tolerances import HARMLESS_BIAS, MIN_EXPLAINING_SECONDS, MODEL_ERROR_LEVEL
 from pneuopt.identification.widths import ESTIMATED_WIDTH, estimated_widths, free_widths, sticking_covariance
 from pneuopt.logs.experiment import Experiment
 from pneuopt.quantities.arrays import Array, Mask
@@ -329,18 +329,18 @@ def _estimates(
     from pneuopt.quantities.frames import WideFrame
 
     usable = covariance is not None and status.converged and not misfit.is_excessive
-    stderr = np.sqrt(np.diag(covariance)) if usable and covariance is not None else np.full(len(parameters), math.nan)
+    known = np.full(len(parameters), math.nan) if covariance is None else np.sqrt(np.diag(covariance))
+    half_widths = np.where(at_bound, math.nan, t_quantile(misfit.dof) * known)
+    bias = np.maximum(misfit.bound_bias(half_widths), np.where(influenced, half_widths, 0.0))
     rows = {}
     for i, (name, p) in enumerate(parameters.items()):
-        deviation, dof = math.nan if at_bound[i] else float(stderr[i]), float(misfit.dof[i])
-        low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
-        ends = [
-            (p.value * math.exp(min(change / p.value, 700.0)) if p.log else p.value + change)
-            for change in misfit.ranges[i].tolist()
-        ]
-        mark = misfit.mark(i, is_optimum=status.converged and math.isfinite(deviation) and not influenced[i])
+        deviation = float(known[i]) if usable and not at_bound[i] else math.nan
+        dof, stretch = float(misfit.dof[i]), max(1.0, bias[i] / half_widths[i])
+        low, high = confidence_interval(p.value, stretch * deviation, log=p.log, dof=dof)
+        is_harmless = bool(bias[i] <= HARMLESS_BIAS * abs(p.value)) and math.isfinite(deviation)
+        mark = misfit.mark if is_harmless and status.converged else Mark.BIAS_POSSIBLE
         shown = [p.value, low, high, p.unit, mark]
-        rows[name] = [*shown, deviation, dof, *ends, p.lower, p.upper, bool(at_bound[i]), p.source]
+        rows[name] = [*shown, deviation, dof, float(bias[i]), p.lower, p.upper, bool(at_bound[i]), p.source]
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
 
 

@@ -27,7 +27,8 @@ from pneuopt.identification.result import Mark, join_names
 from pneuopt.identification.statistics import agreement
 from pneuopt.identification.tolerances import (
     ASSUMED_SHARE,
-    HARMLESS_SHIFT,
+    BIAS_HALF_WIDTHS,
+    BIAS_SHIFTS,
     LEAST_TIME_DOF,
     LEFT_OUT_REGULARISATION,
     LEVEL,
@@ -60,9 +61,6 @@ class Misfit:
     covariance: Array | None  # of all free parameters; NaN for those that the fit has not determined
     dof: Array  # degrees of freedom of each variance, for Student's t
     inflation: float  # mean ratio of the variances to those of white residuals
-    # the least and the largest change of each estimate when a sixth of the logs, a log, or a class of the motion is
-    # left out
-    ranges: Array
     level: float  # residuals over the noise, root mean squares [1]
     noisy_states: bool  # whether gaps between segments stand for noise of the states
     is_excessive: bool  # whether the residuals are so large that there is no interval
@@ -71,24 +69,32 @@ class Misfit:
     is_slow: bool = False  # whether it varies as slowly as the logs, or from log to log
     lone: tuple[str, ...] = ()
     rejected_widths: tuple[str, ...] = ()  # the stated widths of the model that the logs reject
-    biased: Mask | None = None  # the estimates that such a width biases; None without one
+    shifts: Array | None = None  # how far these move the estimates; None without one
     restarts: bool = False  # whether windows that start anew follow the logs where the model, over whole logs, does not
     is_useless: bool = False  # whether the fit does not predict its own logs (`predict_logs`)
 
-    def mark(self, index: int, *, is_optimum: bool) -> Mark:
-        """The mark of an estimate, which may be at an optimum or at a bound."""
-        is_missed = self.noisy_states or self.restarts or self.is_useless or self.level > MODEL_ERROR_LEVEL
-        is_biased = self.biased is not None and bool(self.biased[index])
-        if self.signals or is_biased or is_missed or not is_optimum:
-            return Mark.BIAS_POSSIBLE
+    @property
+    def mark(self) -> Mark:
+        """The mark of an estimate without harmful bias."""
         return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
+
+    @property
+    def is_of_the_model(self) -> bool:
+        """Whether the residuals show an error of the model, which no interval of chance holds."""
+        is_missed = self.restarts or self.is_useless or self.level > MODEL_ERROR_LEVEL
+        return bool(self.signals) or self.noisy_states or is_missed
+
+    def bound_bias(self, half_widths: Array) -> Array:
+        """How far errors of the model may have moved each estimate, at half widths of its 95 % interval of chance."""
+        by_residuals = BIAS_HALF_WIDTHS * half_widths if self.is_of_the_model else np.zeros_like(half_widths)
+        return by_residuals if self.shifts is None else np.maximum(by_residuals, BIAS_SHIFTS * np.abs(self.shifts))
 
     def assess(self, status: Status) -> Status:
         """The status of a fit with the diagnosis of its residuals."""
         status = status.with_details(*self.sentences)
         if not (self.is_excessive and status.converged):
             return status
-        verdict = f"residuals are {self.level:.3g} times the noise, so that estimates have ranges and no intervals"
+        verdict = f"residuals are {self.level:.3g} times the noise, so that estimates have no intervals"
         return Status(Code.MISFIT, (verdict, *status.sentences))
 
     @property
@@ -124,25 +130,20 @@ def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: 
     white = None if fit.covariance is None else fit.covariance * variance * fit.variance_inflation
     size = math.sqrt(variance), fit.jumps is not None, _is_excessive(problem, fit, variance)
     if fit.optimum is None or scores is None or white is None:
-        return Misfit(white, np.full(k, dof), 1.0, np.full((k, 2), np.nan), *size)
+        return Misfit(white, np.full(k, dof), 1.0, *size)
     keep = np.flatnonzero(fit.optimum.keep)
     blocks = _clusters(scores, _split_in_time(fit.optimum.equations.segments, TIME_BLOCKS), simulate=fit.jumps is None)
     signals = _signals_behind_residuals(scores, names((*problem.system.states, *problem.system.inputs)))
     classes = [_clusters(scores, _classes(signals[0].values, of_size=True))] if signals else []
     square = np.ix_(keep, keep)
     found = robust_covariance(blocks, white[square], variance * fit.variance_inflation, dof, classes=classes)
-    covariance, degrees, ranges = white.copy(), np.full(k, dof), np.full((k, 2), np.nan)
+    covariance, degrees = white.copy(), np.full(k, dof)
     covariance[square], degrees[keep] = found.covariance, found.dof
-    parts = [blocks.halve().halve(), blocks.by_log(), *classes]
-    if changes := [jackknife(c).changes for c in parts if c.count > 1]:
-        each = np.concatenate(changes)
-        ranges[keep] = np.stack([each.min(axis=0), each.max(axis=0)], axis=1)
     own = {n for n in free if n not in problem.parameters}
     return Misfit(
         covariance,
         degrees,
         float(np.mean(np.diag(found.covariance) / np.diag(white[square]))),
-        ranges,
         *size,
         found.widened,
         tuple(s.name for s in signals),
@@ -211,7 +212,6 @@ class Spread(NamedTuple):
 
     covariance: Array
     dof: Array  # Bell and McCaffrey's degrees of freedom of each variance
-    changes: Array  # what each cluster adds to the estimates, by which the covariance is made
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +264,7 @@ def jackknife(clusters: Clusters) -> Spread:
     """CR3: the variance by the changes when one cluster is left out (Bell and McCaffrey 2002, without recentring)."""
     K = clusters.count
     found = _spread(clusters, lambda own: 1 / (1 + LEFT_OUT_REGULARISATION - own))
-    return Spread((K - 1) / K * found.covariance, found.dof, found.changes)
+    return Spread((K - 1) / K * found.covariance, found.dof)
 
 
 def between_clusters(clusters: Clusters) -> Spread:
@@ -314,7 +314,7 @@ def _spread(clusters: Clusters, weigh: Callable[[Array], Array]) -> Spread:
     maps = np.einsum("gij,gj,gkj->gik", vectors, weigh(values), vectors)
     changes = np.einsum("gij,gj->gi", maps, clusters.scores @ scale.T) @ scale
     dof = np.array([_degrees_of_freedom(maps @ column, own) for column in scale.T])
-    return Spread(changes.T @ changes, dof, changes)
+    return Spread(changes.T @ changes, dof)
 
 
 def _degrees_of_freedom(directions: Array, own: Array) -> float:
@@ -446,14 +446,15 @@ class RejectedWidth(NamedTuple):
 
 
 def suspect_widths(misfit: Misfit, problem: EstimationProblem, fit: Fit, variance: float) -> Misfit:
-    """The misfit, with the stated widths that the logs reject; a signal that residuals show marks all estimates."""
-    if misfit.signals or not fit.status.converged or misfit.covariance is None:
+    """The misfit, with the stated widths that the logs reject, where they move an estimate beyond its interval."""
+    if not fit.status.converged or misfit.covariance is None:
         return misfit
     level = SIGNIFICANT_FALL * max(1.0, variance) * max(1.0, misfit.inflation)
-    found = [width for width in score_widths(problem, fit) if width.fall > level]
-    spread = np.sqrt(np.diag(misfit.covariance))
-    biased = np.any([np.abs(width.shifts) > HARMLESS_SHIFT * spread for width in found], axis=0)
-    return replace(misfit, rejected_widths=tuple(w.name for w in found), biased=biased) if np.any(biased) else misfit
+    half_widths = t_quantile(misfit.dof) * np.sqrt(np.diag(misfit.covariance))
+    rejected = [width for width in score_widths(problem, fit) if width.fall > level]
+    found = [width for width in rejected if (BIAS_SHIFTS * np.abs(width.shifts) > half_widths).any()]
+    shifts = np.sum([np.abs(width.shifts) for width in found], axis=0) if found else None
+    return replace(misfit, rejected_widths=tuple(w.name for w in found), shifts=shifts)
 
 
 def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth]:

@@ -160,7 +160,7 @@ class EstimateRow(TypedDict):
     value : float
         The estimate; NaN where it is unidentifiable [unit].
     ci_low, ci_high : float
-        Ends of the 95 % interval [unit].
+        Ends of the 95 % interval, of noise and of the `bias` [unit].
     unit : str
         SI unit.
     mark : str
@@ -169,8 +169,9 @@ class EstimateRow(TypedDict):
         Standard deviation [unit].
     dof : float
         Degrees of freedom of the standard deviation, for Student's t.
-    range_low, range_high : float
-        Ends of what it becomes when a part of the logs is left out [unit].
+    bias : float
+        How far errors of the model may have moved it: nine truths in ten are no farther; 0 where residuals show none
+        [unit].
     lower, upper : float
         Bounds [unit].
     at_bound : bool
@@ -188,8 +189,7 @@ class EstimateRow(TypedDict):
     mark: str
     stderr: float
     dof: float
-    range_low: float
-    range_high: float
+    bias: float
     lower: float
     upper: float
     at_bound: bool
@@ -268,10 +268,8 @@ class IdentificationResult(Result):
     estimates : DataFrame
         A row a free parameter ("name[log]" for one of a log), an `EstimateRow`. The value is NaN where the mark is
         "unidentifiable". No interval there, at a bound, without convergence, or with a status of `Code.MISFIT`. Where a
-        linear interval would be wrong it is the profile likelihood's, infinite at an open end. The range is what the
-        estimate becomes when a sixth of the logs' time, any log, or a class of the motion on which the residuals depend
-        is left out (linearised). An unidentifiable parameter may lie a factor of ten from where it is held: the other
-        intervals allow for that.
+        linear interval would be wrong it is the profile likelihood's, infinite at an open end. An unidentifiable
+        parameter may lie a factor of ten from where it is held: the other intervals allow for that.
     covariance : DataFrame
         Of the estimates, as wide as their intervals count the residuals (`stderr`); NaN for what has no interval.
     fit : DataFrame
@@ -329,16 +327,12 @@ def report_trail(trail: "pd.DataFrame") -> Report:
 
 
 def report_estimates(estimates: "pd.DataFrame") -> Report:
-    """Value, interval or range, and mark of each free parameter."""
+    """Value, interval and doubt of each free parameter."""
     rows = []
     for name, row in estimates.to_dict(orient="index").items():
         estimate, spread, low, high = (float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high"))
         value = format_number(estimate, 4)
-        if math.isnan(low) and math.isfinite(row["range_low"]):
-            low, high = float(row["range_low"]), float(row["range_high"])
-            spread = (high - low) / 4  # the digits then show a fiftieth of the range, which is no confidence interval
-            interval = f"range{TIED}{_format_to_stderr(low, spread)}{TIED}to {_format_to_stderr(high, spread)}"
-        elif math.isfinite(low) and math.isinf(high):
+        if math.isfinite(low) and math.isinf(high):
             interval = f"above{TIED}{format_number(low, 4)}"
         elif math.isinf(low) and math.isfinite(high):
             interval = f"below{TIED}{format_number(high, 4)}"
@@ -348,11 +342,26 @@ def report_estimates(estimates: "pd.DataFrame") -> Report:
             value = _format_to_stderr(estimate, spread)
             interval = f"{_format_to_stderr(low, spread)}{TIED}to {_format_to_stderr(high, spread)}"
         value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
-        mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
-        rows.append((str(name), value, interval, str(row["unit"]), str(mark)))
-    columns = *text_columns("parameter"), *number_columns("value", f"95{TIED}% interval"), *text_columns("unit", "mark")
-    table = (Table(columns, tuple(rows)),) if rows else ()
+        rows.append((str(name), value, interval, str(row["unit"]), _doubt(row)))
+    doubts = text_columns("doubt") if any(row[-1] for row in rows) else ()
+    columns = (
+        *text_columns("parameter"),
+        *number_columns("value", f"95{TIED}% interval"),
+        *text_columns("unit"),
+        *doubts,
+    )
+    table = (Table(columns, tuple(row[: len(columns)] for row in rows)),) if rows else ()
     return Report(table)
+
+
+def _doubt(row: Mapping[str, Any]) -> str:
+    """What a reader should know of an estimate beyond its interval; nothing of most."""
+    if row["note"] == AT_BOUND_NOTE or row["mark"] == Mark.UNIDENTIFIABLE:
+        return str(row["note"] or row["mark"])
+    share = row["bias"] / abs(row["value"]) if row["value"] else math.inf
+    is_known = row["mark"] == Mark.BIAS_POSSIBLE and math.isfinite(share)
+    bound = f"bias <={TIED}{format_number(100 * share, 2)}{TIED}%"
+    return bound if is_known else str(row["mark"]) if row["mark"] == Mark.BIAS_POSSIBLE else ""
 
 
 def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:
@@ -417,8 +426,8 @@ class Mark(StrEnum):
     WIDENED
         The residuals exceed the noise, are correlated, or differ from log to log; the interval counts that.
     BIAS_POSSIBLE
-        The model misses a part of the motion, or the estimate is at its bound; no interval holds the error of that. Or
-        most of the interval is what a factor of ten in an unidentifiable parameter does, to first order.
+        Errors of the model, or what a factor of ten in an unidentifiable parameter does, may have moved the estimate by
+        more than 2 % (`EstimateRow.bias`); or it is at its bound, or the fit did not converge.
     UNIDENTIFIABLE
         The logs do not determine the parameter.
     """

@@ -85,7 +85,10 @@ def review_fit(
     estimates = _blank_intervals(result.estimates, unknown)
     for name, found in profiles.items():
         # the linear interval is that of the curvature at the peak, which says little of the side on which it is flat
-        estimates.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
+        ends = [found.low, found.high]
+        if estimates["bias"][name] > 0:
+            ends = [min(found.low, estimates["ci_low"][name]), max(found.high, estimates["ci_high"][name])]
+        estimates.loc[name, ["ci_low", "ci_high"]] = ends
         farther = max(found.high - found.estimate, found.estimate - found.low) / math.sqrt(found.threshold)
         deviation = math.nan if found.is_open else max(farther, float(result.estimates["stderr"][name]))
         estimates.loc[name, "stderr"] = deviation
@@ -110,7 +113,7 @@ def _widen_covariance(covariance: "pd.DataFrame", stderr: "pd.Series[float]") ->
 def _blank_intervals(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
     """The estimates without intervals for the named parameters."""
     out = estimates.copy()
-    out.loc[list(names), ["stderr", "ci_low", "ci_high", "range_low", "range_high"]] = math.nan
+    out.loc[list(names), ["stderr", "ci_low", "ci_high", "bias"]] = math.nan
     return out
 
 

@@ -661,6 +661,7 @@ def mark_order(problem: EstimationProblem, result: IdentificationResult) -> Iden
         below = result.parameters.value(high) - float(result.estimates["value"][low])
         if variance >= 0 and below > CLEAR_DEVIATIONS * math.sqrt(variance):
             estimates.loc[names, "mark"] = Mark.BIAS_POSSIBLE
+            estimates.loc[names, "bias"] = estimates.loc[names, "bias"].clip(lower=below)
             words = f"{low} is below {high}, which no drive has: model error, both may be biased"
             status = status.with_details(words)
     return replace(result, estimates=estimates, status=status)

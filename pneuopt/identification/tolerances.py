@@ -84,7 +84,10 @@ MOTION_LEVEL = 0.001  # [1] probability, over all signals and outputs, below whi
 # friction that depends on load or position 2 to 8
 MAX_MISFIT = 20.0
 MAX_NRMSE = 0.2  # [1] the same over the channel's own variation, where the noise is estimated
-HARMLESS_SHIFT = 0.5  # [deviations] by a rejected width: a 95 % interval so far off holds the truth 92 times in 100
+# half widths of a 95 % interval of chance that hold nine truths in ten where residuals show an error of the model, and
+# first-order shifts to the widths that the logs prefer that do where a stated width is rejected
+BIAS_HALF_WIDTHS, BIAS_SHIFTS = 3.0, 2.0
+HARMLESS_BIAS = 0.02  # [1] over the value, up to which no design notices it
 MIN_SIGNAL_SPREAD = 1e-6  # [1] of a signal over its size: a smaller one is rounding, and has no classes
 
 # Problem

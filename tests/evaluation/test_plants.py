@@ -32,8 +32,7 @@ ESTIMATES = pd.DataFrame(
     {
         "stderr": [2.0, 3.0, math.nan],
         "dof": [4.0, math.inf, math.nan],
-        "range_low": [math.nan, math.nan, 50.0],
-        "range_high": [math.nan, math.nan, 75.0],
+        "bias": [math.nan, math.nan, 12.5],
     },
     [*FITTED, "friction.static"],
 )
@@ -63,7 +62,7 @@ def test_few_degrees_of_freedom_widen_and_ranges_are_drawn_from() -> None:
         2 * stats.t.ppf(0.975, 4), rel=0.1
     )
     assert plants["friction.static"].min() == pytest.approx(60, abs=0.1)
-    assert plants["friction.static"].max() == pytest.approx(75, abs=0.1)
+    assert plants["friction.static"].max() == pytest.approx(80, abs=0.1)
 
 
 def test_what_is_stated_goes_before_the_fit() -> None:
@@ -143,8 +142,8 @@ def test_few_degrees_of_freedom_widen_the_draws_to_the_interval_and_keep_the_cor
 
 def test_a_range_in_place_of_an_interval_is_drawn_from_end_to_end() -> None:
     given, name = parameters(), "friction.coulomb"
-    low, high = 0.5 * given.value(name), 1.1 * given.value(name)
-    columns = {"stderr": [np.nan], "dof": [5.0], "range_low": [low], "range_high": [high]}
+    low, high = given.value(name) * (1 + np.array([-0.3, 0.3]))
+    columns = {"stderr": [np.nan], "dof": [5.0], "bias": [0.3 * given.value(name)]}
     plants = expected_plants(given, estimates=pd.DataFrame(columns, index=[name]), count=400)
     drawn = np.array([v[name] for v in plants.scenarios.values()], dtype=float)
     assert low <= drawn.min() < low + 0.02 * (high - low)

@@ -30,9 +30,7 @@ RIG = ParameterSet(
 )
 FITTED = ("friction.coulomb", "friction.viscous")
 COVARIANCE = pd.DataFrame(np.diag([0.04, 0.09]), FITTED, FITTED)
-RANGES = pd.DataFrame(
-    {"stderr": [np.nan] * 2, "range_low": [1.0, 2.0], "range_high": [3.0, 9.0]}, ["load.mass", "plant.gain"]
-)
+RANGES = pd.DataFrame({"stderr": [np.nan] * 2, "bias": [1.0, 3.0]}, ["load.mass", "plant.gain"])
 BOX = dict.fromkeys(NAMES, "30 %")
 Plants = Mapping[str, Mapping[str, float | Factor]]
 

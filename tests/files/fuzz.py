@@ -32,7 +32,7 @@ from tests.fuzzing import Report
 KINDS = ("pneumatic", "force", "rotary", "linear")
 RESULT = """
 [estimates]
-"friction.coulomb" = { value = 40.0, stderr = 1.0, dof = 30.0, range_low = 30.0, range_high = 50.0, mark = "exact" }
+"friction.coulomb" = { value = 40.0, stderr = 1.0, dof = 30.0, bias = 3.0, mark = "exact" }
 [covariance]
 "friction.coulomb" = [1.0]
 [status]

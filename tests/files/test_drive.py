@@ -334,11 +334,11 @@ def test_a_fit_without_a_covariance_gives_the_variances_of_its_estimates(tmp_pat
     assert found.to_dict() == {"load.mass": {"load.mass": pytest.approx(0.04)}}
 
 
-def test_degrees_of_freedom_and_ranges_are_read_with_the_estimates(tmp_path: Path) -> None:
-    rows = '"load.mass" = {value = 5.0, stderr = nan, dof = 3.5, range_low = 4.0, range_high = 6.0, mark = "exact"}\n'
+def test_degrees_of_freedom_and_bias_are_read_with_the_estimates(tmp_path: Path) -> None:
+    rows = '"load.mass" = {value = 5.0, stderr = nan, dof = 3.5, bias = 0.5, mark = "exact"}\n'
     found = read_fit(written(tmp_path, f'{AXIS}[estimates]\n{rows}"load.force" = {{value = 1.0}}\n')).estimates
     assert found is not None
-    assert found.loc["load.mass"].dropna().to_dict() == {"dof": 3.5, "range_low": 4.0, "range_high": 6.0}
+    assert found.loc["load.mass"].dropna().to_dict() == {"dof": 3.5, "bias": 0.5}
     assert found.loc["load.force"].isna().all()
     assert read_fit(written(tmp_path, FORCE_AXIS)).estimates is None
 

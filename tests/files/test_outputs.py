@@ -135,7 +135,7 @@ def parameter_sets(draw: st.DrawFn) -> ParameterSet:
 def fits(draw: st.DrawFn) -> IdentificationResult:
     names = draw(st.lists(NAME, min_size=3, max_size=3, unique=True))
     marks, units = column(st.sampled_from([m.value for m in Mark])), column(TEXT)
-    numbers = {n: draw(column(NUMBER)) for n in ("value", "stderr", "ci_low", "ci_high", "range_low", "range_high")}
+    numbers = {n: draw(column(NUMBER)) for n in ("value", "stderr", "ci_low", "ci_high", "bias")}
     told = {
         "at_bound": draw(column(st.booleans())),
         "mark": draw(marks),

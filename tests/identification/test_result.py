@@ -22,29 +22,31 @@ from pneuopt.quantities.trajectories import Trajectory
 def test_open_ends_and_what_is_unidentifiable_are_no_numbers() -> None:
     none = math.nan
     rows = {
-        "a.open": (2.0, none, 1.5, math.inf, none, none, "widened", ""),
-        "b.blind": (7.0, none, -math.inf, math.inf, none, none, "unidentifiable", "unidentifiable"),
-        "c.missed": (7.0, none, none, none, 6.0, 9.0, "bias possible", ""),
-        "d.pressed": (7.0, none, none, none, none, none, "bias possible", "at its bound"),
+        "a.open": (2.0, none, 1.5, math.inf, 0.0, "widened", ""),
+        "b.blind": (7.0, none, -math.inf, math.inf, none, "unidentifiable", "unidentifiable"),
+        "c.missed": (7.0, none, none, none, 1.4, "bias possible", ""),
+        "d.pressed": (7.0, none, none, none, none, "bias possible", "at its bound"),
+        "e.early": (7.0, none, none, none, none, "bias possible", ""),
     }
-    columns = ["value", "stderr", "ci_low", "ci_high", "range_low", "range_high", "mark", "note"]
+    columns = ["value", "stderr", "ci_low", "ci_high", "bias", "mark", "note"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=columns).assign(unit="N")
-    shown = [line.split() for line in report_estimates(table).to_text(80).splitlines()[-4:]]
+    shown = [line.split() for line in report_estimates(table).to_text(80).splitlines()[-5:]]
     assert shown == [
-        ["a.open", "2", "above", "1.5", "N", "widened"],
+        ["a.open", "2", "above", "1.5", "N"],
         ["b.blind", "-", "not", "determined", "N", "unidentifiable"],
-        ["c.missed", "7", "range", "6.00", "to", "9.00", "N", "bias", "possible"],
+        ["c.missed", "7", "not", "determined", "N", "bias", "<=", "20", "%"],
         ["d.pressed", "7", "not", "determined", "N", "at", "its", "bound"],
+        ["e.early", "7", "not", "determined", "N", "bias", "possible"],
     ]
 
 
 def test_marks_fit_a_terminal_of_80_columns() -> None:
-    row = [0.020014, 2.8e-5, 0.019958, 0.02007, math.nan, math.nan, "bias possible", "", "m/s"]
-    columns = ["value", "stderr", "ci_low", "ci_high", "range_low", "range_high", "mark", "note", "unit"]
+    row = [0.020014, 2.8e-5, 0.019958, 0.02007, 0.0062, "bias possible", "", "m/s"]
+    columns = ["value", "stderr", "ci_low", "ci_high", "bias", "mark", "note", "unit"]
     table = pd.DataFrame([row], index=["friction.stribeck_velocity"], columns=columns)
     lines = report_estimates(table).to_text(80).splitlines()
     assert max(map(len, lines)) <= 80
-    words = ["friction.stribeck_velocity", "0.020014", "0.019958 to 0.020070", "m/s", "bias possible"]
+    words = ["friction.stribeck_velocity", "0.020014", "0.019958 to 0.020070", "m/s", "bias <= 31 %"]
     assert sum(all(word in line for word in words) for line in lines) == 1
 
 

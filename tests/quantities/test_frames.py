@@ -5,11 +5,11 @@ import pytest
 
 from pneuopt.quantities.frames import WideFrame
 
-NAMES = ["value", "ci_low", "ci_high", "unit", "mark", "stderr", "dof", "range_low", "range_high", "source"]
+NAMES = ["value", "ci_low", "ci_high", "unit", "mark", "stderr", "dof", "bias", "source"]
 
 
 def estimates() -> WideFrame:
-    row = [0.0200024, 0.01999, 0.0200148, "m/s", "bias possible", 6e-6, 801.3, 0.0199, 0.0201, "run_01.csv, by hand"]
+    row = [0.0200024, 0.01999, 0.0200148, "m/s", "bias possible", 6e-6, 801.3, 0.0001, "run_01.csv, by hand"]
     return WideFrame([row, row], index=["friction.stribeck_velocity", "friction.coulomb"], columns=NAMES)
 
 
