@@ -99,7 +99,9 @@ def _fix(places: Mapping[Path, Path], system: System, parameters: ParameterSet, 
     show_output_files(make_console(), list(files))
     if not mended:
         return ExitStatus.BAD_INPUT
-    left = check(system, _read_all([places[path] for path in mended], system, parameters, accept)[0], parameters)
+    left = check(
+        system, _read_all([places[path] for path in mended], system, parameters, accept)[0], parameters, trial=False
+    )
     verdict = replace(left.headline, text=f"the mended logs: {left.headline.text}")
     show_report(make_console(), Report((verdict, *map(finding_line, left.findings))))
     return ExitStatus.BAD_INPUT if errors else ExitStatus.FAILURE if left.is_refused else ExitStatus.SUCCESS

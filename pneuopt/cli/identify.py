@@ -80,7 +80,7 @@ def run_identify(
     model, parameters = read_free_drive(drive)
     system = model.system()
     experiments, others = (read_experiments(own, system, parameters, accept) for own in (logs, held_out))
-    found = check(system, experiments, parameters)
+    found = check(system, experiments, parameters, trial=False)
     for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
     warnings.filterwarnings("ignore", message="before the search")  # the check has said it

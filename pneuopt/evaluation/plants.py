@@ -124,8 +124,9 @@ def select_ranges(
     """As far as errors of the model may reach, within the bounds, where a fit has no interval, without the others."""
     if estimates is None or "bias" not in estimates:
         return {}
-    wide = estimates["bias"][estimates["stderr"].isna() & (estimates["bias"] > 0)].to_dict()
-    return {str(n): _ends(parameters[n], b) for n, b in wide.items() if n in parameters and n not in others}
+    wide = estimates["bias"][estimates["stderr"].isna() & (estimates["bias"] > 0)]
+    bounds = dict(zip(map(str, wide.index), wide.tolist(), strict=True))
+    return {n: _ends(parameters[n], bound) for n, bound in bounds.items() if n in parameters and n not in others}
 
 
 def _ends(p: Parameter, width: float) -> tuple[float, float]:

@@ -25,6 +25,7 @@ from pneuopt.identification.identifiability import (
     is_accepted,
     is_refused,
 )
+from pneuopt.identification.identify import identify
 from pneuopt.identification.problem import (
     EstimationProblem,
     as_estimation_model,
@@ -38,6 +39,8 @@ from pneuopt.identification.problem import (
     outputs_in_log,
 )
 from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, Verdict
+from pneuopt.identification.tolerances import TRIAL_SECONDS
+from pneuopt.identification.widths import estimated_widths
 from pneuopt.logs.doctor import LogFinding, Severity, evidence, examine
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.noise import estimate_noise
@@ -45,6 +48,7 @@ from pneuopt.quantities.errors import ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import Intersample, ParameterSet, check_parameters
 from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, text_columns
 from pneuopt.quantities.results import Shown
+from pneuopt.quantities.status import Code
 from pneuopt.quantities.units import ATMOSPHERE, write_value
 from pneuopt.shooting.least_squares import LeastSquares
 
@@ -142,10 +146,12 @@ class Checkup(Shown):
     findings : tuple of LogFinding
         Faults first; each with its severity and rows.
     verdict : Verdict or None
-        What the logs identify, from sensitivities at the start; None where a fault, or no free parameter, leaves that
-        open.
+        What the logs identify; None where a fault, or no free parameter, leaves that open.
     parameters : ParameterSet
         As they would be fitted: of the model, and as given.
+    is_tried : bool
+        Whether a trial fit converged, whose figures the verdict has; else they are those of a right model at its first
+        start, which are seldom reached.
     """
 
     logs: tuple[Experiment, ...]
@@ -153,6 +159,7 @@ class Checkup(Shown):
     findings: tuple[LogFinding, ...]
     verdict: Verdict | None
     parameters: ParameterSet
+    is_tried: bool = False
 
     @property
     def is_refused(self) -> bool:
@@ -214,11 +221,12 @@ class Checkup(Shown):
             assumed += [_line(f"in {a.file}:", 2)] if a.file != file else []
             assumed.append(_line(f"{a.key} = {a.text}: {a.reason}", 4))
             file = a.file
+        how = "by a trial fit" if self.is_tried else "if the model is right: a fit takes longer, and may know less"
         blocks: dict[str, list[Line | Table]] = {
             "read": [*itertools.chain.from_iterable(map(_log_lines, self.logs))],
             "assumed, for it stands in no file; written so, it states the same": assumed,
             "found": [*map(finding_line, self.findings)],
-            "identifiable, by sensitivities at the start values, if the model is right": [*_verdict_parts(self)],
+            f"identifiable, {how}": [*_verdict_parts(self)],
             "what would help": [_line(f"{run}: for {', '.join(names)}", 2) for run, names in self.runs.items()],
         }
         parts: list[Line | Table] = [self.headline]
@@ -229,9 +237,13 @@ class Checkup(Shown):
 
 
 def check(
-    system: HasSystem | ClosedLoop, experiments: Experiment | Iterable[Experiment], parameters: ParameterSet
+    system: HasSystem | ClosedLoop,
+    experiments: Experiment | Iterable[Experiment],
+    parameters: ParameterSet,
+    *,
+    trial: bool = True,
 ) -> Checkup:
-    """Check logs, a drive and its parameters before a fit: no search is run.
+    """Check logs, a drive and its parameters before a fit, with a trial fit of a few seconds.
 
     Parameters
     ----------
@@ -241,12 +253,14 @@ def check(
         The logs, as read.
     parameters : ParameterSet
         As for `identify`.
+    trial : bool
+        Whether a trial fit of a few seconds tells what the logs identify; else it is told at the first start.
 
     Returns
     -------
     Checkup
         What was read and assumed, what is wrong, what the logs identify, and which run would help. The figures of what
-        they identify are those of a right model and white noise: no estimate is better.
+        they identify are of a trial fit; where it does not converge so soon, of a right model at its first start.
 
     Raises
     ------
@@ -278,8 +292,23 @@ def check(
     ranked.sort(key=lambda f: list(Severity).index(f.severity))
     is_open = any(f.severity is Severity.FAULT for f in ranked)
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, LeastSquares())
-    verdict = None if is_open else foresee(problem)
-    return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters)
+    tried = None if is_open or not trial else _try_fit(system, problem)
+    verdict = None if is_open else tried or foresee(problem)
+    return Checkup(given, assumptions, tuple(ranked), verdict, model.parameters | parameters, tried is not None)
+
+
+def _try_fit(system: HasSystem | ClosedLoop, problem: EstimationProblem) -> Verdict | None:
+    """The verdict of a fit of a few seconds, without widths, for which nobody asks; None where none converges."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PhysicsWarning)  # of what this check has found
+        logs, given = problem.experiments, problem.parameters
+        found = identify(system, logs, given, cpu_seconds=TRIAL_SECONDS, explain=False, throw=False)
+    if found.status.code is Code.INTERRUPTED:
+        raise KeyboardInterrupt
+    if found.verdict is None or found.status.code not in (Code.CONVERGED, Code.PARTIAL):
+        return None
+    asked = [n for n in found.verdict.table.index if n not in estimated_widths(found.parameters)]
+    return replace(found.verdict, table=found.verdict.table.loc[asked])
 
 
 def list_assumptions(
@@ -467,5 +496,5 @@ def _verdict_parts(found: Checkup) -> Iterator[Line | Table]:
             known = f"+-{share:.2g} %"
         known = known if row["identifiable"] else UNIDENTIFIABLE_NOTE
         rows.append((str(name), write_value(value, unit, 4), known))
-    yield Table(text_columns("parameter", "start", "deviation"), tuple(rows))
+    yield Table(text_columns("parameter", "value", "deviation"), tuple(rows))
     yield from (_line(sentence, 2) for sentence in found.verdict.sentences)

@@ -335,7 +335,7 @@ def _estimates(
     rows = {}
     for i, (name, p) in enumerate(parameters.items()):
         deviation = float(known[i]) if usable and not at_bound[i] else math.nan
-        dof, stretch = float(misfit.dof[i]), max(1.0, bias[i] / half_widths[i])
+        dof, stretch = float(misfit.dof[i]), bias[i] / half_widths[i] if bias[i] > half_widths[i] else 1.0
         low, high = confidence_interval(p.value, stretch * deviation, log=p.log, dof=dof)
         is_harmless = bool(bias[i] <= HARMLESS_BIAS * abs(p.value)) and math.isfinite(deviation)
         mark = misfit.mark if is_harmless and status.converged else Mark.BIAS_POSSIBLE

@@ -354,7 +354,7 @@ def report_estimates(estimates: "pd.DataFrame") -> Report:
     return Report(table)
 
 
-def _doubt(row: Mapping[str, Any]) -> str:
+def _doubt(row: Mapping[Any, Any]) -> str:
     """What a reader should know of an estimate beyond its interval; nothing of most."""
     if row["note"] == AT_BOUND_NOTE or row["mark"] == Mark.UNIDENTIFIABLE:
         return str(row["note"] or row["mark"])

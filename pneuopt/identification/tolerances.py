@@ -10,6 +10,10 @@ REFIT_STAGES = 3  # last stages of a method that a refit runs, near its answer
 SIGNIFICANT_FALL = 10.8  # [variances] fall of squared residuals that counts: chance exceeds it once in a thousand
 MIN_WINDOW_SAMPLES = 20  # measured samples of the shortest window: of fewer its start state takes most
 
+# Checkup
+
+TRIAL_SECONDS = 5.0  # [CPU s] that the trial fit of a check may take
+
 # Compare logs
 
 MIN_RELATIVE_DIFFERENCE = 0.02  # [1] that a disagreement must exceed, too: an interval does not hold a model's bias

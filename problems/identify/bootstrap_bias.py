@@ -4,10 +4,11 @@
 
 The log of data/pneumatic_rig is identified with the smooth model; then its logs are simulated on the drive with that
 fit's estimates, which truly sticks, behind the valve's hysteresis and the sensors that its data sheets state, and are
-identified again. `demo.right_signs` counts the marked estimates whose bias is told with the sign that it has. Then the
-same on rigs drawn at random (other_rigs.py), whose hysteresis is half to one and a half times what is stated; their
-mass is stated as it is. `.error` is an estimate's distance from the truth, `.corrected` that of the estimate less its
-bias; `left` is the root mean square of the second over that of the first, over all estimates of all rigs.
+identified again. `demo.right_signs` counts the estimates with a bound of their bias of which it is told with the sign
+that it has. Then the same on rigs drawn at random (other_rigs.py), whose hysteresis is half to one and a half times
+what is stated; their mass is stated as it is. `.error` is an estimate's distance from the truth, `.corrected` that of
+the estimate less its bias; `left` is the root mean square of the second over that of the first, over all estimates of
+all rigs.
 """
 
 import sys
@@ -39,7 +40,7 @@ def main(found: Found) -> "pd.DataFrame":
     for name, table in found.items():
         for parameter, row in table.iterrows():
             claims += [Claim(f"{name}.{parameter}.{part}", float(row[part]), "%") for part in ("error", "corrected")]
-    marked = found[DEMO][found[DEMO]["mark"] == po.Mark.BIAS_POSSIBLE]
+    marked = found[DEMO][found[DEMO]["bias"] > 0]
     right = int((np.sign(marked["error"]) == np.sign(marked["error"] - marked["corrected"])).sum())
     before, after = (np.concatenate([t[part] for t in found.values()]) for part in ("error", "corrected"))
     left = float(np.linalg.norm(after) / np.linalg.norm(before))
@@ -48,7 +49,7 @@ def main(found: Found) -> "pd.DataFrame":
 
 
 def run(count: int = COUNT, rigs: Sequence[int] = RIGS) -> Found:
-    """By rig a row an estimate: error and corrected [% of the truth], mark."""
+    """By rig a row an estimate: error and corrected [% of the truth], bound of the bias."""
     drive, given = po.read_drive(DATA / "drive.toml")
     found = {DEMO: tried(drive, po.read_log(DATA / "run_01.csv"), given, TRUTH, count)}
     for seed in rigs:
@@ -74,7 +75,7 @@ def tried(
     table = result.table[["value", "corrected"]].astype(float)
     true = np.array([truth[str(n)] for n in table.index])
     table = 100 * (table.div(true, axis=0) - 1)
-    table.insert(0, "mark", fit.estimates["mark"].loc[table.index])
+    table.insert(0, "bias", fit.estimates["bias"].loc[table.index])
     return table.rename(columns={"value": "error"})
 
 

@@ -14,6 +14,7 @@ from pneuopt.dynamics.system import Symbols, define, discretise
 from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.files.toml import read_toml
 from pneuopt.identification import identify as identify_module
+from pneuopt.identification.checkup import check
 from pneuopt.identification.identifiability import (
     axis_from_model,
     examine_logs,
@@ -488,6 +489,16 @@ def test_the_deviations_that_are_foreseen_are_those_of_the_fit(law: str, given: 
     curve = ratio.index.isin(["friction.static", "friction.stribeck_velocity"])
     assert ratio[~curve].between(0.5, 2).all(), ratio
     assert ratio[curve].between(0.1, 10).all(), ratio
+
+
+@pytest.mark.parametrize(("law", "given", "log"), drawn_axes(4), ids=lambda v: v if isinstance(v, str) else "")
+def test_a_check_foretells_the_deviations_of_the_fit(law: str, given: ParameterSet, log: Experiment) -> None:
+    """Within a factor of two, a Stribeck curve's, too: its trial fit is that fit."""
+    drive = ForceDrive(Coulomb() if law == "Coulomb" else Stribeck())
+    fit, found = identify(drive, log, given), check(drive, log, given).verdict
+    assert found is not None
+    names = list(given.free_names)
+    assert (found.table["stderr"][names] / fit.estimates["stderr"][names]).between(0.5, 2).all()
 
 
 def test_a_drive_that_moves_one_way_keeps_its_load_and_gives_no_friction() -> None:

@@ -81,7 +81,8 @@ def test_residuals_of_twenty_samples_stay_residuals() -> None:
 
 def test_a_stick_case_counts_what_is_wrong_without_a_mark() -> None:
     names = interval_coverage.WANTED
-    rows = pd.DataFrame({f"scaled {n}": [5.0, 0.1] for n in names} | {f"mark {n}": "bias possible" for n in names})
+    columns = {f"scaled {n}": [5.0, 0.1] for n in names} | {f"off {n}": [2.1, 0.1] for n in names}
+    rows = pd.DataFrame(columns | {f"mark {n}": "bias possible" for n in names})
     rows = rows.assign(converged=1.0, misfit=1.1, seconds=3.0)
     assert {c.name: c for c in interval_coverage._claims("stick_1mm", rows)}["stick_1mm.silent"].holds
     rows["mark friction.static"] = "exact"
