@@ -139,7 +139,21 @@ def test_stops_push_back_beyond_the_stroke_only() -> None:
     assert stop(-0.001, 0.0) == pytest.approx(1000.0, rel=0.01)
     assert stop(0.201, 0.5) == pytest.approx(-1500.0, rel=0.01)  # on its way in it pushes harder
     assert stop(-0.001, 0.5) == pytest.approx(500.0, rel=0.01)
-    assert stop(0.19, 0.0) == pytest.approx(-0.25, rel=0.06)  # less what is left of the other
+    for y in (2e-4, 0.01, 0.1, 0.19, 0.1998):  # a push that depends on the speed here would count as viscous friction
+        for v in (0.0, 0.5, -0.5):
+            assert stop(y, v) == 0.0
+
+
+@given(st.floats(-3e-4, 3e-4), st.floats(1e-6, 1e-4))
+def test_a_cover_pushes_the_more_the_deeper_the_piston_is_and_without_a_kink(y: float, step: float) -> None:
+    at = ca.SX.sym("y")
+    p = {"stroke": ca.SX(0.2), "stop_stiffness": ca.SX(1e6), "stop_damping": ca.SX(0.0)}
+    force = Cylinder().stop_force(at, ca.SX(0.0), p)
+    push = ca.Function("push", [at], [force, ca.gradient(force, at)])
+    (near, slope), (deep, steeper) = ([float(v) for v in push(d)] for d in (y, y - step))
+    assert deep >= near >= 0.0
+    assert 0.0 <= -slope <= -steeper + 1e-6 <= 1e6 + 1.0
+    assert abs(deep - near + slope * step) <= 0.75e10 * step**2 / 2 + 1e-9  # within the greatest curvature of its onset
 
 
 def test_it_runs_into_the_stop_and_stays() -> None:
@@ -213,8 +227,8 @@ def test_steady_motion_leaves_only_the_position_to_change(name: str, speed: floa
 
 @pytest.mark.parametrize("friction", [Stribeck(), LuGre(), Karnopp(Stribeck())])
 def test_a_loop_in_motion_stays_in_motion(friction: FrictionModel) -> None:
-    """50 ms at 0.2 m/s, the command in the controller's hands; without end stops, which reach everywhere a little."""
-    drive = PneumaticDrive(friction=friction, cylinder=Cylinder(stops=False))
+    """50 ms at 0.2 m/s, the command in the controller's hands."""
+    drive = PneumaticDrive(friction=friction)
     loop = ClosedLoop(drive.system(), PID(sample_time=1e-3))
     p = loop.parameters.with_values(
         {"pid.Kp": 10.0, "pid.Ki": 40.0, "pid.Kd": 0.1, "pid.lower": -5.0, "pid.upper": 5.0}
