@@ -1,7 +1,8 @@
 """Friction of seals, guides, bearings and gears, from viscous to LuGre; wrappers add asymmetry, pressure and load.
 
-Signs: the force opposes positive speed when positive. Every map is smooth; `smoothing` is the speed over which the
-Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre holds it.
+Signs: the force opposes positive speed when positive. Every map is smooth in the speed; `smoothing` is the speed over
+which the Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre
+holds it.
 
 `Karnopp` is dry friction for simulations: `simulate` switches its "friction.direction" and locates each break-away and
 standstill; a solver that leaves the direction at zero simulates no dry friction at all. The registry of the laws, a row
@@ -613,11 +614,11 @@ class Presliding:
 
 @dataclass(frozen=True)
 class LoadDependent:
-    """A base model whose Coulomb and static levels rise with the transmitted force F: + coulomb_load |F|, |F| smooth.
+    """A base model whose Coulomb and static levels rise with the transmitted force F: + coulomb_load |F|.
 
-    ``|F| = sqrt(F^2 + load_rounding^2) - load_rounding``: zero without load, and never more than the exact value. F
-    drives the load: the input of a `ForceDrive`, the torque of a `RotaryDrive`. For gears of servos coulomb_load is
-    0.01 to 0.2.
+    F drives the load: the input of a `ForceDrive`, the torque of a `RotaryDrive`. For gears of servos coulomb_load is
+    0.01 to 0.2. The size |F| is exact: a rounding would be a force that is large for a small axis and nothing for a
+    large one, and no integration needs it, since friction has a kink there and no step.
 
     Source: Hamon, Gautier, Garrec, Dynamic identification of robots with a dry friction model depending on load and
     velocity, IROS 2010.
@@ -640,19 +641,9 @@ class LoadDependent:
 
     @property
     def parameters(self) -> ParameterSet:
-        """Parameters of the base model, coulomb_load [1] and load_rounding [N]."""
-        added = {
-            "coulomb_load": Parameter(0.0, "1", lower=0.0, upper=0.9, meaning="Coulomb friction per transmitted force"),
-            "load_rounding": Parameter(
-                1.0,
-                "N",
-                lower=1e-3,
-                upper=1e3,
-                log=True,
-                meaning="force over which the transmitted force's size is rounded",
-            ),
-        }
-        return self.base.parameters | ParameterSet(added)
+        """Parameters of the base model, and coulomb_load [1]."""
+        slope = Parameter(0.0, "1", lower=0.0, upper=0.9, meaning="Coulomb friction per transmitted force")
+        return self.base.parameters | ParameterSet({"coulomb_load": slope})
 
     @property
     def identification_hints(self) -> IdentificationHints:
@@ -668,16 +659,13 @@ class LoadDependent:
         base = self.base.start
 
         def columns(s: FrictionSamples) -> dict[str, Array]:
-            rounding = s.values["load_rounding"]
-            size = np.sqrt(s.inputs["force"] ** 2 + rounding**2) - rounding
-            return base.columns(s) | {"coulomb_load": s.side * size}
+            return base.columns(s) | {"coulomb_load": s.side * np.abs(s.inputs["force"])}
 
         return replace(base, columns=columns, unknowns=(*base.unknowns, "coulomb_load"))
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """Return the force of the base model with raised levels; see the class."""
-        size = ca.sqrt(u["force"] ** 2 + p["load_rounding"] ** 2) - p["load_rounding"]
-        return self.base.force(v, z, u, raise_levels(p, p["coulomb_load"] * size))
+        return self.base.force(v, z, u, raise_levels(p, p["coulomb_load"] * ca.fabs(u["force"])))
 
 
 @dataclass(frozen=True)

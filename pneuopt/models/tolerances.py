@@ -64,11 +64,8 @@ DAMPING_GRID = (0.1, 0.3, 0.7, 1.5, 4.0)  # damping ratios of the grid [1], from
 
 # Pneumatic drives: where the model is smooth, and where it ends
 
-# mass flow over which exponent or temperature change from outflow to inflow [kg/s]: a narrower one is stiffer at rest,
-# a wider one mixes the two in motion
-FLOW_REVERSAL_WIDTH = 1e-5
-# rounding of the end stops' onset [m]: with a larger one the stops push far inside the stroke (now 0.25 N at 10 mm from
-# a stop of 1e6 N/m), with a smaller one impacts need finer steps
+# rounding of the end stops' onset [m], within which a cover pushes before it is reached: with a larger one it shortens
+# the stroke, with a smaller one impacts need finer steps
 STOP_ROUNDING = 1e-4
 MIN_CHAMBER_PRESSURE = 1e3  # absolute pressure [Pa] below which the models are not valid
 MAX_COMPRESSION_RATIO = 20.0  # largest chamber pressure over supply pressure [1] that is searched in steady motion

@@ -45,6 +45,12 @@ static double edge(double x, const double *p) {
     return 0.5 * (d + sqrt(d * d + p[ROUND] * p[ROUND])) + p[LEAK];
 }
 
+/* of a cover: 0 up to 0.1 mm before it, the depth from 0.1 mm beyond it */
+static double compression(double depth) {
+    double w = depth / 1e-4;
+    return w <= -1 ? 0 : w >= 1 ? depth : 1e-4 * (w + 1) * (w + 1) * (w + 1) * (3 - w) / 16;
+}
+
 static void cylinder(const double *x, double u, const double *p, double *d) {
     double Aa = TWO_PI / 8 * p[BORE] * p[BORE], Ab = Aa - TWO_PI / 8 * p[ROD] * p[ROD];
     double Va = p[DA] + Aa * x[0], Vb = p[DB] + Ab * (p[STROKE] - x[0]), w = TWO_PI * p[BW];
@@ -53,7 +59,7 @@ static void cylinder(const double *x, double u, const double *p, double *d) {
     double wb = scale * (edge(-x[4], p) * orifice(p[PS], x[3], p) - edge(x[4], p) * orifice(x[3], p[PO], p));
     double friction = lugre(x[1], x[6], p[FC], p[FS], p[VS], p[B], p[S0], p[S1], p[VD], &dz);
     double command = fmax(-1, fmin(1, u / p[SPAN]));
-    double rear = 0.5 * (-x[0] + sqrt(x[0] * x[0] + 1e-8)), over = x[0] - p[STROKE], front = 0.5 * (over + sqrt(over * over + 1e-8));
+    double rear = compression(-x[0]), front = compression(x[0] - p[STROKE]);
     double stop = p[KSTOP] * (rear * (1 - p[DSTOP] * x[1]) - front * (1 + p[DSTOP] * x[1]));
     d[0] = x[1];
     d[1] = (stop + Aa * (x[2] - p[PO]) - Ab * (x[3] - p[PO]) - friction - p[F]) / p[M];

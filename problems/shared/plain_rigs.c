@@ -1,7 +1,7 @@
 /* Rigs of foreign_rigs.py in plain C, which shares no line with pneuopt: a force drive and a pneumatic cylinder, each
    under a sampled controller. Classical Runge-Kutta in fixed steps; true stiction is a mode of its own: the mass stands
    until the force on it exceeds the static level, and slides until its speed changes its sign, at an instant that is
-   interpolated. Flow by ISO 6358-1:2013 and the valve's edges are sharp. */
+   interpolated. Flow by ISO 6358-1:2013, of air of 1.185 kg/m^3 at its reference, and the edges are sharp. */
 #include <math.h>
 #include <string.h>
 
@@ -30,7 +30,7 @@ static double flow(const Rig *r, double up, double down, double opening) {
     if (down > up) { double t = up; up = down; down = t; sign = -1.0; }
     double ratio = down / up, part = 1.0;
     if (ratio > r->ratio) { double q = (ratio - r->ratio) / (1.0 - r->ratio); part = sqrt(fmax(0.0, 1.0 - q * q)); }
-    return sign * r->conductance * opening * 1e5 / (287.05 * 293.15) * sqrt(293.15 / r->temperature) * up * part;
+    return sign * r->conductance * opening * 1.185 * sqrt(293.15 / r->temperature) * up * part;
 }
 
 static double edge(const Rig *r, double x) { return fmax(0.0, x - r->dead_zone) + r->leak; }

@@ -67,7 +67,7 @@ def test_an_end_stop_is_told_when_and_where() -> None:
     with pytest.warns(PhysicsWarning) as told:
         simulate(DRIVE.system(), held(5.0, 0.5, 2), p)
     assert str(told[0].message) == (
-        "the piston reached the front end stop (position 199.9 mm) at t = 0.07634 s with 2.65 m/s; from there the "
+        "the piston reached the front end stop (position 199.9 mm) at t = 0.07633 s with 2.65 m/s; from there the "
         "response is the stop's"
     )
     with pytest.warns(PhysicsWarning, match=r"front end stop .* at t = 0.0763"):

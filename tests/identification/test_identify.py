@@ -687,6 +687,18 @@ def test_load_dependent_friction_from_four_seconds_at_100_hz() -> None:
     assert max(abs(found["load.mass"]), abs(found["friction.coulomb"])) < 0.05, found
 
 
+@pytest.mark.parametrize("size", [0.05, 50.0])
+def test_the_friction_of_a_gear_is_found_on_an_axis_of_5_n_and_of_5_kn(size: float) -> None:
+    small = logged(500.0, 4.0, load=0.1)  # scaled alike, force, mass and friction give the same motion
+    force = {"force": size * small.trajectory["force"]}
+    drive, truth = ForceDrive(LoadDependent(Coulomb())), {n: size * v for n, v in FORCE_TRUTH.items()}
+    truth |= {"friction.coulomb_load": 0.1}
+    given = drive.parameters.with_values({n: 1.4 * v for n, v in truth.items()}).freed(*truth)
+    fit = identify(drive, replace(small, trajectory=small.trajectory.with_columns(force)), given)
+    for name, true in truth.items():
+        assert fit.parameters.value(name) == pytest.approx(true, rel=5e-3), name
+
+
 def test_a_third_of_the_rows_missing_does_not_move_the_mass() -> None:
     log = logged(500.0)
     kept = np.random.default_rng(0).random(len(log.trajectory)) > 1 / 3

@@ -267,9 +267,8 @@ def test_advice_speaks_in_the_axis_units() -> None:
 
 def test_the_torque_is_the_load_of_load_dependent_friction() -> None:
     drive = RotaryDrive(LoadDependent(Coulomb()))
-    truth = {**TRUTH, "friction.coulomb_load": 0.1, "friction.load_rounding": 0.02}
+    truth = {**TRUTH, "friction.coulomb_load": 0.1}
     parameters = drive.parameters.with_values(truth)
-    assert parameters["friction.load_rounding"].unit == "N*m"
     t = np.arange(2000) * 1e-3
     torque = 0.9 * np.sin(2 * np.pi * 1.5 * t) + 0.6 * np.sin(2 * np.pi * 4.3 * t)
     run = simulate(
@@ -277,7 +276,7 @@ def test_the_torque_is_the_load_of_load_dependent_friction() -> None:
     )
     noise = 1e-3 * np.random.default_rng(0).standard_normal(t.size)
     log = Experiment(Trajectory(t, {"torque": torque, "angle": run["angle"] + noise}))
-    known = drive.parameters.with_values({"load.inertia": 2e-3, "friction.load_rounding": 0.02})
+    known = drive.parameters.with_values({"load.inertia": 2e-3})
     fit = identify(drive.system(), [log], known.freed("friction.coulomb", "friction.viscous", "friction.coulomb_load"))
     for name in ("friction.coulomb", "friction.coulomb_load"):
         assert fit.parameters.value(name) == pytest.approx(truth[name], rel=0.05)

@@ -136,7 +136,7 @@ def test_friction_along_a_run_is_what_the_balance_of_forces_leaves() -> None:
     v, values = ca.SX.sym("v"), {n: ca.SX(q.value) for n, q in LuGre().parameters.items()}
     force = ca.Function("force", [v, *z.values()], [g(v, z, {}, values).value])
     expected = np.array(force(speed, bristle)).ravel()
-    assert friction_force(drive.system(), run, p) == pytest.approx(expected, abs=0.02)  # the end stops reach so far
+    assert friction_force(drive.system(), run, p) == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_fit_stands_beside_its_log_with_units() -> None:

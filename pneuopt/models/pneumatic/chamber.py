@@ -8,7 +8,7 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import ISENTROPIC_EXPONENT
-from pneuopt.models.tolerances import FLOW_REVERSAL_WIDTH, MIN_CHAMBER_PRESSURE
+from pneuopt.models.tolerances import MIN_CHAMBER_PRESSURE
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 PRESSURE = Quantity("pressure", "Pa(a)", nominal=5e5, lower=MIN_CHAMBER_PRESSURE)
@@ -99,7 +99,7 @@ class Polytropic:
         inward, outward, swept = (
             p[f"{n}_exponent" if self.mixed else "exponent"] for n in ("inflow", "outflow", "volume")
         )
-        fed = blend(w, inward, outward) * around.gas_constant * around.temperature * w
+        fed = convection(w, inward, outward) * around.gas_constant * around.temperature
         return {"pressure": (fed - swept * z["pressure"] * around.volume_rate) / around.volume}
 
 
@@ -132,7 +132,7 @@ class Thermal:
     def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
         """Return the rates of the states; see the class."""
         pressure, temperature, k = z["pressure"], z["temperature"], ISENTROPIC_EXPONENT
-        enthalpy = sum((w * blend(w, source, temperature) for w, source in flows), start=ca.SX(0))
+        enthalpy = sum((convection(w, source, temperature) for w, source in flows), start=ca.SX(0))
         heat = p["wall_conductance"] * (around.temperature - temperature)
         rate = (k * around.gas_constant * enthalpy - k * pressure * around.volume_rate + (k - 1) * heat) / around.volume
         mass = pressure * around.volume / (around.gas_constant * temperature)
@@ -143,12 +143,15 @@ class Thermal:
         }
 
 
-def blend(flow: ca.SX, inward: ca.SX, outward: ca.SX) -> ca.SX:
-    """Property of the air in a mass flow [kg/s]: `inward` into the chamber, `outward` out of it, smooth in between.
+def convection(flow: ca.SX, inward: ca.SX, outward: ca.SX) -> ca.SX:
+    """Rate at which a mass flow [kg/s] carries a property: `inward` per mass into the chamber, `outward` out of it.
+
+    It has a kink at zero flow, and no step, so that nothing is rounded: a width in kg/s that is nothing for a large
+    drive is the flow of slow motion for a small one.
 
     Examples
     --------
-    >>> round(float(blend(1e-2, 1.4, 1.0)), 6), round(float(blend(0.0, 1.4, 1.0)), 6)
-    (1.4, 1.2)
+    >>> [round(float(convection(w, 1.4, 1.0)), 6) for w in (1e-2, -1e-2)]
+    [0.014, -0.01]
     """
-    return outward + (inward - outward) * (1 + flow / ca.sqrt(flow**2 + FLOW_REVERSAL_WIDTH**2)) / 2
+    return outward * flow + (inward - outward) * ca.fmax(flow, 0)

@@ -52,13 +52,22 @@ class Cylinder:
     def stop_force(self, y: ca.SX, v: ca.SX, p: Symbols) -> ca.SX:
         r"""Force of the covers on the piston [N] at position y [m] and speed v [m/s].
 
-        .. math:: -K \sigma(y - L)(1 + c v) + K \sigma(-y)(1 - c v), \qquad
-            \sigma(d) = \tfrac12 \left( d + \sqrt{d^2 + \delta^2} \right)
+        .. math:: -K \sigma(y - L)(1 + c v) + K \sigma(-y)(1 - c v)
+
+        A cover's compression sigma(d) is exactly 0 up to delta before it and exactly d from delta beyond it, with two
+        continuous derivatives in between. A rounding with a tail, such as a hyperbola, would push inside the stroke,
+        and by its damping act as viscous friction there: 0.01 N*s/m in a cylinder of 1 m, 3 % of a light drive's.
         """
         if not self.stops:
             return ca.SX(0)
-        front, rear = ((d + ca.sqrt(d**2 + STOP_ROUNDING**2)) / 2 for d in (y - p["stroke"], -y))
+        front, rear = (_compression(d) for d in (y - p["stroke"], -y))
         return p["stop_stiffness"] * (rear * (1 - p["stop_damping"] * v) - front * (1 + p["stop_damping"] * v))
+
+
+def _compression(d: ca.SX) -> ca.SX:
+    """Compression [m] of a cover that the piston is d [m] beyond."""
+    w = ca.fmax(-1, ca.fmin(1, d / STOP_ROUNDING))
+    return ca.fmax(d - STOP_ROUNDING, 0) + STOP_ROUNDING / 16 * (w + 1) ** 3 * (3 - w)
 
 
 def areas(bore: ca.SX, rod: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -9,7 +9,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.models.friction import Viscous
-from pneuopt.models.pneumatic.chamber import Polytropic, Thermal, blend
+from pneuopt.models.pneumatic.chamber import Polytropic, Thermal, convection
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import GAS_CONSTANT
@@ -40,7 +40,7 @@ def books(drive: PneumaticDrive) -> System:
         fed = {"fed_a": sum(crossing["a"]) + leak, "fed_b": sum(crossing["b"]) - leak}
         c_p, inside = 3.5 * p["gas.constant"], dict(zip("ab", (q.temperature for q in ports), strict=True))
         power = sum(
-            (c_p * rate * blend(rate, outside, inside[s]) for s, rates_ in crossing.items() for rate in rates_),
+            (c_p * convection(rate, outside, inside[s]) for s, rates_ in crossing.items() for rate in rates_),
             start=ca.SX(0),
         )
         if thermal:

@@ -12,9 +12,18 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names, parameter_vector
-from pneuopt.models.friction import Coulomb, FrictionModel, Karnopp, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.friction import (
+    Coulomb,
+    FrictionModel,
+    Karnopp,
+    LoadDependent,
+    LuGre,
+    PressureDependent,
+    Stribeck,
+    Viscous,
+)
 from pneuopt.models.load import GRAVITY, Load
-from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
+from pneuopt.models.pneumatic.chamber import ChamberModel, Polytropic, Thermal
 from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle
@@ -139,7 +148,21 @@ def test_stops_push_back_beyond_the_stroke_only() -> None:
     assert stop(-0.001, 0.0) == pytest.approx(1000.0, rel=0.01)
     assert stop(0.201, 0.5) == pytest.approx(-1500.0, rel=0.01)  # on its way in it pushes harder
     assert stop(-0.001, 0.5) == pytest.approx(500.0, rel=0.01)
-    assert stop(0.19, 0.0) == pytest.approx(-0.25, rel=0.06)  # less what is left of the other
+    for y in (2e-4, 0.01, 0.1, 0.19, 0.1998):  # a push that depends on the speed here would count as viscous friction
+        for v in (0.0, 0.5, -0.5):
+            assert stop(y, v) == 0.0
+
+
+@given(st.floats(-3e-4, 3e-4), st.floats(1e-6, 1e-4))
+def test_a_cover_pushes_the_more_the_deeper_the_piston_is_and_without_a_kink(y: float, step: float) -> None:
+    at = ca.SX.sym("y")
+    p = {"stroke": ca.SX(0.2), "stop_stiffness": ca.SX(1e6), "stop_damping": ca.SX(0.0)}
+    force = Cylinder().stop_force(at, ca.SX(0.0), p)
+    push = ca.Function("push", [at], [force, ca.gradient(force, at)])
+    (near, slope), (deep, steeper) = ([float(v) for v in push(d)] for d in (y, y - step))
+    assert deep >= near >= 0.0
+    assert 0.0 <= -slope <= -steeper + 1e-6 <= 1e6 + 1.0
+    assert abs(deep - near + slope * step) <= 0.75e10 * step**2 / 2 + 1e-9  # within the greatest curvature of its onset
 
 
 def test_it_runs_into_the_stop_and_stays() -> None:
@@ -213,8 +236,8 @@ def test_steady_motion_leaves_only_the_position_to_change(name: str, speed: floa
 
 @pytest.mark.parametrize("friction", [Stribeck(), LuGre(), Karnopp(Stribeck())])
 def test_a_loop_in_motion_stays_in_motion(friction: FrictionModel) -> None:
-    """50 ms at 0.2 m/s, the command in the controller's hands; without end stops, which reach everywhere a little."""
-    drive = PneumaticDrive(friction=friction, cylinder=Cylinder(stops=False))
+    """50 ms at 0.2 m/s, the command in the controller's hands."""
+    drive = PneumaticDrive(friction=friction)
     loop = ClosedLoop(drive.system(), PID(sample_time=1e-3))
     p = loop.parameters.with_values(
         {"pid.Kp": 10.0, "pid.Ki": 40.0, "pid.Kd": 0.1, "pid.lower": -5.0, "pid.upper": 5.0}
@@ -243,6 +266,28 @@ def test_motion_takes_the_force_that_friction_and_load_take() -> None:
     a, b = AREAS
     push = a * rest.states["pressure_a"] - b * rest.states["pressure_b"] - (a - b) * 101325.0
     assert push == pytest.approx(90.0 * 0.4 + 25.0, abs=1e-6)
+
+
+BY_AREA = {"conductance", "mass", "force", "coulomb", "static", "viscous", "bristle_stiffness", "bristle_damping"}
+BY_AREA |= {"dead_volume_a", "dead_volume_b", "wall_conductance"}
+
+
+@pytest.mark.parametrize("chamber", [Polytropic(), Polytropic(mixed=True), Thermal()], ids=["one", "mixed", "thermal"])
+@given(v=st.floats(-0.5, 0.5), a=st.floats(1.1e5, 6.9e5), b=st.floats(1.1e5, 6.9e5), opening=st.floats(-1.0, 1.0))
+@settings(max_examples=30, deadline=None)
+def test_drives_of_every_size_move_alike(chamber: ChamberModel, v: float, a: float, b: float, opening: float) -> None:
+    """Areas, flows, masses and forces a hundred times as large: no newton and no kg/s is built in."""
+    drive = PneumaticDrive(friction=LoadDependent(LuGre()), chamber=chamber)
+    sizes = {"cylinder__bore": 0.01, "cylinder__rod": 0.004, "friction__bristle_damping": 20.0}
+    small = with_values(drive, load__force=20.0, valve__leak=0.003, friction__coulomb_load=0.1, **sizes)
+    scale = 100.0
+    large = small.with_values({n: scale * p.value for n, p in small.items() if n.partition(".")[2] in BY_AREA})
+    large = large.with_values({f"cylinder.{n}": small.value(f"cylinder.{n}") * scale**0.5 for n in ("bore", "rod")})
+    state = {"position": 0.08, "speed": v, "pressure_a": a, "pressure_b": b, "valve.spool": opening}
+    state |= {"temperature_a": 290.0, "temperature_b": 300.0, "friction.bristle": 2e-4}
+    x = np.array([state.get(n, 0.0) for n in names(drive.states)])
+    unit = np.array([q.nominal for q in drive.states])
+    assert rates(drive, x, 1.0, large) / unit == pytest.approx(rates(drive, x, 1.0, small) / unit, rel=1e-9, abs=1e-9)
 
 
 @st.composite
