@@ -343,25 +343,20 @@ def report_estimates(estimates: "pd.DataFrame") -> Report:
             interval = f"{_format_to_stderr(low, spread)}{TIED}to {_format_to_stderr(high, spread)}"
         value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
         rows.append((str(name), value, interval, str(row["unit"]), _doubt(row)))
-    doubts = text_columns("doubt") if any(row[-1] for row in rows) else ()
-    columns = (
-        *text_columns("parameter"),
-        *number_columns("value", f"95{TIED}% interval"),
-        *text_columns("unit"),
-        *doubts,
-    )
+    words = ["unit", *["doubt"] * any(row[-1] for row in rows)]
+    columns = *text_columns("parameter"), *number_columns("value", f"95{TIED}% interval"), *text_columns(*words)
     table = (Table(columns, tuple(row[: len(columns)] for row in rows)),) if rows else ()
     return Report(table)
 
 
 def _doubt(row: Mapping[Any, Any]) -> str:
     """What a reader should know of an estimate beyond its interval; nothing of most."""
-    if row["note"] == AT_BOUND_NOTE or row["mark"] == Mark.UNIDENTIFIABLE:
+    if row["mark"] == Mark.UNIDENTIFIABLE or row["note"] == AT_BOUND_NOTE:
         return str(row["note"] or row["mark"])
+    if row["mark"] != Mark.BIAS_POSSIBLE:
+        return ""
     share = row["bias"] / abs(row["value"]) if row["value"] else math.inf
-    is_known = row["mark"] == Mark.BIAS_POSSIBLE and math.isfinite(share)
-    bound = f"bias <={TIED}{format_number(100 * share, 2)}{TIED}%"
-    return bound if is_known else str(row["mark"]) if row["mark"] == Mark.BIAS_POSSIBLE else ""
+    return f"bias <={TIED}{format_number(100 * share, 2)}{TIED}%" if share < 1 else str(row["mark"])
 
 
 def report_agreement(fit: "pd.DataFrame", most_rows: int = 12) -> Report:

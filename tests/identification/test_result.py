@@ -27,16 +27,18 @@ def test_open_ends_and_what_is_unidentifiable_are_no_numbers() -> None:
         "c.missed": (7.0, none, none, none, 1.4, "bias possible", ""),
         "d.pressed": (7.0, none, none, none, none, "bias possible", "at its bound"),
         "e.early": (7.0, none, none, none, none, "bias possible", ""),
+        "f.far": (7.0, none, none, none, 8.0, "bias possible", ""),
     }
     columns = ["value", "stderr", "ci_low", "ci_high", "bias", "mark", "note"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=columns).assign(unit="N")
-    shown = [line.split() for line in report_estimates(table).to_text(80).splitlines()[-5:]]
+    shown = [line.split() for line in report_estimates(table).to_text(80).splitlines()[-6:]]
     assert shown == [
         ["a.open", "2", "above", "1.5", "N"],
         ["b.blind", "-", "not", "determined", "N", "unidentifiable"],
         ["c.missed", "7", "not", "determined", "N", "bias", "<=", "20", "%"],
         ["d.pressed", "7", "not", "determined", "N", "at", "its", "bound"],
         ["e.early", "7", "not", "determined", "N", "bias", "possible"],
+        ["f.far", "7", "not", "determined", "N", "bias", "possible"],
     ]
 
 
