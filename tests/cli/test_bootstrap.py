@@ -10,7 +10,7 @@ import pytest
 
 import pneuopt.cli.identify as identify_module
 from pneuopt.identification.identify import identify
-from pneuopt.identification.result import IdentificationResult, Mark
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.studies.bootstrap import Bootstrap
 from tests.cli.test_check import folder, run, write
 from tests.logs.bad_logs import swing
@@ -23,9 +23,9 @@ FOUND = Bootstrap(
 )
 
 
-@pytest.mark.parametrize(("mark", "friction"), [(Mark.EXACT, "Coulomb"), (Mark.BIAS_POSSIBLE, "Karnopp")])
+@pytest.mark.parametrize(("bias", "friction"), [(0.0, "Coulomb"), (1.0, "Karnopp")])
 def test_the_table_follows_the_fit_and_a_rig_that_sticks_stands_in_where_the_fit_misses_the_logs(
-    mark: Mark, friction: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+    bias: float, friction: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: dict[str, Any] = {}
 
@@ -35,7 +35,7 @@ def test_the_table_follows_the_fit_and_a_rig_that_sticks_stands_in_where_the_fit
 
     def fit(*arguments: Any, **options: Any) -> IdentificationResult:
         result = identify(*arguments, **options)
-        return replace(result, estimates=result.estimates.assign(mark=str(mark)))
+        return replace(result, estimates=result.estimates.assign(bias=bias))
 
     monkeypatch.setattr(identify_module, "bootstrap", keep)
     monkeypatch.setattr(identify_module, "identify", fit)
@@ -44,7 +44,7 @@ def test_the_table_follows_the_fit_and_a_rig_that_sticks_stands_in_where_the_fit
     assert result.exit_code == 0
     assert given["count"] == 3
     assert type(given["rig"].friction).__name__ == friction
-    assert ("truly sticks" in result.stdout) == (mark == Mark.BIAS_POSSIBLE)
+    assert ("truly sticks" in result.stdout) == (bias > 0)
     assert "doubt friction.coulomb" in result.stdout
     assert "5 % too high, and 0 of 3 intervals hold its value" in " ".join(result.stdout.split())
     assert json.loads((folder / "fit.json").read_text("utf-8"))["bootstrap"][0]["bias"] == 1.5

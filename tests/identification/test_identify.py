@@ -506,7 +506,7 @@ def step_fit() -> IdentificationResult:
 
 
 @pytest.mark.parametrize("columns", ["60", "80"])
-def test_a_fit_is_printed_verdict_first_with_intervals_and_marks(
+def test_a_fit_is_printed_verdict_first_with_intervals_and_no_doubt(
     step_fit: IdentificationResult, columns: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", columns)
@@ -516,7 +516,7 @@ def test_a_fit_is_printed_verdict_first_with_intervals_and_marks(
     assert max(map(len, text.splitlines())) <= int(columns)
     (line,) = [line for line in text.splitlines() if line.startswith("plant.gain")]
     assert re.search(r" [\d.]+ to ", line)
-    assert line.endswith(str(step_fit.estimates["mark"]["plant.gain"]))
+    assert line.endswith(step_fit.estimates["unit"]["plant.gain"])
     page = step_fit._repr_html_()
     assert page.count("<table>") == 2
     assert "plant.time_constant" in page

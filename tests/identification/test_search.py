@@ -33,6 +33,7 @@ from pneuopt.identification import search as windows
 from pneuopt.identification.forecast import predict, validate
 from pneuopt.identification.identify import identify
 from pneuopt.identification.losses import Huber
+from pneuopt.identification.misfit import t_quantile
 from pneuopt.identification.problem import EstimationProblem, check_logs
 from pneuopt.identification.profiles import Profile
 from pneuopt.identification.profiles import profile as profile_of_windows
@@ -680,7 +681,7 @@ def test_friction_that_no_drive_has_is_named_and_marked() -> None:
     problem = EstimationProblem(SYSTEM, tuple(check_logs(SYSTEM, [log], given)), given, po.LeastSquares())
     marks = {}
     for static in (10.0, 27.0, 40.0):
-        estimates = pd.DataFrame({"value": {COULOMB: 30.0, STATIC: static}, "mark": po.Mark.EXACT})
+        estimates = pd.DataFrame({"value": {COULOMB: 30.0, STATIC: static}, "mark": po.Mark.EXACT, "bias": 0.0})
         covariance = pd.DataFrame(np.eye(2), estimates.index, estimates.index)
         values, status = (
             given.with_values({COULOMB: 30.0, STATIC: static}),
@@ -689,6 +690,7 @@ def test_friction_that_no_drive_has_is_named_and_marked() -> None:
         fit = IdentificationResult(values, estimates, covariance, pd.DataFrame(), {}, status, {}, {})
         found = mark_order(problem, fit)
         marks[static] = set(found.estimates["mark"])
+        assert set(found.estimates["bias"]) == {20.0 if static == 10.0 else 0.0}
         assert ("which no drive has" in str(found.status)) == (static == 10.0)
     assert marks == {10.0: {po.Mark.BIAS_POSSIBLE}, 27.0: {po.Mark.EXACT}, 40.0: {po.Mark.EXACT}}
 
@@ -845,7 +847,7 @@ def test_a_profile_of_windows_is_that_of_the_fit() -> None:
     found = profile_of_windows(DRIVE.system(), pushed(), result, "load.mass")
     row = result.estimates.to_dict(orient="index")["load.mass"]
     assert found.low < row["value"] < found.high
-    assert found.high - found.low == pytest.approx(row["ci_high"] - row["ci_low"], rel=0.3)
+    assert found.high - found.low == pytest.approx(2 * t_quantile(row["dof"]) * row["stderr"], rel=0.3)
 
 
 def test_both_errors_are_in_the_file(tmp_path: Path) -> None:
