@@ -49,9 +49,15 @@ class Prediction:
         return self.is_far and not _is_useful(self.over_horizon or self.shares)
 
     def assess(self, status: Status) -> Status:
-        """The status of a fit, which begins with the prediction where that is useless."""
+        """The status of a fit, which begins with what it predicts."""
         if not self.is_far:
-            return status
+            if status.code is not Code.CONVERGED or not self.shares:
+                return status
+            is_seen = _is_useful(self.shares)  # else what moves is noise
+            told = (
+                f"a free run misses {_worst(self.shares)}" if is_seen else "a free run follows the logs to their noise"
+            )
+            return Status(status.code, (told, *status.sentences))
         over = f"over {self.horizon:.2g} s, from a fitted state, it misses {_worst(self.over_horizon or self.shares)}"
         if not self.is_useless:
             return status.with_details(f"the free run drifts away, it misses {_worst(self.shares)}; {over}")
@@ -128,4 +134,6 @@ def _worst(shares: Shares) -> str:
 
 
 def _size(share: float) -> str:
-    return f"{share:.0%} of the" if share < 10 else f"{share:.2g} times the" if share < 1e4 else "far more than the"
+    if share >= 10:
+        return f"{share:.2g} times the" if share < 1e4 else "far more than the"
+    return f"{share:.0%} of the" if share >= 0.1 else f"{100 * share:.2g}% of the"

@@ -72,6 +72,7 @@ def test_a_right_fit_predicts_its_log_and_stays_converged() -> None:
     result = fit(log_of())
     assert result.status.code is Code.CONVERGED
     assert result.stats["free_run_share"] < 0.01
+    assert re.fullmatch(r"a free run misses speed by 0\.\d+% of the motion", result.status.verdict)
     assert not explanation(result)
     assert set(result.estimates["mark"]) <= {Mark.EXACT, Mark.WIDENED}
 
@@ -201,4 +202,7 @@ def test_noise_alone_is_no_misfit() -> None:
     problem = EstimationProblem(drive.system(), (log,), drive.parameters.freed("load.mass"), LeastSquares())
     still = Trajectory(TIME, dict.fromkeys(("position", "speed"), 0 * TIME))
     found = solve_least_squares(problem.transcription(problem.candidates[0]), problem.method)
-    assert not predict_logs(problem, found, [still]).is_far
+    predicted = predict_logs(problem, found, [still])
+    assert not predicted.is_far
+    said = predicted.assess(Status(Code.CONVERGED, ("found",))).sentences
+    assert said == ("a free run follows the logs to their noise", "found")
