@@ -63,7 +63,11 @@ def fit_page(
     system = None if model is None else as_runnable(model)
     marks = result.estimates["mark"]
     biased = [str(n) for n, mark in marks.items() if mark == Mark.BIAS_POSSIBLE]
-    doubts = [f"a model error may bias {join_names(biased)}: the intervals do not hold it"] if biased else []
+    doubts = (
+        [f"an error of the model may have moved {join_names(biased)}: the intervals are as wide as that"]
+        if biased
+        else []
+    )
     unknown = result.verdict.sentences if result.verdict else ()
     runs = list(result.trajectories.values())
     compared = (_comparison(runs, experiments, "fitted"),) if experiments and runs else ()

@@ -298,7 +298,7 @@ def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: boo
     """Sentences on residuals beyond `level` (mean squares, in noise variances), or on gaps as noise of the states."""
     segments = equations.segments
     lead = "the model does not explain the log to its noise: "
-    tail = "the intervals count that as noise: they do not hold the bias of a wrong model"
+    tail = "the intervals count that"
     if noisy_gaps:
         sizes = np.sqrt(np.mean(equations.gaps[segments.linked] ** 2, axis=0))
         state = segments.system.states[int(np.argmax(sizes))]
