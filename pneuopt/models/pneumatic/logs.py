@@ -204,6 +204,11 @@ class PneumaticLog:
         }
         self._known_signals = self.measured.select(["valve_voltage"]).with_columns(self.known_states)
 
+    @functools.cached_property
+    def _pressure_rates(self) -> Array:
+        """Rates of the logged pressures [Pa/s], shape (n, m), which every shape of the valve has to explain."""
+        return np.column_stack([filter_channel(self.measured, n, 1, self._window) for n in self.logged_pressures])
+
     def force_balance(self, valve: ValveValues) -> RegressionRows:
         """Rows for the regression of friction, with this valve."""
         return self.force_balances([valve])[0]
@@ -237,8 +242,7 @@ class PneumaticLog:
         which = [PRESSURE_NAMES.index(n) for n in self.logged_pressures]
         closed, edges, leaking = simulator.pressure_rates(signals, self._with_valves(probes))[:, :, which]
         columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
-        rates = [filter_channel(self.measured, n, 1, self._window) for n in self.logged_pressures]
-        return columns, np.column_stack(rates) - closed
+        return columns, self._pressure_rates - closed
 
     def min_conductance(self) -> float:
         """Conductance of a choked edge that feeds the fastest motion at half the supply pressure [m^3/(s*Pa)]."""
