@@ -361,7 +361,8 @@ class LinePressureCheck:
         active = {name: most_active_part(log) for name, log in logs.items() if is_informative(log)}
         sentences = []
         for name, log in active.items():
-            measured = min((self._balance(log, shape) for shape in trial_shapes(log)), key=lambda each: each.residual)
+            run = self.prepare({"": log})[""]
+            measured = min((_balance(run, shape) for shape in trial_shapes(log)), key=lambda each: each.residual)
             if measured.residual < MAX_UNQUESTIONED_SHARE * measured.total:
                 continue
             lead, best, worse = 0.0, measured, 0
@@ -390,22 +391,24 @@ class LinePressureCheck:
             behind = {n: log.measured[n] - lead * flow for n, flow in zip(uncorrected.channels, flows, strict=True)}
             if min(float(np.nanmin(p)) for p in behind.values()) <= 0:
                 return uncorrected
-            balance = self._balance(log._replace(measured=log.measured.with_columns(behind)), uncorrected.shape)
+            moved = log._replace(measured=log.measured.with_columns(behind))
+            balance = _balance(self.prepare({"": moved})[""], uncorrected.shape)
             flows = [(old + new) / 2 for old, new in zip(flows, balance.flows, strict=True)]
         return balance
 
-    def _balance(self, log: Log, shape: Mapping[str, float]) -> "Balance":
-        run = self.prepare({"": log})[""]
-        columns, rates = run.valve_columns(shape)
-        geometry: Any = without_prefix({n: p.value for n, p in log.parameters.items()}, "cylinder")
-        position: Any = run.known_states["position"]
-        size: dict[str, Any] = dict(zip(PRESSURE_NAMES, volumes(position, geometry), strict=True))
-        residual, flows = 0.0, []
-        for k, channel in enumerate(run.logged_pressures):
-            model = columns[:, k] @ np.linalg.lstsq(columns[:, k], rates[:, k])[0]
-            residual += float(np.sum((rates[:, k] - model) ** 2))
-            flows.append(np.asarray(model * size[channel] / float(np.mean(size[channel]))))
-        return Balance(shape, run.logged_pressures, residual, float(np.sum(rates**2)), flows)
+
+def _balance(run: PneumaticLog, shape: Mapping[str, float]) -> "Balance":
+    """The balance of a log with a valve of this shape."""
+    columns, rates = run.valve_columns(shape)
+    geometry: Any = without_prefix({n: p.value for n, p in run.parameters.items()}, "cylinder")
+    position: Any = run.known_states["position"]
+    size: dict[str, Any] = dict(zip(PRESSURE_NAMES, volumes(position, geometry), strict=True))
+    residual, flows = 0.0, []
+    for k, channel in enumerate(run.logged_pressures):
+        model = columns[:, k] @ np.linalg.lstsq(columns[:, k], rates[:, k])[0]
+        residual += float(np.sum((rates[:, k] - model) ** 2))
+        flows.append(np.asarray(model * size[channel] / float(np.mean(size[channel]))))
+    return Balance(shape, run.logged_pressures, residual, float(np.sum(rates**2)), flows)
 
 
 class Balance(NamedTuple):
