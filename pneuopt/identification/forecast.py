@@ -93,8 +93,7 @@ def validate(
     """Predict logs with known parameters: the start state is fitted, then an independent simulation runs freely.
 
     With parameters alone the start is fitted to the whole log, so that what is left is the model's error. With a fit
-    the run is a forecast: its start is fitted to the first tenth (10 s at most), and a 95 % band says what to expect of
-    the rest.
+    the run is a forecast: its start is fitted to the first tenth (10 s at most), and a 95 % band is given of the rest.
 
     Parameters
     ----------
@@ -321,10 +320,7 @@ def _constant(log: Experiment, states: Mapping[str, float]) -> Trajectory:
 
 
 def _head(system: Fittable, part: Experiment, share: float, longest: float) -> int:
-    """The first samples of a part, to which its start is fitted: a share of its time, with enough of some output.
-
-    What comes after the `longest` time [s] hardly tells of the start any more.
-    """
+    """The first samples of a part, to which its start is fitted: a share of its time, or the `longest` [s]."""
     t = part.trajectory.t
     measured = np.isfinite(part.trajectory.matrix(outputs_in_log(system, part))).any(axis=1)
     enough = int(np.searchsorted(np.cumsum(measured), MIN_WINDOW_SAMPLES)) + 1
