@@ -1,12 +1,12 @@
 """`predict`, `validate`: the free run of a log; with a fit a forecast from the log's first tenth, with a 95 % band.
 
-The start state is fitted to that tenth; from there on the inputs alone drive the run, and so nothing in run or band
-rests on what is forecast. The band's variance is a sum: of the parameters, by runs at one deviation to both
-sides along each principal direction of their covariance (central differences, which stay finite where a linearised
-stick-slip does not), and of what the start state, the noise and the model's error add. These are learned (Ljung, Model
-validation and model error modeling, 1999) as split conformal prediction calibrates (Lei et al., J. Am. Stat. Assoc.
-113, 2018): the fit forecasts parts of its own logs by the same rule, from starts that are fitted alike, and the mean
-square of the errors by time since the start is what it must expect of itself elsewhere.
+The start state is fitted to that tenth (of a long log to 1000 segments, 10 s); from there on the inputs alone drive the
+run, and so nothing in run or band rests on what is forecast. The band's variance is a sum: of the parameters, by runs
+at one deviation to both sides along each principal direction of their covariance (central differences, which stay
+finite where a linearised stick-slip does not), and of what the start state, the noise and the model's error add. These
+are learned (Ljung, Model validation and model error modeling, 1999) as split conformal prediction calibrates (Lei et
+al., J. Am. Stat. Assoc. 113, 2018): the fit forecasts parts of its own logs by the same rule, from starts that are
+fitted alike, and the mean square of the errors by time since the start is what it must expect of itself elsewhere.
 `problems/identify/forecast_band.py` measures the share inside.
 """
 
@@ -40,6 +40,7 @@ from pneuopt.identification.search import check_window
 from pneuopt.identification.statistics import agreement, cross_correlation, ljung_box
 from pneuopt.identification.tolerances import (
     ENDLESS,
+    EXCERPT_SEGMENTS,
     FORECAST_LANES,
     FORECAST_LEVELS,
     FORECAST_STARTS,
@@ -92,7 +93,7 @@ def validate(
     """Predict logs with known parameters: the start state is fitted, then an independent simulation runs freely.
 
     With parameters alone the start is fitted to the whole log, so that what is left is the model's error. With a fit
-    the run is a forecast: its start is fitted to the first tenth, and a 95 % band says what to expect of the rest.
+    the run is a forecast: its start is fitted to the first tenth (10 s at most), and a 95 % band is given of the rest.
 
     Parameters
     ----------
@@ -287,7 +288,8 @@ def _forecast(
     system: Fittable, parts: Sequence[Experiment], known: ParameterSet, method: LeastSquares, share: float
 ) -> _Forecast:
     """Fit the start states of all parts at once, each to the first share of its part, and run freely from there."""
-    heads = np.array([_head(system, part, share) for part in parts])
+    longest = math.inf if share == 1 else EXCERPT_SEGMENTS * method.segment_time
+    heads = np.array([_head(system, part, share, longest) for part in parts])
     short = [replace(e, trajectory=e.trajectory.rows(0, n)) for e, n in zip(parts, heads, strict=True)]
     problem = EstimationProblem(system, tuple(short), known, method)
     starts, substeps = [np.zeros(0)] * len(parts), 1
@@ -317,12 +319,12 @@ def _constant(log: Experiment, states: Mapping[str, float]) -> Trajectory:
     return Trajectory(log.trajectory.t, {n: np.full(len(log.trajectory), v) for n, v in states.items()})
 
 
-def _head(system: Fittable, part: Experiment, share: float) -> int:
-    """The first samples of a part, to which its start is fitted: a share of its time, with enough of some output."""
+def _head(system: Fittable, part: Experiment, share: float, longest: float) -> int:
+    """The first samples of a part, to which its start is fitted: a share of its time, or the `longest` [s]."""
     t = part.trajectory.t
     measured = np.isfinite(part.trajectory.matrix(outputs_in_log(system, part))).any(axis=1)
     enough = int(np.searchsorted(np.cumsum(measured), MIN_WINDOW_SAMPLES)) + 1
-    return min(max(int(np.searchsorted(t, t[0] + share * (t[-1] - t[0]), "right")), enough), len(t))
+    return min(max(int(np.searchsorted(t, t[0] + min(share * (t[-1] - t[0]), longest), "right")), enough), len(t))
 
 
 def _cut(experiment: Experiment, runs: Iterable[tuple[int, int]]) -> list[Experiment]:

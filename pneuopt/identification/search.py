@@ -27,7 +27,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import islice, product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -122,6 +122,11 @@ class Search:
     def guesses(self) -> list[Start]:
         """The model's starts that try values of what the logs do not determine."""
         return [c for c in self.problem.candidates if c.trial_parameters]
+
+    @property
+    def has_guesses(self) -> bool:
+        """Whether there is more than one guess, for which two starts at most are made."""
+        return len(list(islice((c for c in self.problem.candidates if c.trial_parameters), 2))) > 1
 
     @property
     def trail(self) -> "pd.DataFrame":
@@ -229,7 +234,7 @@ def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: b
 def _from_first_start(search: Search) -> Iterator[Candidate]:
     """The model's first start, left after its first stage where that is far from the logs and others are to come."""
     problem, start = search.problem, search.problem.candidates[0]
-    may_wait = search.loss is None and problem.has_gaps and len(search.guesses) > 1
+    may_wait = search.loss is None and problem.has_gaps and search.has_guesses
     allows = problem.method.allows_state_noise and not may_wait  # with other starts to come, these are tried before
     tried = replace(problem, method=replace(problem.method, allows_state_noise=allows))
     held, fit = fit_fixing_unidentifiable(tried, start, HOPELESS_MISFIT if may_wait else math.inf)
@@ -239,7 +244,7 @@ def _from_first_start(search: Search) -> Iterator[Candidate]:
 def _from_other_starts(search: Search) -> Iterator[Candidate]:
     """The other starts, with guesses held for a few stages; the least cost first."""
     problem, candidates = search.problem, search.problem.candidates
-    guessed = search.guesses if len(search.guesses) > 1 else []
+    guessed = search.guesses if search.has_guesses else []
     settled = sorted((_settle_start(problem, c) for c in guessed), key=lambda each: each[0])
     for start in [*(start for _, start in settled), *(c for c in candidates[1:] if c not in guessed)]:
         known = search.best.fit.stage_costs if is_optimum(search.best.fit) else ()
@@ -509,7 +514,7 @@ def _can_predict(search: Search) -> bool:
     problem = search.problem
     is_whole = problem.has_gaps and not np.isfinite(problem.window) and not any(e.holes for e in problem.experiments)
     is_plain = is_whole and bool(problem.system.states) and not problem.weights and search.loss is None
-    return is_plain and bool(_order_of_unknowns(problem)) and len(search.guesses) > 1
+    return is_plain and bool(_order_of_unknowns(problem)) and search.has_guesses
 
 
 def _from_predictions(search: Search) -> Iterator[Candidate]:

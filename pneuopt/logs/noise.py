@@ -68,7 +68,9 @@ def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstima
     # a lattice leaves medians on its steps; a uniform dither of its step takes them off, and its variance is known
     dithered = y + resolution * (np.random.default_rng(0).random(y.size) - 0.5)
     # a slow sensor has no neighbours, or too few of them for high orders
-    levels = max(_levels(time, dithered), _levels(time[known], dithered[known]), key=len)
+    levels = _levels(time, dithered)
+    if not known.all():
+        levels = max(levels, _levels(time[known], dithered[known]), key=len)
     least = min(level.value for level in levels)
     chosen = next(level for level in levels if level.value <= (1 + level.uncertainty) * least)
     random = math.sqrt(max(chosen.value**2 - resolution**2 / 12, 0.0))
@@ -191,26 +193,35 @@ def _decimals(values: Array, smallest: float) -> float:
     return step if lies_on and smallest < LATTICE_TOLERANCE * step else 0.0
 
 
-def _fit_lattice(values: Array, step: float, written: float, most: int = 4000, largest: float = 300.0) -> float:
+def _fit_lattice(values: Array, step: float, written: float, most: int = 1000, largest: float = 300.0) -> float:
     """The step of the lattice about a given one on which all values lie, but for their decimals; 0 where they do not.
 
     Counts of neighbours are added up: they are small, so that a step known to a per cent numbers them. A motion at one
     speed makes steps, too: they are a sensor's only where they vary.
     """
     sizes = np.diff(values)
-    sizes = sizes[(sizes != 0) & (np.abs(sizes) < largest * step)][:most]
-    if not sizes.size:
+    used = np.flatnonzero((sizes != 0) & (np.abs(sizes) < largest * step))[:most]
+    if not used.size:
         return 0.0
+    sizes = sizes[used]
     # the step near the given one by which most differences are whole numbers, to an eighth of a count of the largest
     tried = step * np.linspace(0.95, 1.05, 1 + math.ceil(0.8 * float(np.max(np.abs(sizes))) / step))
     step = float(max(tried, key=lambda s: abs(np.exp(2j * np.pi / s * sizes).sum())))
+    part = values[: used[-1] + 2]
+    if part.size < values.size and _off_lattice(part, step)[1] > 4 * min(step / 4, written):
+        return 0.0  # as most steps that are tried
     moves = np.round(np.diff(values) / step)
     varies = np.count_nonzero(np.diff(moves)) > MIN_VARIED_SHARE * values.size
-    counts = np.concatenate([[0.0], np.cumsum(moves)])
+    step, farthest = _off_lattice(values, step)
+    return step if varies and step > 0 and farthest <= min(step / 4, written) else 0.0
+
+
+def _off_lattice(values: Array, step: float) -> tuple[float, float]:
+    """The step that fits the counts by a given one best, and how far the farthest value lies off its lattice."""
+    counts = np.concatenate([[0.0], np.cumsum(np.round(np.diff(values) / step))])
     off, spread = values - values.mean(), counts - counts.mean()
     step = float(off @ spread / (spread @ spread)) if spread.any() else 0.0
-    is_lattice = varies and step > 0 and float(np.max(np.abs(off - step * spread))) <= min(step / 4, written)
-    return step if is_lattice else 0.0
+    return step, float(np.max(np.abs(off - step * spread)))
 
 
 class _Level(NamedTuple):

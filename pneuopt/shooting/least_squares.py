@@ -737,7 +737,7 @@ def apply_finer_steps(state: SearchState, steps: int) -> SearchState:
 def correct_residuals_by(state: SearchState, steps: int) -> SearchState:
     """Add what finer steps change to the residuals of the iterate; derivatives are computed anew where that is much."""
     slopes, fine = state.iterate.equations.linearisation, state.run(steps)
-    correction = IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
+    correction = IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine, state.iterate.nodes)
     corrected = replace(state, correction=correction, output_substeps=steps, is_coarse=False)
     nodes, z, equations = state.iterate.nodes, state.iterate.z, state.iterate.equations
     if not state.moves_no_estimate(fine.y - state.outputs):
@@ -1166,7 +1166,7 @@ def unsettled_covariance(state: SearchState) -> Array:
 def _final_run(state: SearchState) -> RolloutResult:
     """The run of the last iterate by the finest steps, with states; those of an interrupted search are by its own."""
     correction = state.correction
-    if correction is not None and math.isfinite(state.integration_change):  # of these very nodes
+    if correction is not None and correction.nodes is state.iterate.nodes:
         return correction.fine_run
     if state.end is not SearchEnd.INTERRUPTED or not math.isfinite(state.iterate.cost):
         return state.run(state.output_substeps)

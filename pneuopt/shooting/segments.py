@@ -49,6 +49,7 @@ class IntegrationCorrection:
     y: Array  # (m, n, n_outputs)
     x_end: Array  # (m, n_states)
     fine_run: RolloutResult  # the run with the finer steps
+    nodes: Array | None = None  # (m, n_states): where it starts
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +201,7 @@ def segment(transcription: Transcription) -> Segments:
     for head, stop in zip(heads, [*heads[1:], len(index)], strict=True):  # states that no log shows keep their guess
         guess = transcription.phases[index[head]].guess
         outputs = {o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs}
-        idle = ~_observable_states(system, outputs) & np.isnan(start[head])
+        idle = ~_observable_states(system, frozenset(outputs)) & np.isnan(start[head])
         start[head, idle] = 0.0 if guess is None else guess[nodes[head], idle]
     return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
 
@@ -232,7 +233,8 @@ def _cut_phase(
     )
 
 
-def _observable_states(system: DiscreteSystem, outputs: set[str]) -> Mask:
+@functools.lru_cache(maxsize=64)
+def _observable_states(system: DiscreteSystem, outputs: frozenset[str]) -> Mask:
     """The states on which these outputs depend, directly or through other states' rates. Shape (n_states,)."""
     if system.update is not None or not system.states:
         return np.ones(len(system.states), dtype=bool)

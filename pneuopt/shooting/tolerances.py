@@ -55,10 +55,10 @@ STEP_CUT = 0.3  # of a step that has not helped [1]: higher tries it again too f
 # squares of a segment, over its samples, beyond which they count by their logarithm [1]: lower is blind to what wrong
 # parameters miss, higher lets one lost slip outweigh a log
 ROBUST_SQUARES = 4.0
-DAMPINGS = (1e-2, 10**-0.75, 10**0.5, 10**1.75, 1e3)  # over the last one, tried side by side: wider spreads overshoot
+DAMPINGS = (1e-2, 10**-0.5, 10.0, 10**2.5)  # over the last one, tried side by side: wider spreads overshoot
 FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-6  # over the diagonal [1]: lower takes wild first steps, higher small ones
 GIVEN_UP_DAMPING = 10.0  # where no damping helps beyond it, a descent has ended; higher takes time
-SETTLED_DECREASE = 1e-4  # of the cost [1] at which a descent has ended: lower takes time, higher ends too early
+SETTLED_DECREASE = 1e-3  # of the cost [1] at which a descent has ended: lower takes time, 1e-2 ends one too early
 MAX_BATCH_NUMBERS = 4_000_000  # numbers of 8 bytes in a batch: more take memory, fewer time
 
 # Full space

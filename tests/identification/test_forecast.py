@@ -89,6 +89,14 @@ def test_a_forecast_fits_its_start_once(monkeypatch: pytest.MonkeyPatch) -> None
     assert len(calls) == 1
 
 
+def test_the_start_of_a_long_log_is_fitted_to_a_part_of_bounded_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of a log of a million samples cost as much as its identification."""
+    log, fit = record(9), fitted(0, exact=True)
+    assert np.isnan(predict(DRIVE, log, fit)["position_low"]).sum() == pytest.approx(0.1 * len(log.trajectory), abs=1)
+    monkeypatch.setattr("pneuopt.identification.forecast.EXCERPT_SEGMENTS", 5)  # of 10 ms, at 2 ms a sample
+    assert np.isnan(predict(DRIVE, log, fit)["position_low"]).sum() == pytest.approx(25, abs=1)
+
+
 def test_parameters_alone_have_no_band() -> None:
     fit, log = fitted(0, exact=True), record(8)
     assert "position_low" not in predict(DRIVE, log, fit.parameters)

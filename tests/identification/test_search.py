@@ -6,7 +6,7 @@ Windows: logs that a model does not follow from end to end are fitted, and predi
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ from scipy.signal import lfilter
 
 import pneuopt as po
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.dynamics.hooks import Start
+from pneuopt.dynamics.hooks import Start, Starts
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import discretise, parameter_vector
 from pneuopt.files.drive import write_fit
@@ -435,6 +435,21 @@ def test_what_a_filter_cannot_follow_is_left_to_the_starts(case: str, monkeypatc
     elif case == "weights":
         problem = replace(problem, weights={"run": np.ones((1000, 1))})
     assert not search._can_predict(search.Search(problem, Huber() if case == "robust" else None))
+
+
+def test_two_starts_show_that_there_are_guesses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All seven, with states along a million samples each, took seconds and memory that nobody asked for."""
+    problem, made = posed_stick_slip(Stribeck()), list[int]()
+    starts = problem.candidates
+
+    def make(index: int) -> Start:
+        made.append(index)
+        return starts[index]
+
+    lazy = Starts([partial(make, i) for i in range(len(starts))])
+    monkeypatch.setattr(EstimationProblem, "candidates", property(lambda _: lazy))
+    assert search.Search(problem).has_guesses
+    assert len(made) == 2 < len(starts)
 
 
 def test_the_end_of_the_budget_ends_the_filter() -> None:

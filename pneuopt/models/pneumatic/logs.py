@@ -204,6 +204,11 @@ class PneumaticLog:
         }
         self._known_signals = self.measured.select(["valve_voltage"]).with_columns(self.known_states)
 
+    @functools.cached_property
+    def _pressure_rates(self) -> Array:
+        """Rates of the logged pressures [Pa/s], shape (n, m), which every shape of the valve has to explain."""
+        return np.column_stack([filter_channel(self.measured, n, 1, self._window) for n in self.logged_pressures])
+
     def force_balance(self, valve: ValveValues) -> RegressionRows:
         """Rows for the regression of friction, with this valve."""
         return self.force_balances([valve])[0]
@@ -237,8 +242,7 @@ class PneumaticLog:
         which = [PRESSURE_NAMES.index(n) for n in self.logged_pressures]
         closed, edges, leaking = simulator.pressure_rates(signals, self._with_valves(probes))[:, :, which]
         columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
-        rates = [filter_channel(self.measured, n, 1, self._window) for n in self.logged_pressures]
-        return columns, np.column_stack(rates) - closed
+        return columns, self._pressure_rates - closed
 
     def min_conductance(self) -> float:
         """Conductance of a choked edge that feeds the fastest motion at half the supply pressure [m^3/(s*Pa)]."""
@@ -357,7 +361,8 @@ class LinePressureCheck:
         active = {name: most_active_part(log) for name, log in logs.items() if is_informative(log)}
         sentences = []
         for name, log in active.items():
-            measured = min((self._balance(log, shape) for shape in trial_shapes(log)), key=lambda each: each.residual)
+            run = self.prepare({"": log})[""]
+            measured = min((_balance(run, shape) for shape in trial_shapes(log)), key=lambda each: each.residual)
             if measured.residual < MAX_UNQUESTIONED_SHARE * measured.total:
                 continue
             lead, best, worse = 0.0, measured, 0
@@ -386,22 +391,24 @@ class LinePressureCheck:
             behind = {n: log.measured[n] - lead * flow for n, flow in zip(uncorrected.channels, flows, strict=True)}
             if min(float(np.nanmin(p)) for p in behind.values()) <= 0:
                 return uncorrected
-            balance = self._balance(log._replace(measured=log.measured.with_columns(behind)), uncorrected.shape)
+            moved = log._replace(measured=log.measured.with_columns(behind))
+            balance = _balance(self.prepare({"": moved})[""], uncorrected.shape)
             flows = [(old + new) / 2 for old, new in zip(flows, balance.flows, strict=True)]
         return balance
 
-    def _balance(self, log: Log, shape: Mapping[str, float]) -> "Balance":
-        run = self.prepare({"": log})[""]
-        columns, rates = run.valve_columns(shape)
-        geometry: Any = without_prefix({n: p.value for n, p in log.parameters.items()}, "cylinder")
-        position: Any = run.known_states["position"]
-        size: dict[str, Any] = dict(zip(PRESSURE_NAMES, volumes(position, geometry), strict=True))
-        residual, flows = 0.0, []
-        for k, channel in enumerate(run.logged_pressures):
-            model = columns[:, k] @ np.linalg.lstsq(columns[:, k], rates[:, k])[0]
-            residual += float(np.sum((rates[:, k] - model) ** 2))
-            flows.append(np.asarray(model * size[channel] / float(np.mean(size[channel]))))
-        return Balance(shape, run.logged_pressures, residual, float(np.sum(rates**2)), flows)
+
+def _balance(run: PneumaticLog, shape: Mapping[str, float]) -> "Balance":
+    """The balance of a log with a valve of this shape."""
+    columns, rates = run.valve_columns(shape)
+    geometry: Any = without_prefix({n: p.value for n, p in run.parameters.items()}, "cylinder")
+    position: Any = run.known_states["position"]
+    size: dict[str, Any] = dict(zip(PRESSURE_NAMES, volumes(position, geometry), strict=True))
+    residual, flows = 0.0, []
+    for k, channel in enumerate(run.logged_pressures):
+        model = columns[:, k] @ np.linalg.lstsq(columns[:, k], rates[:, k])[0]
+        residual += float(np.sum((rates[:, k] - model) ** 2))
+        flows.append(np.asarray(model * size[channel] / float(np.mean(size[channel]))))
+    return Balance(shape, run.logged_pressures, residual, float(np.sum(rates**2)), flows)
 
 
 class Balance(NamedTuple):

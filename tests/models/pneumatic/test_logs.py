@@ -26,7 +26,8 @@ from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.chamber import Thermal
 from pneuopt.models.pneumatic.cylinder import volumes
 from pneuopt.models.pneumatic.logs import AirSimulator, Balance, LinePressureCheck
-from pneuopt.models.tolerances import LEADS
+from pneuopt.models.starts import filter_channel
+from pneuopt.models.tolerances import FILTER_TIMES, LEADS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import without_prefix
 from pneuopt.quantities.trajectories import Trajectory
@@ -93,6 +94,24 @@ def test_the_valve_starts_near_the_truth_from_fewer_channels(
     assert start.parameters["valve.conductance"] == pytest.approx(2e-8, rel=0.15)
     assert 0 < start.parameters["valve.leak"] < 0.1
     assert set(start.states["run"].names) >= {q.name for q in system.states}
+
+
+def test_the_pressures_rates_are_filtered_once_a_log(
+    truth: tuple[po.System, po.ParameterSet, po.Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once a trial of the valve's shape, they took a seventh of an easy identification."""
+    system, parameters, log = truth
+    asked = list[tuple[str, int]]()
+
+    def spy(measured: po.Trajectory, name: str, derivative: int, window: float = FILTER_TIMES[0]) -> Array:
+        asked.append((name, derivative))
+        return filter_channel(measured, name, derivative, window)
+
+    monkeypatch.setattr("pneuopt.models.pneumatic.logs.filter_channel", spy)
+    shape = {"valve.dead_zone": 0.0, "valve.critical_ratio": 0.3}
+    given = blind(parameters).with_values(shape).freed(*shape)
+    assert system.starts({"run": Log(log.select(ALL), given)})
+    assert 1 <= asked.count(("pressure_a", 1)) <= len(FILTER_TIMES)
 
 
 def test_dead_zone_and_critical_ratio_are_told_from_the_pressures() -> None:
