@@ -41,6 +41,7 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, Viscous
+from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, PhysicsWarning, UnknownNameError
 from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
@@ -609,3 +610,48 @@ def test_a_model_without_starts_begins_where_its_states_may_be() -> None:
     for name, value in truth.items():
         assert abs(fit.parameters.value(name) - value) < 4 * fit.estimates["stderr"][name]
         assert fit.estimates["stderr"][name] < 0.02 * value
+
+
+OFFSET = "plant.input_offset"
+
+
+def oscillator_log(zero: float, shown: float = 0.0, seed: int = 0) -> Experiment:
+    """Steps of a second-order plant, whose input counts from `zero` [V] and its output from `shown`."""
+    plant, t = SecondOrder().system(), np.arange(600) * 5e-3
+    u = np.array([0.0, 0.3, -0.2, 0.1])[np.arange(600) // 150]
+    truth = plant.parameters.with_values({"plant.gain": 8.0, "plant.natural_frequency": 20.0, "plant.damping": 0.4})
+    y = simulate(plant, Trajectory(t, {"valve_voltage": u}), truth)["speed"]
+    noisy = y + shown + 0.02 * np.random.default_rng(seed).standard_normal(600)
+    return Experiment(Trajectory(t, {"valve_voltage": u + zero, "speed": noisy}), name=f"run{seed}")
+
+
+def test_a_log_that_counts_from_elsewhere_has_its_offset_estimated() -> None:
+    """A centre that was 1 V off led to a gain half as large again, and nothing was said."""
+    plant = SecondOrder().system()
+    free = plant.parameters.freed("plant.gain", "plant.natural_frequency", "plant.damping")
+    for zero, shown, offset in ((1.0, 0.0, 1.0), (0.0, 4.0, -0.5), (2.4, 13.2, 2.4 - 13.2 / 8)):
+        with pytest.warns(PhysicsWarning, match=OFFSET):
+            fit = identify(plant, oscillator_log(zero, shown), free)
+        assert fit.parameters.value("plant.gain") == pytest.approx(8.0, rel=0.01)
+        assert fit.parameters.value(OFFSET) == pytest.approx(offset, abs=0.01)
+    assert fit.estimates["ci_low"][OFFSET] < offset < fit.estimates["ci_high"][OFFSET]
+
+
+def test_an_offset_that_no_log_shows_or_that_is_stated_stays() -> None:
+    plant = SecondOrder().system()
+    free = plant.parameters.freed("plant.gain", "plant.natural_frequency", "plant.damping")
+    fit = identify(plant, [oscillator_log(0.0, seed=k) for k in (1, 2)], free)
+    assert OFFSET not in fit.estimates.index
+    stated = identify(plant, oscillator_log(1.0), free.with_values({OFFSET: 0.9}), throw=False)
+    assert stated.parameters.value(OFFSET) == 0.9
+    known = oscillator_log(1.0).with_conditions({OFFSET: 1.0})
+    fit = identify(plant, [known, oscillator_log(0.0, seed=1)], free)
+    assert fit.parameters.value("plant.gain") == pytest.approx(8.0, rel=0.01)
+
+
+def test_each_log_has_an_offset_of_its_own_where_the_file_says_so() -> None:
+    plant = SecondOrder().system()
+    free = plant.parameters.freed("plant.gain", "plant.natural_frequency", "plant.damping", OFFSET).per_log(OFFSET)
+    fit = identify(plant, [oscillator_log(1.0), oscillator_log(-0.5, seed=1)], free)
+    assert fit.estimates["value"][f"{OFFSET}[run0]"] == pytest.approx(1.0, abs=0.01)
+    assert fit.estimates["value"][f"{OFFSET}[run1]"] == pytest.approx(-0.5, abs=0.01)
