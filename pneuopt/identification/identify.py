@@ -38,9 +38,10 @@ from pneuopt.identification.problem import (
     outputs_in_log,
 )
 from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult
-from pneuopt.identification.review import FixedValueTest, review_fit
+from pneuopt.identification.review import FixedValueTest, free_shown_offset, gains_beyond_chance, review_fit
 from pneuopt.identification.search import (
     Search,
+    Tried,
     check_window,
     enforce_ordering,
     find_fit,
@@ -212,13 +213,18 @@ def _fit_and_review(
     problem, unseen = hold_unseen(problem)
     for sentence in unseen:
         warnings.warn(sentence, PhysicsWarning, stacklevel=3)
-    doubts, trail = FixedValueTest(), None
+    doubts, trail, offset = FixedValueTest(), None, ""
     if start is None:
-        search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
-        _, held, fit, label, _ = find_fit(search)
-        trail = search.trail
-        if not (fit.status.converged or doubts.tests):  # a wrong value drives widths to where a search does not settle
-            doubts.explains(held, fit)
+        (_, held, fit, label, _), doubts, trail = _search(problem, loss, estimate_noise=estimate_noise)
+        if freed := free_shown_offset(held, fit):
+            freed = replace(problem, parameters=freed.parameters)
+            better, *others = _search(freed, loss, estimate_noise=estimate_noise)
+            if better.fit.status.converged and gains_beyond_chance(fit, 2 * better.fit.stats["cost"]):
+                problem, (_, held, fit, label, _), (doubts, trail) = freed, better, others
+                offset = (
+                    f"{problem.system.inputs[0].name} counts from another value than 0: {problem.system.plant.centre} "
+                    "is estimated with the rest, unless it is stated"
+                )
     else:
         began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
@@ -244,7 +250,19 @@ def _fit_and_review(
         why, explains = explain_misfit(held, fit, min(seconds, problem.method.budget.part(1.0).seconds))
         if explains:
             result = replace(result, status=refuse_drift(result.status, result.stats["free_run_share"]))
-    return replace(result, status=result.status.with_details(why, str(chosen) if chosen else ""))
+    return replace(result, status=result.status.with_details(why, offset, str(chosen) if chosen else ""))
+
+
+def _search(
+    problem: EstimationProblem, loss: Loss | None, *, estimate_noise: bool
+) -> "tuple[Tried, FixedValueTest, pd.DataFrame]":
+    """The best fit, what was found of fixed values on the way, and the trail."""
+    doubts = FixedValueTest()
+    search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
+    found = find_fit(search)
+    if not (found.fit.status.converged or doubts.tests):  # a wrong value drives widths to where no search settles
+        doubts.explains(found.problem, found.fit)
+    return found, doubts, search.trail
 
 
 def _is_missed(result: IdentificationResult) -> bool:

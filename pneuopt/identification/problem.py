@@ -465,15 +465,13 @@ def _bridge(log: Trajectory, behaviour: dict[str, Intersample], lost: Mask) -> d
 
 
 def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> ParameterSet:
-    """Free what a plant's command counts from, with a warning, where logs show another than 0 and nobody has stated it.
+    """Free the centre of a plant's valve, with a warning, where logs count its command from 0 and nobody has stated it.
 
-    Logs that count a valve's from different voltages are refused, and so is a log that contradicts a stated centre.
+    Logs that count it from different voltages are refused, and so is a log that contradicts a stated centre.
     """
     name, element = centre_name(system.plant), system.plant.axis.final_element if system.plant.axis else None
-    if name is None:
+    if name is None or element is None:
         return parameters
-    if element is None:
-        return _find_offset(system, experiments, parameters, name)
     every = system.parameters | parameters
     stated = every[name]
     commands = [c for e in experiments if name not in e.conditions for c in _commands(system, element, e, every)]
@@ -504,37 +502,6 @@ def find_centre(system: Fittable, experiments: Sequence[Experiment], parameters:
         stacklevel=3,
     )
     return parameters | ParameterSet({name: found})
-
-
-def _find_offset(
-    system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet, name: str
-) -> ParameterSet:
-    """Free an offset of the command that nobody has stated, where starts with it are nearer to the logs beyond chance.
-
-    Beyond chance is Schwarz's criterion: ``n log(squares / squares with it) > log n`` (Annals of Statistics 6, 1978).
-    """
-    every = system.parameters | parameters
-    is_open = parameters.free_names and not (every[name].free or every[name].stated)
-    if not is_open or any(name in e.conditions for e in experiments):
-        return parameters
-    squares, freed = list[float](), every.freed(name)
-    for tried in (every, freed):
-        start = EstimationProblem(system, tuple(experiments), tried, LeastSquares()).candidates[0]
-        outputs = [(e.trajectory, start.states[e.name], n) for e in experiments for n in outputs_in_log(system, e)]
-        misses = np.concatenate([measured[n] - states[n] for measured, states, n in outputs])
-        squares.append(float(np.nansum(misses**2)))
-    count = int(np.isfinite(misses).sum())
-    if not squares[0] > squares[1] * count ** (1 / count):
-        return parameters
-    where = ", ".join(e.name for e in experiments)
-    source, driving = system.inputs[0].name, name.partition(".")
-    warnings.warn(
-        f"{where}: the output is zero at another {source} than 0 {every[name].unit}; {name} is estimated with the "
-        f'rest, or state it, {driving[2]} = "0 {every[name].unit}", under [{driving[0]}]',
-        PhysicsWarning,
-        stacklevel=4,
-    )
-    return parameters | freed.select([name])
 
 
 UNSEEN_CENTRE = "the middle of its range: the log uses one side of it only"
