@@ -215,16 +215,7 @@ def _fit_and_review(
         warnings.warn(sentence, PhysicsWarning, stacklevel=3)
     doubts, trail, offset = FixedValueTest(), None, ""
     if start is None:
-        (_, held, fit, label, _), doubts, trail = _search(problem, loss, estimate_noise=estimate_noise)
-        if freed := free_shown_offset(held, fit):
-            freed = replace(problem, parameters=freed.parameters)
-            better, *others = _search(freed, loss, estimate_noise=estimate_noise)
-            if better.fit.status.converged and gains_beyond_chance(fit, 2 * better.fit.stats["cost"]):
-                problem, (_, held, fit, label, _), (doubts, trail) = freed, better, others
-                offset = (
-                    f"{problem.system.inputs[0].name} counts from another value than 0: {problem.system.plant.centre} "
-                    "is estimated with the rest, unless it is stated"
-                )
+        problem, (_, held, fit, label, _), doubts, trail, offset = _search(problem, loss, estimate_noise=estimate_noise)
     else:
         began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
@@ -255,14 +246,20 @@ def _fit_and_review(
 
 def _search(
     problem: EstimationProblem, loss: Loss | None, *, estimate_noise: bool
-) -> "tuple[Tried, FixedValueTest, pd.DataFrame]":
-    """The best fit, what was found of fixed values on the way, and the trail."""
-    doubts = FixedValueTest()
+) -> "tuple[EstimationProblem, Tried, FixedValueTest, pd.DataFrame, str]":
+    """The problem, whose offset is freed where logs show one; its best fit, doubts of fixed values, trail, a remark."""
+    doubts, offset = FixedValueTest(), problem.system.plant.centre
     search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
     found = find_fit(search)
+    if freed := free_shown_offset(found.problem, found.fit):
+        freed = replace(problem, parameters=freed.parameters)
+        freed, better, others, trail, _ = _search(freed, loss, estimate_noise=estimate_noise)
+        if better.fit.status.converged and gains_beyond_chance(found.fit, 2 * better.fit.stats["cost"]):
+            remark = f"{problem.system.inputs[0].name} counts from another value than 0: {offset} is estimated with the"
+            return freed, better, others, trail, f"{remark} rest, unless it is stated"
     if not (found.fit.status.converged or doubts.tests):  # a wrong value drives widths to where no search settles
         doubts.explains(found.problem, found.fit)
-    return found, doubts, search.trail
+    return problem, found, doubts, search.trail, ""
 
 
 def _is_missed(result: IdentificationResult) -> bool:

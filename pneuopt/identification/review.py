@@ -362,9 +362,8 @@ def free_shown_offset(problem: EstimationProblem, fit: Fit) -> EstimationProblem
     if name is None or problem.parameters[name].stated or not math.isfinite(fit.stats["cost"]):
         return None
     without, freed = promised_squares(problem, fit, {name})
-    if name not in freed or not gains_beyond_chance(fit, freed[name], without):
-        return None
-    return replace(problem, parameters=problem.parameters.freed(name))
+    is_shown = name in freed and gains_beyond_chance(fit, freed[name], without)
+    return replace(problem, parameters=problem.parameters.freed(name)) if is_shown else None
 
 
 def gains_beyond_chance(fit: Fit, squares: float, without: float | None = None) -> bool:
@@ -372,7 +371,8 @@ def gains_beyond_chance(fit: Fit, squares: float, without: float | None = None) 
 
     `without` is what the squares are without it, those of the fit by default.
     """
-    return (2 * fit.stats["cost"] if without is None else without) > squares * fit.count ** (1 / fit.count)
+    before = 2 * fit.stats["cost"] if without is None else without
+    return bool(before > squares * fit.count ** (1 / fit.count))
 
 
 def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -> WrongValue | None:

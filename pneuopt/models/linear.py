@@ -606,11 +606,13 @@ def _solve_linear_part(
     coulomb = (
         float(weights[0 if fixed_gain is not None else 1]) / gain if responses[0].friction_responses and gain else 0.0
     )
-    moved = dict(zip(groups, weights[len(weights) - 1 - len(groups) : -1] / (gain or 1.0), strict=True))
-    offsets = tuple(float(moved.get(r.group, 0.0)) for r in records)
+    shifts: dict[str | None, float] = dict(
+        zip(groups, weights[len(weights) - 1 - len(groups) : -1] / (gain or 1.0), strict=True)
+    )
+    moved = tuple(float(shifts.get(r.group, 0.0)) for r in records)
     ends = np.cumsum([len(r.t) for r in records])[:-1]
     split = tuple(np.split(errors, ends))
-    return _Fit((*shaping, *dead), misfit if np.isfinite(misfit) else np.inf, gain, coulomb, split, offsets)
+    return _Fit((*shaping, *dead), misfit if np.isfinite(misfit) else np.inf, gain, coulomb, split, moved)
 
 
 def _zero_order_hold_filter(polynomials: Polynomials, step: float) -> tuple[Array, Array]:
