@@ -637,6 +637,14 @@ def test_a_log_that_counts_from_elsewhere_has_its_offset_estimated() -> None:
     assert fit.estimates["ci_low"][OFFSET] < offset < fit.estimates["ci_high"][OFFSET]
 
 
+def test_the_covariance_of_a_fit_far_from_zero_is_symmetric() -> None:
+    """Rounding left it lopsided by a few millionths, and `simulate` refused the fit.toml that `identify` wrote."""
+    plant = SecondOrder().system()
+    free = plant.parameters.freed("plant.gain", "plant.natural_frequency", "plant.damping", OFFSET)
+    covariance = identify(plant, oscillator_log(2.4, 13.2), free).covariance.to_numpy()
+    assert np.array_equal(covariance, covariance.T)
+
+
 def test_an_offset_that_no_log_shows_or_that_is_stated_stays() -> None:
     plant = SecondOrder().system()
     free = plant.parameters.freed("plant.gain", "plant.natural_frequency", "plant.damping")
