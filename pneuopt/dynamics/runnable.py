@@ -10,7 +10,7 @@ to 10 V is closed near 5 V, and its wire and its logs count from 0 V.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Protocol, TypeVar
 
 import casadi as ca
@@ -150,6 +150,7 @@ def check_smooth(model: Runnable) -> None:
     require(FRICTION_DIRECTION not in model.parameters, message, ModelError)
 
 
+@lru_cache(maxsize=64)
 def count_from_centre(system: System) -> System:
     """A system whose command is the deviation from the centre of its final element; the same one where it has none.
 

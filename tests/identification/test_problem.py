@@ -41,7 +41,7 @@ from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drives import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, Viscous
-from pneuopt.models.linear import SecondOrder
+from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, PhysicsWarning, UnknownNameError
 from pneuopt.quantities.parameters import Intersample, Parameter, ParameterSet, Quantity
@@ -663,3 +663,30 @@ def test_each_log_has_an_offset_of_its_own_where_the_file_says_so() -> None:
     fit = identify(plant, [oscillator_log(1.0), oscillator_log(-0.5, seed=1)], free)
     assert fit.estimates["value"][f"{OFFSET}[run0]"] == pytest.approx(1.0, abs=0.01)
     assert fit.estimates["value"][f"{OFFSET}[run1]"] == pytest.approx(-0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("plant", [FirstOrder(pade_order=3), SecondOrder(), Integrator()])
+def test_a_gain_that_is_stated_as_negative_is_no_wrong_sign(plant: Plant) -> None:
+    """A check knows what the file says of the gain: a right log was refused, with advice that spoils it."""
+    system, t = plant.system(), np.arange(400) * 0.01
+    u = np.sin(2.0 * t) + 0.3 * np.sin(5.0 * t)
+    truth = system.parameters.with_values({"plant.gain": -2.0})
+    y = simulate(system, Trajectory(t, {"valve_voltage": u}), truth)["speed"]
+    log = Experiment(Trajectory(t, {"valve_voltage": u, "speed": y + 0.01 * np.random.default_rng(0).normal(size=400)}))
+    stated = system.parameters.with_values({"plant.gain": -1.0}).freed("plant.gain")
+    fit = identify(system, log, stated)
+    assert fit.parameters.value("plant.gain") == pytest.approx(-2.0, rel=0.02)
+    if not isinstance(plant, Integrator):  # which follows a swing by a quarter of its period, whatever the sign
+        with pytest.raises(LogError, match="against the valve's command"):
+            identify(system, log, system.parameters.freed("plant.gain"))
+
+
+def test_no_piston_is_looked_for_in_newtons() -> None:
+    """An output of 129 N was "129 m/s: is its unit mm, and read as m?"."""
+    plant, t = FirstOrder(output=Quantity("speed", "N")).system(), np.arange(400) * 0.01
+    u = 60.0 + 40.0 * np.sin(2.0 * t)
+    y = simulate(plant, Trajectory(t, {"valve_voltage": u}), plant.parameters.with_values({"plant.gain": 2.0}))["speed"]
+    noisy = {"valve_voltage": u, "speed": y + np.random.default_rng(0).normal(size=400)}
+    log = Experiment(Trajectory(t, noisy), units={"speed": "N"}, name="run")
+    fit = identify(plant, log, plant.parameters.freed("plant.gain", "plant.time_constant"))
+    assert fit.parameters.value("plant.gain") == pytest.approx(2.0, rel=0.02)
