@@ -284,7 +284,7 @@ def test_a_loop_counts_its_command_from_the_offset() -> None:
     at = system.parameters.with_values({INPUT_OFFSET: 3.0})
     assert command_centre(system, at) == 3.0
     loop = ClosedLoop(system, PID())
-    rest = loop.plant.linearise([0.0], {}, at)
+    rest = loop.plant.linearise(np.zeros(1), {}, at)
     assert loop.plant.equilibrium({"valve_voltage": 0.0}, at) == pytest.approx([0.0])
     assert system.equilibrium({"valve_voltage": 3.0}, at) == pytest.approx([0.0])
-    assert pytest.approx(system.linearise([0.0], {}, at).A) == rest.A
+    assert pytest.approx(system.linearise(np.zeros(1), {}, at).A) == rest.A
