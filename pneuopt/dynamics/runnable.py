@@ -10,7 +10,7 @@ to 10 V is closed near 5 V, and its wire and its logs count from 0 V.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Protocol, TypeVar
 
 import casadi as ca
@@ -150,14 +150,17 @@ def check_smooth(model: Runnable) -> None:
     require(FRICTION_DIRECTION not in model.parameters, message, ModelError)
 
 
+@lru_cache(maxsize=64)
 def count_from_centre(system: System) -> System:
     """A system whose command is the deviation from the centre of its final element; the same one where it has none.
 
     Its parameter of the centre remains, without an effect.
     """
     axis, centre = system.axis, centre_name(system)
-    if axis is None or axis.final_element is None or centre is None:
+    if centre is None:
         return system
+    if axis is not None and axis.final_element is not None:
+        axis = axis._replace(final_element=axis.final_element._replace(centre=None))
     rest, start, warn = system.rest_hook, system.start_hook, system.log_warning_hook
     return replace(
         system,
@@ -166,14 +169,15 @@ def count_from_centre(system: System) -> System:
         rest_hook=None if rest is None else partial(_rest, rest, centre),
         start_hook=None if start is None else partial(_read_at_zero, start, centre),
         log_warning_hook=None if warn is None else partial(_read_at_zero, warn, centre),
-        axis=axis._replace(final_element=axis.final_element._replace(centre=None)),
+        axis=axis,
+        centre=None,
     )
 
 
 def centre_name(system: System) -> str | None:
-    """The parameter at which the final element of a plant is centred; None where its command counts from there."""
+    """The parameter from which the command of a plant, or of its final element, counts; None where that is 0."""
     element = None if system.axis is None else system.axis.final_element
-    return None if element is None else element.centre
+    return system.centre if element is None else element.centre
 
 
 def command_centre(system: System, parameters: ParameterSet) -> float:

@@ -77,6 +77,9 @@ class System:
         Which motion a log must show for its parameters to be identifiable.
     axis : Axis, optional
         The body that it moves against friction.
+    centre : str, optional
+        The parameter from which the command counts, where a log's may count from elsewhere; a controller's counts from
+        there.
     """
 
     states: tuple[Quantity, ...]
@@ -92,6 +95,7 @@ class System:
     meter: ca.Function | None = None
     identification_hints: IdentificationHints = field(default_factory=IdentificationHints)
     axis: Axis | None = None
+    centre: str | None = None
 
     def __repr__(self) -> str:
         return describe(self)

@@ -462,7 +462,7 @@ def _find(system: Fittable, experiments: Iterable[Experiment], parameters: Param
 def axis_from_model(plant: System, experiment: Experiment, parameters: ParameterSet) -> StatedAxis:
     """The channels of the plant's axis and the forces on it that are not free; a piston's by default."""
     if plant.axis is None:
-        return PISTON._replace(forces={})
+        return PISTON._replace(forces={}, is_piston=_may_be_piston(plant, parameters))
     known = plant.parameters | parameters.select(n for n in parameters if n in plant.parameters)
     conditions = {n: value for n, value in experiment.conditions.items() if n in known}
     known = known.with_values(conditions).fixed(*conditions)
@@ -490,6 +490,18 @@ def axis_from_model(plant: System, experiment: Experiment, parameters: Parameter
         offset_parameter=body.offset_parameter(),
         stops=body.stops(),
     )
+
+
+def _may_be_piston(plant: System, parameters: ParameterSet) -> bool:
+    """Whether a plant without a body moves in metres, and forward in the long run by a positive command, as stated."""
+    channels = [q for q in plant.outputs if q.name in (PISTON.position, PISTON.speed)]
+    if any(q.unit not in ("m", "m/s") for q in channels):
+        return False
+    if not (channels and plant.inputs and plant.states):
+        return True
+    at = plant.linearise(np.zeros(len(plant.states)), {}, parameters)
+    slow = 1e-6 * (1 + np.abs(at.A).max()) * np.eye(len(at.A))  # of an integrator, too, the gain is finite there
+    return not (at.C @ np.linalg.solve(slow - at.A, at.B) + at.D)[0, 0] < 0
 
 
 def _agree(a: Mapping[str, float], b: Mapping[str, float]) -> bool:

@@ -38,9 +38,10 @@ from pneuopt.identification.problem import (
     outputs_in_log,
 )
 from pneuopt.identification.result import ChosenWindow, EstimateRow, IdentificationResult, Mark
-from pneuopt.identification.review import FixedValueTest, review_fit
+from pneuopt.identification.review import FixedValueTest, free_shown_offset, gains_beyond_chance, review_fit
 from pneuopt.identification.search import (
     Search,
+    Tried,
     check_window,
     enforce_ordering,
     find_fit,
@@ -212,13 +213,9 @@ def _fit_and_review(
     problem, unseen = hold_unseen(problem)
     for sentence in unseen:
         warnings.warn(sentence, PhysicsWarning, stacklevel=3)
-    doubts, trail = FixedValueTest(), None
+    doubts, trail, offset = FixedValueTest(), None, ""
     if start is None:
-        search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
-        _, held, fit, label, _ = find_fit(search)
-        trail = search.trail
-        if not (fit.status.converged or doubts.tests):  # a wrong value drives widths to where a search does not settle
-            doubts.explains(held, fit)
+        problem, (_, held, fit, label, _), doubts, trail, offset = _search(problem, loss, estimate_noise=estimate_noise)
     else:
         began = fit_fixing_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
@@ -244,7 +241,25 @@ def _fit_and_review(
         why, explains = explain_misfit(held, fit, min(seconds, problem.method.budget.part(1.0).seconds))
         if explains:
             result = replace(result, status=refuse_drift(result.status, result.stats["free_run_share"]))
-    return replace(result, status=result.status.with_details(why, str(chosen) if chosen else ""))
+    return replace(result, status=result.status.with_details(why, offset, str(chosen) if chosen else ""))
+
+
+def _search(
+    problem: EstimationProblem, loss: Loss | None, *, estimate_noise: bool
+) -> "tuple[EstimationProblem, Tried, FixedValueTest, pd.DataFrame, str]":
+    """The problem, whose offset is freed where logs show one; its best fit, doubts of fixed values, trail, a remark."""
+    doubts, offset = FixedValueTest(), problem.system.plant.centre
+    search = Search(problem, loss, estimate_noise=estimate_noise, gives_up=doubts.explains)
+    found = find_fit(search)
+    if freed := free_shown_offset(found.problem, found.fit):
+        freed = replace(problem, parameters=freed.parameters)
+        freed, better, others, trail, _ = _search(freed, loss, estimate_noise=estimate_noise)
+        if better.fit.status.converged and gains_beyond_chance(found.fit, 2 * better.fit.stats["cost"]):
+            remark = f"{problem.system.inputs[0].name} counts from another value than 0: {offset} is estimated with the"
+            return freed, better, others, trail, f"{remark} rest, unless it is stated"
+    if not (found.fit.status.converged or doubts.tests):  # a wrong value drives widths to where no search settles
+        doubts.explains(found.problem, found.fit)
+    return problem, found, doubts, search.trail, ""
 
 
 def _is_missed(result: IdentificationResult) -> bool:

@@ -16,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import FinalElement, Log, Start
 from pneuopt.dynamics.runnable import Fittable, HasSystem, as_runnable, centre_name
-from pneuopt.dynamics.system import DiscreteSystem, add_slopes, append_slopes, names
+from pneuopt.dynamics.system import DiscreteSystem, System, add_slopes, append_slopes, names
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.tolerances import (
@@ -44,7 +45,10 @@ from pneuopt.quantities.parameters import (
     usual_intersample,
 )
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import Fit, LeastSquares
+from pneuopt.shooting.filters import filter_nodes
+from pneuopt.shooting.least_squares import BudgetSpentError, Fit, LeastSquares
+from pneuopt.shooting.segments import choose_integration, segment, start_nodes
+from pneuopt.shooting.tolerances import GATHERED_DEVIATION
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 
@@ -76,7 +80,7 @@ class EstimationProblem:
 
     @property
     def candidates(self) -> Sequence[Start]:
-        """The model's own starts from all logs together."""
+        """The model's own starts from all logs together; of a model that has none, its states filtered along them."""
         source = (self.system, self.parameters, *self.experiments)
         for others, starts in self._made:
             if len(others) == len(source) and all(a is b for a, b in zip(others, source, strict=True)):
@@ -85,6 +89,8 @@ class EstimationProblem:
             e.name: (apply_conditions(self.parameters, e), input_behaviour(self.system, e)) for e in self.experiments
         }
         starts = self.system.starts({e.name: Log(e.trajectory, *known[e.name]) for e in self.experiments})
+        if isinstance(self.system, System) and self.system.start_hook is None and self.system.states:
+            starts = [self.filter_states(start) for start in starts]
         self._made.append((source, starts))
         return starts
 
@@ -101,6 +107,20 @@ class EstimationProblem:
         given = self.unknowns()
         values = {n: v if math.isfinite(v) else given.value(n) for n, v in found.items() if n in given}
         return Start(dict(zip((e.name for e in self.experiments), runs, strict=True)), values, label)
+
+    def filter_states(self, start: Start, gathered: float = GATHERED_DEVIATION) -> Start:
+        """The start with states along the logs that fit its parameters (`shooting.filters`)."""
+        segments = segment(self.transcription(start))
+        q = np.array([p.value for p in segments.transcription.parameters.values()])
+        try:
+            with check_during_runs(self.method.budget.check):
+                nodes = filter_nodes(segments, start_nodes(segments), q, gathered)
+                segments, substeps = choose_integration(segments, nodes, q)
+                run = segments.run(nodes, q, substeps, states=True)
+        except BudgetSpentError:
+            return start
+        names = (e.name for e in self.experiments)
+        return replace(start, states=dict(zip(names, segments.trajectories(run), strict=True)))
 
     def unknowns(self) -> ParameterSet:
         """The problem's parameters: the system's, each log's conditions, each log's own copies."""

@@ -199,8 +199,9 @@ class _Refits:
         return value
 
     def value(self, z: float) -> float:
-        """The parameter's value at a searched one."""
-        return math.exp(z) if self.parameter.log else z
+        """The parameter's value at a searched one; at a bound exactly the bound, which an exponential may exceed."""
+        p = self.parameter
+        return min(max(math.exp(z) if p.log else z, p.lower), p.upper)
 
     def refit_at(self, z: float, begin: _ProfilePoint | None = None) -> _ProfilePoint:
         """The fit with the parameter held there, from a refit or the nearest; `KeyboardInterrupt` if interrupted."""

@@ -335,13 +335,18 @@ def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
     return replace(best, alike=tuple(t.name for t in alike[1:]), lag=lag)
 
 
-def promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[str, float]]:
-    """The squares with tight gaps by the equations linearised at a fit, and those with each fixed value freed."""
+def promised_squares(
+    problem: EstimationProblem, fit: Fit, only: Container[str] | None = None
+) -> tuple[float, dict[str, float]]:
+    """The squares with tight gaps by the equations linearised at a fit, and those with each fixed value freed.
+
+    `only` says which of these; None: all.
+    """
     # a fixed parameter may be wrong unless it is a width, or each log has or states one of its own
     widths = {w.name for w in problem.system.plant.identification_hints.widths}
     stated = {n for e in problem.experiments for n in e.conditions} | widths
     fixed = {n: p for n, p in problem.parameters.items() if not (p.free or p.per_log) and n not in stated}
-    names = [n for n, p in fixed.items() if p.lower < p.value < p.upper]
+    names = [n for n, p in fixed.items() if p.lower < p.value < p.upper and (only is None or n in only)]
     if not names:
         return math.nan, {}
     freed = replace(problem, parameters=problem.parameters.freed(*names))
@@ -352,6 +357,25 @@ def promised_squares(problem: EstimationProblem, fit: Fit) -> tuple[float, dict[
     movable = scaling.has_effect(equations) & ~scaling.fixed & ~scaling.at_bound(begun.iterate.z)
     squares = {name: equations.promised_squares(movable & (~tested | (np.array(free) == name))) for name in names}
     return equations.promised_squares(movable & ~tested), squares
+
+
+def free_shown_offset(problem: EstimationProblem, fit: Fit) -> EstimationProblem | None:
+    """The problem with the zero of the command freed, where nobody has stated it and the fit promises to gain by it."""
+    name = problem.system.plant.centre
+    if name is None or problem.parameters[name].stated or not math.isfinite(fit.stats["cost"]):
+        return None
+    without, freed = promised_squares(problem, fit, {name})
+    is_shown = name in freed and gains_beyond_chance(fit, freed[name], without)
+    return replace(problem, parameters=problem.parameters.freed(name)) if is_shown else None
+
+
+def gains_beyond_chance(fit: Fit, squares: float, without: float | None = None) -> bool:
+    """Whether one more parameter is worth it by Schwarz's criterion (Annals of Statistics 6(2), 1978).
+
+    `without` is what the squares are without it, those of the fit by default.
+    """
+    before = 2 * fit.stats["cost"] if without is None else without
+    return bool(before > squares * fit.count ** (1 / fit.count))
 
 
 def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -> WrongValue | None:

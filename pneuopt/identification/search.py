@@ -74,10 +74,10 @@ from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.equations import ParameterScaling
-from pneuopt.shooting.filters import PredictionErrors, filter_nodes
-from pneuopt.shooting.least_squares import BudgetSpentError, Fit, SearchEnd, close_gaps, solve_least_squares
+from pneuopt.shooting.filters import PredictionErrors
+from pneuopt.shooting.least_squares import Fit, SearchEnd, close_gaps, solve_least_squares
 from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
-from pneuopt.shooting.tolerances import GATHERED_DEVIATION, MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
+from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -423,7 +423,7 @@ def _from_excerpt(search: Search) -> Iterator[Candidate]:
     tight = replace(problem, method=replace(problem.method, stages=problem.method.stages[-1:]))
     rough = replace(problem.candidates[0], parameters=parts.start_from(found.fit).parameters)
     held, fit = fit_fixing_unidentifiable(
-        tight, filter_states(tight, rough, tight.method.stages[-1].gap), HOPELESS_MISFIT
+        tight, tight.filter_states(rough, tight.method.stages[-1].gap), HOPELESS_MISFIT
     )
     yield replace(held, method=problem.method), fit, f"{found.label}, of a part"
 
@@ -432,13 +432,13 @@ def _from_filtered(search: Search) -> Iterator[Candidate]:
     """The fit with tight gaps from states filtered by the parameters of wide ones, whose nodes would close slowly."""
     problem, rough, stages = search.problem, search.problem.candidates[0], search.problem.method.stages
     wide = replace(problem.method, stages=stages[:GUESS_STAGES:2], allows_state_noise=False)
-    settled = solve_least_squares(problem.transcription(filter_states(problem, rough)), wide)
+    settled = solve_least_squares(problem.transcription(problem.filter_states(rough)), wide)
     if settled.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     if not 2 * settled.stats["cost"] <= MAX_CHI_SQUARE_RATIO * settled.count:
         return
     tight = replace(problem, method=replace(problem.method, stages=stages[-1:], allows_state_noise=False))
-    start = filter_states(tight, replace(rough, parameters=problem.start_from(settled).parameters))
+    start = tight.filter_states(replace(rough, parameters=problem.start_from(settled).parameters))
     held, fit = fit_fixing_unidentifiable(tight, start, HOPELESS_MISFIT)
     yield replace(held, method=problem.method), fit.with_effort_of(settled), f"{rough.label}, filtered"
 
@@ -461,21 +461,6 @@ def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
     whole, kept = (sum(len(e.trajectory) for e in each) for each in (problem.experiments, parts))
     is_huge = sum(e.trajectory.duration for e in problem.experiments) > MAX_SEGMENTS * problem.method.segment_time
     return replace(problem, experiments=tuple(parts)) if whole >= MIN_LENGTH_RATIO * kept and not is_huge else None
-
-
-def filter_states(problem: EstimationProblem, start: Start, gathered: float = GATHERED_DEVIATION) -> Start:
-    """The start with states along the logs that fit its parameters (`shooting.filters`)."""
-    segments = segment(problem.transcription(start))
-    q = np.array([p.value for p in segments.transcription.parameters.values()])
-    try:
-        with check_during_runs(problem.method.budget.check):
-            nodes = filter_nodes(segments, start_nodes(segments), q, gathered)
-            segments, substeps = choose_integration(segments, nodes, q)
-            run = segments.run(nodes, q, substeps, states=True)
-    except BudgetSpentError:
-        return start
-    names = (e.name for e in problem.experiments)
-    return replace(start, states=dict(zip(names, segments.trajectories(run), strict=True)))
 
 
 def liveliest_part(columns: Array, count: int) -> int:
@@ -538,7 +523,7 @@ def _from_predictions(search: Search) -> Iterator[Candidate]:
     last = problem.method.stages[-1:]
     tight = replace(problem, method=replace(problem.method, stages=last, allows_state_noise=False))
     start = replace(guesses[0], parameters={**guesses[0].parameters, **found}, label="prediction errors")
-    held, fit = fit_fixing_unidentifiable(tight, filter_states(tight, start, last[-1].gap), HOPELESS_MISFIT)
+    held, fit = fit_fixing_unidentifiable(tight, tight.filter_states(start, last[-1].gap), HOPELESS_MISFIT)
     yield replace(held, method=problem.method), fit, "prediction errors"
 
 

@@ -80,6 +80,7 @@ class StatedAxis(NamedTuple):
     force_unit: str = "N"
     offset_parameter: str = ""  # of a constant force; empty where there is none
     stops: tuple[float, ...] = ()  # positions at which the model has end stops
+    is_piston: bool = True  # not so where the motion's unit is another, or the gain is stated as negative
 
     def net_force(self, channels: Mapping[str, Array]) -> Array:
         """The force on the body without friction, from channels; the constant counts as zero where it is unknown."""
@@ -754,7 +755,7 @@ def check_work_sign(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
 def check_command(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find a piston that runs against its valve's command, or without one."""
     log, motion = experiment.trajectory, motion_speed(experiment, axis)
-    if motion is None or "valve_voltage" not in log:
+    if motion is None or "valve_voltage" not in log or not axis.is_piston:
         return
     known = np.isfinite(motion) & np.isfinite(log["valve_voltage"])
     t, command, motion = log.t[known], log["valve_voltage"][known], motion[known]
@@ -824,7 +825,7 @@ def check_scale(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding
     """Find motion of a size that no drive has, as millimetres that are read as metres."""
     log, motion = experiment.trajectory, motion_speed(experiment, axis)
     fastest = 0.0 if motion is None else float(np.nanpercentile(np.abs(motion), 99))
-    if axis.position == PISTON.position and fastest > MAX_PISTON_SPEED:
+    if axis.position == PISTON.position and axis.is_piston and fastest > MAX_PISTON_SPEED:
         name = axis.speed if axis.speed in log else axis.position
         size = np.zeros(len(log)) if motion is None else np.abs(motion)
         speeds = Panel("m/s", {"speed": size, "no piston is faster": np.full(size.size, MAX_PISTON_SPEED)})

@@ -1,9 +1,12 @@
 """Transfer-function plants with named signals: first order, second order, integrator; dead time; their starts.
 
+Each reads its input u as ``u - input_offset``, the input that holds its output at zero: a log's signals rarely count
+from there. A constant on the output is the same as one on the input of ``-1 / gain`` of it, so one number holds both.
+
 Below the plants and their files' section stand the dead time as states, a Padé approximant of order 1 to 5, and the
-starts from logs without a user's guess (`LinearStarts`): gain, start states and Coulomb friction enter the response
-linearly, so each point of a grid over the few other values (time constants, damping, dead time) costs one small linear
-least squares; the best of them are refined.
+starts from logs without a user's guess (`LinearStarts`): gain, offset, start states and Coulomb friction enter the
+response linearly, so each point of a grid over the few other values (time constants, damping, dead time) costs one
+small linear least squares; the best of them are refined.
 """
 
 import itertools
@@ -39,6 +42,13 @@ from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import difference_unit, read_si
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
+PLANT_DAMPING, PLANT_DEAD_TIME, PLANT_GAIN, COULOMB_LEVEL, INPUT_OFFSET = (
+    "plant.damping",
+    "plant.dead_time",
+    "plant.gain",
+    "friction.coulomb",
+    "plant.input_offset",
+)
 Dynamics = Callable[[ca.SX, Symbols, Symbols], dict[str, ca.SX]]
 
 
@@ -278,19 +288,21 @@ def _assemble_plant(
     order, source, unit = plant.pade_order, plant.input, difference_unit(plant.input.unit)
     line, gain_unit = delay_line(source, order), _quotient_unit(plant.output, f"({unit}{per})" if per else unit)
     gain = Parameter(1.0, gain_unit, meaning="steady output, or of an integrator its rate, per input")
-    parameters = ParameterSet({"plant.gain": gain}) | shaping
+    zero = Parameter(0.0, unit, meaning="input that holds the output at zero; estimated where logs show another than 0")
+    parameters = ParameterSet({PLANT_GAIN: gain, INPUT_OFFSET: zero}) | shaping
     if order:
         meaning = "delay from the input to its effect; none where it is left out"
         parameters |= ParameterSet({"plant.dead_time": Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)})
 
     def rhs(_: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
-        late, rates = pade_delay(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
+        counted = u[source.name] - p[INPUT_OFFSET]
+        late, rates = pade_delay(counted, [x[q.name] for q in line], p.get(PLANT_DEAD_TIME, ca.SX(0)))
         moving = dynamics(late, x, p) | {q.name: r for q, r in zip(line, rates, strict=True)}
         return moving, {plant.output.name: x[plant.output.name]}
 
     others = tuple(n for n in names(states) if n not in {plant.output.name, "drive"})
     find = LinearStarts(shape, source.name, plant.output.name, names(line), others)
-    return define(states + line, (source,), (plant.output,), parameters, rhs, find)
+    return replace(define(states + line, (source,), (plant.output,), parameters, rhs, find), centre=INPUT_OFFSET)
 
 
 # These polynomials are functions of the module, not lambdas: a system goes to other processes (pickle).
@@ -371,14 +383,6 @@ def delay_states(u: Array, step: float, order: int, dead_time: float) -> Array:
     return states
 
 
-PLANT_DAMPING, PLANT_DEAD_TIME, PLANT_GAIN, COULOMB_LEVEL = (
-    "plant.damping",
-    "plant.dead_time",
-    "plant.gain",
-    "friction.coulomb",
-)
-
-
 @dataclass(frozen=True)
 class LinearStarts:
     """Start hook of a linear plant; `LogError` for a log that is too short, or logs whose input never changes."""
@@ -422,8 +426,14 @@ class LinearStarts:
         for n in (n for n in estimates if n in parameters and parameters[n].free):
             value = float(np.clip(estimates[n], parameters[n].lower, parameters[n].upper))
             values |= {f"{n}[{log}]": value for log in logs} if parameters[n].per_log else {n: value}
-        states = {}
-        for (name, log), record, error in zip(logs.items(), records, fit.errors, strict=True):
+        offset, states = parameters[INPUT_OFFSET], {}
+        zeros = [
+            float(np.clip(r.zero + moved, offset.lower, offset.upper))
+            for r, moved in zip(records, fit.offsets, strict=True)
+        ]
+        named = {n: z for n, z, r in zip(logs, zeros, records, strict=True) if r.group is not None}
+        values |= {f"{INPUT_OFFSET}[{n}]" if offset.per_log else INPUT_OFFSET: zero for n, zero in named.items()}
+        for (name, log), record, error, moved in zip(logs.items(), records, fit.errors, fit.offsets, strict=True):
             response = record.y - error
             drive = np.gradient(response, record.t)
             if self.shape.friction_polynomials is not None:
@@ -432,7 +442,7 @@ class LinearStarts:
             columns = {n: np.zeros(len(record.t)) for n in (*self.zero_states, *self.delay_line)}
             if self.delay_line:
                 dead_time = fit.values[len(self.shape.names)]
-                line = delay_states(record.u, float(record.t[1] - record.t[0]), len(self.delay_line), dead_time)
+                line = delay_states(record.u - moved, float(record.t[1] - record.t[0]), len(self.delay_line), dead_time)
                 columns |= dict(zip(self.delay_line, line.T, strict=True))
             run = Trajectory(record.t + record.start_time, columns | {self.output: response, "drive": drive})
             states[name] = run.interpolate(log.measured.t)
@@ -441,7 +451,7 @@ class LinearStarts:
 
 @dataclass(frozen=True, eq=False)
 class _EvenLog:
-    """A log on an even grid from zero: held input, output, smooth sign of the output, and the gain if it is fixed."""
+    """A log on an even grid from zero: held input over `zero`, output, its smooth sign, and the gain if it is fixed."""
 
     t: Array
     u: Array
@@ -449,13 +459,15 @@ class _EvenLog:
     sign: Array
     gain: float | None
     start_time: float
+    zero: float  # the given offset of the input
+    group: str | None  # the logs with which it shares an offset that is free; None where that is known
 
 
 @dataclass(frozen=True, eq=False)
 class _UnitResponses:
-    """Responses of unit gain on one log: to the initial input, to its changes, to friction, and free responses."""
+    """Responses of unit gain on one log: to a constant input, to its changes, to friction, and free responses."""
 
-    initial_input: Array
+    constant_input: Array
     input_changes: Array
     friction_responses: tuple[Array, ...]
     free: Array
@@ -470,10 +482,11 @@ class _Fit:
     gain: float
     coulomb: float
     errors: tuple[Array, ...]
+    offsets: tuple[float, ...]  # of the input, over the given one, by log
 
 
 def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
-    measured, gain = log.measured, log.parameters[PLANT_GAIN]
+    measured, gain, offset = log.measured, log.parameters[PLANT_GAIN], log.parameters[INPUT_OFFSET]
     finite = np.isfinite(measured[source]) & np.isfinite(measured[output])
     t, u, y = (a[finite] for a in (measured.t, measured[source], measured[output]))
     few = f"{name}: {len(t)} samples of {source} and {output} are too few to start from; give {MIN_FIT_SAMPLES} or more"
@@ -486,14 +499,15 @@ def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
     even = np.interp(grid, t, y)
     noise = 1.4826 * np.median(np.abs(np.diff(even))) + 1e-3 * np.ptp(even) + 1e-300
     known_gain = None if gain.free else gain.value
-    return _EvenLog(grid - grid[0], held, even, np.tanh(even / (3 * noise)), known_gain, float(grid[0]))
+    sign, group = np.tanh(even / (3 * noise)), (name if offset.per_log else "") if offset.free else None
+    return _EvenLog(grid - grid[0], held - offset.value, even, sign, known_gain, float(grid[0]), offset.value, group)
 
 
 def _thin_log(record: _EvenLog, most: int) -> _EvenLog:
     every = max(1, len(record.t) // max(most, 5 * MIN_FIT_SAMPLES))
     starts = np.arange(0, len(record.u), every)
     u = np.add.reduceat(record.u, starts) / np.diff(starts, append=len(record.u))
-    return _EvenLog(record.t[::every], u, record.y[::every], record.sign[::every], record.gain, record.start_time)
+    return replace(record, t=record.t[::every], u=u, y=record.y[::every], sign=record.sign[::every])
 
 
 def _trial_values(name: str, records: Sequence[_EvenLog], parameters: ParameterSet) -> Array:
@@ -557,7 +571,7 @@ def _unit_responses(shape: ResponseShape, record: _EvenLog, shaping: Sequence[fl
     t, u = record.t, record.u
     numerator, denominator = shape.polynomials(*shaping)
     b, a = _zero_order_hold_filter((numerator, denominator), float(t[1]))
-    before: Array = u[0] * (np.full(len(t), numerator[-1] / denominator[-1]) if denominator[-1] else t)
+    constant: Array = np.full(len(t), numerator[-1] / denominator[-1]) if denominator[-1] else t
     decays = np.column_stack([_apply_filter(np.ones(1), a, pulse) for pulse in np.eye(len(a) - 1, len(t))])
     free = np.linalg.qr(decays / np.abs(decays).max(axis=0))[0]
     friction = (
@@ -565,18 +579,20 @@ def _unit_responses(shape: ResponseShape, record: _EvenLog, shaping: Sequence[fl
         if shape.friction_polynomials is None
         else (_apply_filter(*_zero_order_hold_filter(shape.friction_polynomials(*shaping), float(t[1])), record.sign),)
     )
-    return _UnitResponses(before, _apply_filter(b, a, u - u[0]), friction, free)
+    return _UnitResponses(constant, _apply_filter(b, a, u - u[0]), friction, free)
 
 
 def _solve_linear_part(
     responses: Sequence[_UnitResponses], records: Sequence[_EvenLog], shaping: Sequence[float], dead: Sequence[float]
 ) -> _Fit:
-    """Least squares for the linear parameters: gain, gain times Coulomb voltage, and each log's free response."""
+    """Least squares for the linear parameters: gain, gain times Coulomb voltage and offsets, and free responses."""
     blocks, targets = [], []
+    groups = list(dict.fromkeys(r.group for r in records if r.group is not None))
     for q, r in zip(responses, records, strict=True):
-        forced = q.initial_input + np.interp(r.t - sum(dead), r.t, q.input_changes, left=0.0)
+        forced = r.u[0] * q.constant_input + np.interp(r.t - sum(dead), r.t, q.input_changes, left=0.0)
+        offsets = [-(g == r.group) * q.constant_input for g in groups]
         columns = np.column_stack(
-            [*([forced] if r.gain is None else []), *(-f for f in q.friction_responses), np.zeros(len(r.t))]
+            [*([forced] if r.gain is None else []), *(-f for f in q.friction_responses), *offsets, np.zeros(len(r.t))]
         )
         target = r.y if r.gain is None else r.y - r.gain * forced
         blocks.append(columns - q.free @ (q.free.T @ columns))
@@ -590,9 +606,13 @@ def _solve_linear_part(
     coulomb = (
         float(weights[0 if fixed_gain is not None else 1]) / gain if responses[0].friction_responses and gain else 0.0
     )
+    shifts: dict[str | None, float] = dict(
+        zip(groups, weights[len(weights) - 1 - len(groups) : -1] / (gain or 1.0), strict=True)
+    )
+    moved = tuple(float(shifts.get(r.group, 0.0)) for r in records)
     ends = np.cumsum([len(r.t) for r in records])[:-1]
     split = tuple(np.split(errors, ends))
-    return _Fit((*shaping, *dead), misfit if np.isfinite(misfit) else np.inf, gain, coulomb, split)
+    return _Fit((*shaping, *dead), misfit if np.isfinite(misfit) else np.inf, gain, coulomb, split, moved)
 
 
 def _zero_order_hold_filter(polynomials: Polynomials, step: float) -> tuple[Array, Array]:

@@ -113,8 +113,9 @@ class NormalEquations:
         if reduced is None or self.unidentifiable_parameters(reduced, keep).size:
             return None
         bread = positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])
+        found = bread if noisy_gaps else bread @ self._meat(reduced)[np.ix_(keep, keep)] @ bread
         out = np.full((len(keep), len(keep)), np.nan)
-        out[np.ix_(keep, keep)] = bread if noisy_gaps else bread @ self._meat(reduced)[np.ix_(keep, keep)] @ bread
+        out[np.ix_(keep, keep)] = (found + found.T) / 2  # rounding of the sum, which a narrow bread magnifies
         return np.asarray(out * np.outer(self.linearisation.chain, self.linearisation.chain))
 
     def _meat(self, reduced: ReducedEquations) -> Array:

@@ -74,7 +74,7 @@ def test_the_simulation_sees_a_triangles_corners(analogue: bool) -> None:
     given = loop.parameters.with_values({"pid.Kp": 0.0, "dither.amplitude": 0.4})
     t = np.arange(401) * 1e-3
     run = simulate(loop, Trajectory(t, {"reference": np.zeros(len(t))}), given)
-    gain, T = (given.value(n) for n in plant.parameters)
+    gain, T = (given.value(f"plant.{n}") for n in ("gain", "time_constant"))
     y, corners = 0.0, np.arange(-0.0125, 0.5, 0.025)
     for k, (a, b) in enumerate(pairwise(t)):
         cuts = [a, *corners[(corners > a + 1e-9) & (corners < b - 1e-9)], b]

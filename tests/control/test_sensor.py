@@ -39,7 +39,7 @@ def test_the_open_loop_has_the_sensors_pole() -> None:
     loop = first_order()
     p = loop.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 30.0})
     s, w = control.tf("s"), np.geomspace(0.1, 1e3, 30)
-    gain, T = (p.value(n) for n in p if n in loop.plant.parameters)
+    gain, T = (p.value(f"plant.{n}") for n in ("gain", "time_constant"))
     expected = gain / (T * s + 1) * (2 + 30 / s) / (LAG * s + 1)
     ours = frequency_response(open_loop(loop, p), w)
     assert ours == pytest.approx(np.array([expected(1j * v) for v in w]), rel=1e-9)
@@ -56,7 +56,7 @@ def test_the_response_is_the_plants_and_the_controller_sees_it_late(sample_time:
     p = loop.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 30.0})
     run = respond(loop, Step(1.0, horizon=0.5), p)
     s = control.tf("s")
-    gain, T = (p.value(n) for n in p if n in loop.plant.parameters)
+    gain, T = (p.value(f"plant.{n}") for n in ("gain", "time_constant"))
     plant, controller = gain / (T * s + 1), 2 + 30 / s
     closed = control.minreal(plant * controller / (1 + plant * controller / (LAG * s + 1)), verbose=False)
     expected = control.step_response(closed, run.t).outputs

@@ -19,6 +19,7 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.moves import MotionPath, Move, MoveProfile, MoveSequence
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.runnable import count_from_centre
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.limit_cycle import NoHunting
 from pneuopt.evaluation.metric import Tolerance
@@ -108,7 +109,7 @@ def written(folder: Path, text: str, name: str = "tuning.toml") -> Path:
 
 def test_reads_what_design_draws(tmp_path: Path) -> None:
     tuning = read_tuning(written(tmp_path, TUNING), PLANT)
-    assert tuning.loop.plant is PLANT
+    assert tuning.loop.plant is count_from_centre(PLANT)
     assert (tuning.loop.pid, tuning.loop.dither) == (PID(sample_time=1e-3), Dither(160.0))
     assert tuning.references == (Step(0.2, horizon=1.0), Step(-0.1, at=0.05, initial=0.2, horizon=1.0))
     assert tuning.specification.weights == {SettlingTime(0.02): 1.0, Overshoot(): 2.0}

@@ -95,6 +95,17 @@ def test_a_weakly_identifiable_stribeck_velocity_has_unequal_sides() -> None:
     assert wider.low < found.low < found.high < wider.high
 
 
+def test_a_profile_ends_at_a_bound_that_a_logarithm_there_and_back_exceeds() -> None:
+    """A refit left the bound by a rounding, and the next one, which began there, was refused."""
+    bound = next(b for b in np.linspace(0.028, 0.029, 100).tolist() if math.exp(math.log(b)) > b)
+    log, rig = moved(42.0, 16.0), MotionDrive(Stribeck(), chamber=False)
+    narrow = rig.parameters.with_values({**LEVELS, "friction.viscous": 60.0})
+    narrow = narrow.with_bounds({"friction.stribeck_velocity": (1e-3, bound)})
+    result = identify(rig.system(), [log], narrow.freed(*CURVE))
+    found = profile(rig.system(), [log], result, "friction.stribeck_velocity")
+    assert found.curve["value"].max() <= bound
+
+
 def test_a_standard_deviation_reaches_the_farther_end_of_a_profile() -> None:
     """The curvature at the peak gave one of a third on the side on which the likelihood is flat."""
     _, result = fitted(Stribeck(), moved(42.0, 16.0), *CURVE)

@@ -42,7 +42,6 @@ from pneuopt.identification.review import review_fit
 from pneuopt.identification.search import (
     cut_excerpts,
     enforce_ordering,
-    filter_states,
     fit_fixing_unidentifiable,
     fit_from_profiles,
     liveliest_part,
@@ -326,7 +325,7 @@ def test_filtered_states_fit_the_parameters() -> None:
     problem, states = posed_long_log(6.0)
     rough = problem.candidates[0]
     true = {n: b32()[1].value(n) for n in FREE}
-    filtered = filter_states(problem, replace(rough, parameters=true))
+    filtered = problem.filter_states(replace(rough, parameters=true))
     error, before = (
         np.sqrt(np.mean((each.states["run"]["speed"] - states["speed"])[100:] ** 2)) for each in (filtered, rough)
     )
@@ -335,13 +334,13 @@ def test_filtered_states_fit_the_parameters() -> None:
 
 def test_a_long_log_takes_over_the_answer_of_its_part(monkeypatch: pytest.MonkeyPatch) -> None:
     """Known from a part, the parameters leave the filter as little as a gap: with ten times that, slips were lost."""
-    deviations = list[float]()
+    deviations, filter_states = list[float](), EstimationProblem.filter_states
 
     def filtered(problem: EstimationProblem, start: Start, gathered: float) -> Start:
         deviations.append(gathered)
         return filter_states(problem, start, gathered)
 
-    monkeypatch.setattr(search, "filter_states", filtered)
+    monkeypatch.setattr(EstimationProblem, "filter_states", filtered)
     problem, _ = posed_long_log()
     made = search.Search(problem)
     assert search._is_long(made)
@@ -394,7 +393,7 @@ def spoil(problem: EstimationProblem) -> list[Start]:
 
 
 def test_prediction_errors_find_what_the_starts_miss(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines, deviations = list[str](), list[float]()
+    lines, deviations, filter_states = list[str](), list[float](), EstimationProblem.filter_states
 
     def filtered(problem: EstimationProblem, start: Start, gathered: float) -> Start:
         deviations.append(gathered)
@@ -402,7 +401,7 @@ def test_prediction_errors_find_what_the_starts_miss(monkeypatch: pytest.MonkeyP
 
     problem = replace(posed_stick_slip(Stribeck()), method=LeastSquares(progress=lines.append))
     spoilt = spoil(problem)
-    monkeypatch.setattr(search, "filter_states", filtered)
+    monkeypatch.setattr(EstimationProblem, "filter_states", filtered)
     monkeypatch.setattr(EstimationProblem, "candidates", property(lambda _: spoilt))
     made = search.Search(problem)
     assert search._can_predict(made)
@@ -418,7 +417,7 @@ def test_prediction_errors_find_what_the_starts_miss(monkeypatch: pytest.MonkeyP
 def test_a_model_that_cannot_predict_the_log_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Six seconds of filters, and the search would show only that the model is wrong."""
     problem = posed_stick_slip(Stribeck(), disturbance=40.0)
-    monkeypatch.setattr(search, "filter_states", lambda *_: pytest.fail("the search would begin"))
+    monkeypatch.setattr(EstimationProblem, "filter_states", lambda *_: pytest.fail("the search would begin"))
     assert list(search._from_predictions(search.Search(problem))) == []
 
 

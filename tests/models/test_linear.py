@@ -6,11 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
 from pneuopt.dynamics.hooks import Log
+from pneuopt.dynamics.runnable import command_centre
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.models.friction import Coulomb, LuGre
-from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder
+from pneuopt.models.linear import INPUT_OFFSET, PLANT_GAIN, FirstOrder, Integrator, Plant, SecondOrder
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
@@ -97,7 +100,7 @@ def test_derivatives_agree_with_finite_differences(plant: Plant) -> None:
     jacobian = ca.Function("jacobian", z, [ca.jacobian(rate, ca.vertcat(*z))])
     exact, point = np.array(jacobian(x, u, p)), np.concatenate([x, u, p])
     for k in range(len(point)):
-        h = 1e-6 * max(abs(point[k]), 1e-6)
+        h = 1e-6 * max(abs(point[k]), 1e-3)
         high, low = (
             np.array(system.ode(0, *np.split(point + sign * h * np.eye(len(point))[k], [len(x), len(x) + 1]))[0])
             for sign in (1, -1)
@@ -162,7 +165,7 @@ def logged(
     run = simulate(system, Trajectory(t + begin, {"valve_voltage": steps(t, levels)}), truth)
     noise = 0.005 * np.abs(run["speed"]).max() * np.random.default_rng(seed).normal(size=len(t))
     channels = {"valve_voltage": steps(t, levels), "speed": run["speed"] + noise}
-    return Log(Trajectory(t + begin, channels), system.parameters.freed("plant.*"))
+    return Log(Trajectory(t + begin, channels), system.parameters.freed(*(n for n in values if n.startswith("plant."))))
 
 
 SECOND = {"plant.gain": -0.12, "plant.natural_frequency": 22.0, "plant.damping": 0.35}
@@ -244,3 +247,44 @@ def test_a_dead_time_may_have_a_lower_bound_of_zero(dead: float) -> None:
     starts = system.starts({"run": Log(log.measured.with_columns({"speed": late}), free)})
     assert all(start.parameters["plant.dead_time"] > 0 for start in starts)
     assert starts[0].parameters["plant.dead_time"] == pytest.approx(dead, abs=2e-3)
+
+
+@pytest.mark.parametrize(("plant", "values"), CASES)
+def test_the_first_candidate_finds_where_the_input_counts_from(plant: Plant, values: dict[str, float]) -> None:
+    """A constant on the output is one on the input: the log of this one counts both from elsewhere."""
+    system = plant.system()
+    log = logged(system, values | {INPUT_OFFSET: 1.5}, (2.0, 3.5, 0.5, 2.5))
+    shown = 0.0 if isinstance(plant, Integrator) else 0.4
+    measured = log.measured.with_columns({"speed": log.measured["speed"] + shown})
+    first = system.starts({"run": Log(measured, log.parameters.freed(INPUT_OFFSET))})[0]
+    truth = values | {INPUT_OFFSET: 1.5 - shown / values[PLANT_GAIN]}
+    for name, value in truth.items():
+        assert first.parameters[name] == pytest.approx(value, rel=0.06 if name == "plant.dead_time" else 0.03), name
+    error = first.states["run"]["speed"] - measured["speed"]
+    assert np.std(error) < 0.012 * np.abs(measured["speed"]).max()
+
+
+def test_each_log_may_count_from_elsewhere_and_a_known_offset_stays() -> None:
+    system = SecondOrder().system()
+    zeros = {"a": 1.0, "b": -0.5, "known": 2.0}
+    logs = {n: logged(system, SECOND | {INPUT_OFFSET: zero}, (0.0, 2.0, -1.0)) for n, zero in zeros.items()}
+    own = logs["a"].parameters.freed(INPUT_OFFSET).per_log(INPUT_OFFSET)
+    logs = {n: Log(log.measured, own) for n, log in logs.items()}
+    logs["known"] = Log(logs["known"].measured, own.with_values({INPUT_OFFSET: 2.0}).fixed(INPUT_OFFSET))
+    first = system.starts(logs)[0]
+    assert first.parameters["plant.gain"] == pytest.approx(SECOND["plant.gain"], rel=0.02)
+    assert first.parameters[f"{INPUT_OFFSET}[a]"] == pytest.approx(1.0, abs=0.02)
+    assert first.parameters[f"{INPUT_OFFSET}[b]"] == pytest.approx(-0.5, abs=0.02)
+    assert {INPUT_OFFSET, f"{INPUT_OFFSET}[known]"}.isdisjoint(first.parameters)
+
+
+def test_a_loop_counts_its_command_from_the_offset() -> None:
+    """As from a valve's centre: what the wire carries at rest is no disturbance of the loop."""
+    system = FirstOrder().system()
+    at = system.parameters.with_values({INPUT_OFFSET: 3.0})
+    assert command_centre(system, at) == 3.0
+    loop = ClosedLoop(system, PID())
+    rest = loop.plant.linearise(np.zeros(1), {}, at)
+    assert loop.plant.equilibrium({"valve_voltage": 0.0}, at) == pytest.approx([0.0])
+    assert system.equilibrium({"valve_voltage": 3.0}, at) == pytest.approx([0.0])
+    assert pytest.approx(system.linearise(np.zeros(1), {}, at).A) == rest.A

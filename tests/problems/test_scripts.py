@@ -11,6 +11,8 @@ from problems.identify import (
     b32,
     b32_partial,
     bootstrap_bias,
+    buck,
+    cascaded_tanks,
     emps,
     forecast_band,
     foreign_rig,
@@ -29,6 +31,18 @@ measured = pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no measured logs i
 
 def failed(rows: pd.DataFrame) -> list[str]:
     return [str(r) for r in rows.loc[~rows["holds"].astype(bool), "name"]]
+
+
+@measured
+@pytest.mark.slow
+def test_cascaded_tanks() -> None:
+    assert failed(cascaded_tanks.main(DATASETS / "cascaded_tanks" / "dataBenchmark.csv")) == []
+
+
+@measured
+@pytest.mark.slow
+def test_buck() -> None:
+    assert failed(buck.main(DATASETS / "buck")) == []
 
 
 @measured
