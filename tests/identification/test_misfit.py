@@ -225,7 +225,8 @@ def test_far_beyond_the_noise_there_is_a_bound_of_the_bias_and_no_interval(tmp_p
 def test_few_degrees_of_freedom_reach_profiles() -> None:
     logs, result = scattered(29.0, 30.0, 31.0)
     found, row = profile(DRIVE.system(), logs, result, "friction.coulomb"), result.estimates.loc["friction.coulomb"]
-    half = t_quantile(float(row["dof"])) * row["stderr"]
+    dof, stderr = (float(result.estimates[n]["friction.coulomb"]) for n in ("dof", "stderr"))
+    half = t_quantile(dof) * stderr
     assert found.low == pytest.approx(row["value"] - half, rel=0.02)
     assert found.high == pytest.approx(row["value"] + half, rel=0.02)
 
