@@ -8,7 +8,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -196,11 +196,11 @@ def segment(transcription: Transcription) -> Segments:
     for i, phase in enumerate(transcription.phases[1:], 1):
         linked[np.flatnonzero(index == i)[0] - 1] = phase.follows
     nodes = np.concatenate([phase.nodes for phase in transcription.phases])
-    heads = np.flatnonzero(np.append(True, ~linked[:-1]))
+    heads, observable = np.flatnonzero(np.append(True, ~linked[:-1])), cache(partial(_observable_states, system))
     for head, stop in zip(heads, [*heads[1:], len(index)], strict=True):  # states that no log shows keep their guess
         guess = transcription.phases[index[head]].guess
-        outputs = {o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs}
-        idle = ~_observable_states(system, outputs) & np.isnan(start[head])
+        outputs = frozenset(o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs)
+        idle = ~observable(outputs) & np.isnan(start[head])
         start[head, idle] = 0.0 if guess is None else guess[nodes[head], idle]
     return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
 
@@ -232,7 +232,7 @@ def _cut_phase(
     )
 
 
-def _observable_states(system: DiscreteSystem, outputs: set[str]) -> Mask:
+def _observable_states(system: DiscreteSystem, outputs: frozenset[str]) -> Mask:
     """The states on which these outputs depend, directly or through other states' rates. Shape (n_states,)."""
     if system.update is not None or not system.states:
         return np.ones(len(system.states), dtype=bool)
