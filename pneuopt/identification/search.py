@@ -38,7 +38,13 @@ from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.identifiability import rejects_fixed_values, verdict_from_sensitivities
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
-from pneuopt.identification.misfit import cluster_segments, jackknife
+from pneuopt.identification.misfit import (
+    cluster_segments,
+    degrees_of_freedom,
+    diagnose_misfit,
+    jackknife,
+    t_quantile,
+)
 from pneuopt.identification.problem import EstimationProblem, outputs_in_log, window_runs
 from pneuopt.identification.profiles import Profile
 from pneuopt.identification.result import ChosenWindow, IdentificationResult, Mark, TrailRow
@@ -60,6 +66,7 @@ from pneuopt.identification.tolerances import (
     MAX_STAGES,
     MIN_DOUBTED,
     MIN_EXCESS,
+    MIN_KNOWN_SHARE,
     MIN_LENGTH_RATIO,
     MIN_WINDOW_SAMPLES,
     MIN_WINDOWS,
@@ -702,6 +709,8 @@ def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
     if not found:
         return None
     best = found[-1] if len(found) == 1 or trials[-1].fit.status.code is Code.INTERRUPTED else _choose(found)
+    if not best.is_answer:
+        return None
     window = ChosenWindow(best.length, lengths[0], lengths[-1], fit.stats["gap_share"])
     return best.problem, best.fit.with_effort_of(fit), window
 
@@ -729,6 +738,18 @@ class _WindowTrial(NamedTuple):
     length: float
     problem: EstimationProblem
     fit: Fit
+
+    @property
+    def is_answer(self) -> bool:
+        """Whether it tells most parameters better than their own size."""
+        freedom, free = degrees_of_freedom(self.problem, self.fit), self.fit.parameters.free_names
+        misfit = diagnose_misfit(self.problem, self.fit, self.fit.chi_square / freedom, freedom)
+        if misfit.covariance is None:
+            return not free
+        variances = np.diag(misfit.covariance)
+        halves = t_quantile(misfit.dof) * np.sqrt(np.maximum(variances, 0.0))
+        sizes = np.abs([self.fit.parameters.value(n) for n in free])
+        return not free or float(np.mean((variances > 0) & (halves < sizes))) > MIN_KNOWN_SHARE
 
     def predict(self, horizons: Sequence[float]) -> Array:
         """Squared errors over each horizon (n_horizons, K) of each part of the logs, by the estimates without it.

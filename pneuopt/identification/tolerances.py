@@ -160,4 +160,5 @@ WIDTH_RANGE = 30.0  # [1] start of a width over its least: less keeps friction f
 # Windows
 
 MIN_WINDOWS = 12  # of all logs
+MIN_KNOWN_SHARE = 0.5  # [1] of the parameters that windows must determine to better than their own size
 WINDOW_FACTOR = 4.0  # [1] from one length to the next
