@@ -110,7 +110,7 @@ def identify(
         Take each channel's noise from its residuals, whatever the logs declare.
     window : float, optional
         Cut the logs into windows of this time [s], each with a start state of its own; by default only where the model
-        does not follow whole logs, and of the length with the narrowest intervals (`result.window`); math.inf: never.
+        does not follow whole logs, and as long as those that predict best (`result.window`); math.inf: never.
     accept : sequence of str
         Checks that the logs need not pass, for they are right: "motion", "speed", "work", "command", "scale", "jumps",
         "stops", "mass", "pressures". What these find stands in the status.

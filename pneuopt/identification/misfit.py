@@ -132,9 +132,11 @@ def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: 
     if fit.optimum is None or scores is None or white is None:
         return Misfit(white, np.full(k, dof), 1.0, *size)
     keep = np.flatnonzero(fit.optimum.keep)
-    blocks = _clusters(scores, _split_in_time(fit.optimum.equations.segments, TIME_BLOCKS), simulate=fit.jumps is None)
+    blocks = cluster_segments(
+        scores, _split_in_time(fit.optimum.equations.segments, TIME_BLOCKS), simulate=fit.jumps is None
+    )
     signals = _signals_behind_residuals(scores, names((*problem.system.states, *problem.system.inputs)))
-    classes = [_clusters(scores, _classes(signals[0].values, of_size=True))] if signals else []
+    classes = [cluster_segments(scores, _classes(signals[0].values, of_size=True))] if signals else []
     square = np.ix_(keep, keep)
     found = robust_covariance(blocks, white[square], variance * fit.variance_inflation, dof, classes=classes)
     covariance, degrees = white.copy(), np.full(k, dof)
@@ -428,7 +430,7 @@ def _split_in_time(segments: Segments, count: int) -> Indices:
     return np.concatenate(groups)
 
 
-def _clusters(scores: FitScores, groups: Indices, *, simulate: bool = False) -> Clusters:
+def cluster_segments(scores: FitScores, groups: Indices, *, simulate: bool = False) -> Clusters:
     """The clusters of groups of segments, with what chance does if asked for."""
     first = np.unique(groups, return_index=True)[1]
     sums = np.zeros((len(first), scores.scores.shape[1]))

@@ -18,9 +18,11 @@ worth is measured by problems/identify/ablation.py.
 
 `fit_in_windows`: a plant that integrates adds up whatever its model misses: the position runs away from the log, and
 the gaps of a fit that links its segments take the misfit in their place. In windows with a start state each the model
-runs freely for a limited time only. Short windows show little of slow terms, long ones gather what the model misses;
-the length is that with the narrowest intervals among those that agree with all shorter ones (the rule of Lepski, Theory
-of Probability and its Applications 35(3), 1991; problems/identify/windows.py holds its estimates to the truth).
+runs freely for a limited time only. Long windows gather what the model misses, short ones show little of slow terms:
+the estimates of each length predict the parts of the logs that they have not seen, over horizons of all lengths
+(cross-validation, by the jackknife's estimates without a part), and the longest within one standard error of the best
+is taken, as Breiman et al. (Classification and Regression Trees, 1984) choose the simplest.
+problems/identify/windows.py holds its estimates to the truth.
 """
 
 import math
@@ -36,8 +38,14 @@ from pneuopt.dynamics.compiled.rollout import check_during_runs
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.identifiability import rejects_fixed_values, verdict_from_sensitivities
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
-from pneuopt.identification.misfit import Misfit, degrees_of_freedom, diagnose_misfit, t_quantile
-from pneuopt.identification.problem import EstimationProblem, outputs_in_log
+from pneuopt.identification.misfit import (
+    cluster_segments,
+    degrees_of_freedom,
+    diagnose_misfit,
+    jackknife,
+    t_quantile,
+)
+from pneuopt.identification.problem import EstimationProblem, outputs_in_log, window_runs
 from pneuopt.identification.profiles import Profile
 from pneuopt.identification.result import ChosenWindow, IdentificationResult, Mark, TrailRow
 from pneuopt.identification.tolerances import (
@@ -66,16 +74,15 @@ from pneuopt.identification.tolerances import (
     REFIT_STAGES,
     SAME_COST_RATIO,
     WINDOW_FACTOR,
-    WINDOW_ITERATIONS,
 )
 from pneuopt.identification.widths import estimated_widths
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.equations import ParameterScaling
-from pneuopt.shooting.filters import PredictionErrors
-from pneuopt.shooting.least_squares import Fit, SearchEnd, close_gaps, solve_least_squares
+from pneuopt.shooting.equations import NormalEquations, ParameterScaling, normal_equations
+from pneuopt.shooting.filters import PredictionErrors, fit_scores
+from pneuopt.shooting.least_squares import Fit, Optimum, SearchEnd, close_gaps, solve_least_squares
 from pneuopt.shooting.segments import Segments, choose_integration, segment, start_nodes
 from pneuopt.shooting.tolerances import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
 
@@ -677,23 +684,24 @@ def check_window(problem: EstimationProblem) -> None:
 
 
 def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
-    """The fit in windows of the length with the narrowest intervals; None unless whole logs failed by their gaps."""
+    """The fit in the longest windows that predict as well as any; None unless whole logs failed by their gaps."""
     absorbed = fit.stats["gap_share"] > MAX_GAP_SHARE and math.isfinite(fit.stats["cost"])
     can_cut = not problem.is_whole and bool(problem.system.states) and problem.system.motion().sample_time is None
     if not (fit.status.code is Code.NOT_CONVERGED and absorbed and can_cut):
         return None
     lengths = [problem.window] if math.isfinite(problem.window) else _lengths(problem)
-    trials, start, iterations = list[_WindowTrial](), problem.start_from(fit), 2 * WINDOW_ITERATIONS
+    trials, start = list[_WindowTrial](), problem.start_from(fit)
     for length in reversed(lengths):
-        trials.append(_try_length(problem, start, length, iterations))
+        trials.append(_try_length(problem, start, length))
         if trials[-1].fit.status.code is Code.INTERRUPTED:
             break
-        start, iterations = trials[-1].problem.start_from(trials[-1].fit), WINDOW_ITERATIONS
-    found = [trial for trial in trials if trial.is_answer]
+        start = trials[-1].problem.start_from(trials[-1].fit)
+    found = [trial for trial in trials if trial.fit.status.converged]
     if not found:
         return None
-    agreeing = [trial for trial in found if all(trial.agrees(other) for other in found if other.length < trial.length)]
-    best = min(agreeing, key=lambda trial: trial.rank)
+    best = found[-1] if len(found) == 1 or trials[-1].fit.status.code is Code.INTERRUPTED else _choose(found)
+    if not best.is_answer:
+        return None
     window = ChosenWindow(best.length, lengths[0], lengths[-1], fit.stats["gap_share"])
     return best.problem, best.fit.with_effort_of(fit), window
 
@@ -721,41 +729,83 @@ class _WindowTrial(NamedTuple):
     length: float
     problem: EstimationProblem
     fit: Fit
-    misfit: Misfit
-
-    @property
-    def rank(self) -> tuple[int, bool, float]:
-        """Parameters without a variance, whether residuals are too large for intervals, and the mean log of these."""
-        if self.misfit.covariance is None:
-            return len(self.fit.parameters.free_names), True, math.inf
-        half_widths = self.half_widths[np.isfinite(self.half_widths)]
-        unknown = len(self.half_widths) - len(half_widths)
-        return unknown, self.misfit.is_excessive, float(np.log(half_widths).sum())
-
-    @property
-    def half_widths(self) -> Array:
-        """Half of each interval, infinite where a parameter has no variance, shape (k,)."""
-        if self.misfit.covariance is None:
-            return np.full(len(self.fit.parameters.free_names), np.inf)
-        variances = np.diag(self.misfit.covariance)
-        widths = t_quantile(self.misfit.dof) * np.sqrt(np.maximum(variances, 0.0))
-        return np.where(variances > 0, widths, np.inf)
 
     @property
     def is_answer(self) -> bool:
-        """Whether it is an optimum that tells most parameters better than their own size."""
-        sizes = np.abs([self.fit.parameters.value(n) for n in self.fit.parameters.free_names])
-        known = float(np.mean(self.half_widths < sizes)) if sizes.size else 1.0
-        return self.fit.status.converged and known > MIN_KNOWN_SHARE
+        """Whether it tells most parameters better than their own size."""
+        freedom, free = degrees_of_freedom(self.problem, self.fit), self.fit.parameters.free_names
+        misfit = diagnose_misfit(self.problem, self.fit, self.fit.chi_square / freedom, freedom)
+        if misfit.covariance is None:
+            return not free
+        variances = np.diag(misfit.covariance)
+        halves = t_quantile(misfit.dof) * np.sqrt(np.maximum(variances, 0.0))
+        sizes = np.abs([self.fit.parameters.value(n) for n in free])
+        return not free or float(np.mean((variances > 0) & (halves < sizes))) > MIN_KNOWN_SHARE
 
-    def agrees(self, shorter: "_WindowTrial") -> bool:
-        """Whether its estimates agree with those of shorter windows, in which the model's errors add up less."""
-        names = [n for n in self.fit.parameters.free_names if n in shorter.fit.parameters.free_names]
-        apart = np.abs([self.fit.parameters.value(n) - shorter.fit.parameters.value(n) for n in names])
-        free, others = self.fit.parameters.free_names, shorter.fit.parameters.free_names
-        own, other = self.half_widths, shorter.half_widths
-        widths = [own[free.index(n)] + other[others.index(n)] for n in names]
-        return bool(np.all(apart <= np.array(widths)))
+    def predict(self, horizons: Sequence[float]) -> Array:
+        """Squared errors over each horizon (n_horizons, K) of each part of the logs, by the estimates without it.
+
+        To first order; a part is as long as the longest horizon. Infinite where the logs leave a parameter open.
+        """
+        optimum, errors, longest = self.fit.optimum, list[Array](), max(horizons)
+        scores = optimum and fit_scores(optimum)
+        if not (optimum and scores):
+            return np.full((len(horizons), 1), math.inf)
+        without = jackknife(cluster_segments(scores, self._parts(optimum, longest))).changes
+        for horizon in horizons:
+            seen = optimum if horizon == self.length else replace(optimum, equations=self._linearise(horizon, optimum))
+            reduced = seen.equations.arrow.eliminate(0.0) if math.isfinite(seen.equations.cost) else None
+            found, parts = reduced and fit_scores(seen), self._parts(seen, longest)
+            if not (found and reduced):
+                return np.full((len(horizons), 1), math.inf)
+            own = cluster_segments(found, parts)
+            start = seen.equations.arrow.node_gradient * reduced.nodes  # what the start states can still explain
+            squares = np.bincount(parts, seen.equations.linearisation.squares.sum(axis=1) + start.sum(axis=1))
+            changed = np.einsum("gi,gi->g", 2 * own.scores + np.einsum("gij,gj->gi", own.information, without), without)
+            errors.append(squares + changed)
+        return np.array(errors)
+
+    def _linearise(self, horizon: float, optimum: Optimum) -> NormalEquations:
+        """The equations of windows of another length at these estimates, one step of the start states from this fit."""
+        cut = replace(self.problem, window=horizon, method=replace(self.problem.method, segment_time=horizon))
+        segments = segment(cut.transcription(cut.start_from(self.fit)))
+        scaling, nodes = ParameterScaling(segments.transcription), start_nodes(segments)
+        q, rest = scaling.values(scaling.start), (scaling.chain(scaling.start), optimum.gap_deviations)
+        segments, substeps = choose_integration(segments, nodes, q, int(self.fit.stats["substeps"]))
+        with np.errstate(all="ignore"):
+            first = normal_equations(segments, nodes, q, *rest, substeps)
+            step = first.arrow.eliminate(0.0)
+            return (
+                first
+                if step is None
+                else normal_equations(segments, nodes + step.nodes * segments.nominal, q, *rest, substeps)
+            )
+
+    def _parts(self, optimum: Optimum, length: float) -> Indices:
+        """The part of the logs, a window of a length, in which each segment begins, shape (m,)."""
+        segments, found, count = optimum.equations.segments, list[Indices](), 0
+        for phase, log in enumerate(self.problem.experiments):
+            begins = log.trajectory.t[[begin for begin, _ in window_runs(log, length)]]
+            found.append(count - 1 + np.searchsorted(begins, segments.t[segments.phase == phase, 0], "right"))
+            count += len(begins)
+        return np.concatenate(found)
+
+
+def _choose(trials: Sequence[_WindowTrial]) -> _WindowTrial:
+    """The longest windows, of these from the longest on, that predict within one standard error of the best.
+
+    Errors over all horizons count alike, by the logarithms of their sums.
+    """
+    errors = [trial.predict([trial.length for trial in trials]) for trial in trials]
+    levels = [float(np.log(each.sum(axis=1)).sum()) for each in errors]
+    best = int(np.argmin(levels))
+    for trial, each, level in zip(trials, errors, levels, strict=True):
+        if math.isfinite(level):
+            shares = each / each.sum(axis=1, keepdims=True) - errors[best] / errors[best].sum(axis=1, keepdims=True)
+            parts = shares.sum(axis=0)  # they sum to zero
+            if level - levels[best] <= math.sqrt(parts.size) * float(np.std(parts, ddof=1)):
+                return trial
+    return trials[-1]
 
 
 def _lengths(problem: EstimationProblem) -> list[float]:
@@ -765,16 +815,15 @@ def _lengths(problem: EstimationProblem) -> list[float]:
         known = np.isfinite(e.trajectory.matrix(outputs_in_log(problem.system, e))).any(axis=1)
         shortest = max(shortest, MIN_WINDOW_SAMPLES * e.trajectory.duration / max(1, int(known.sum())))
         total += e.trajectory.duration
-    count = max(1, 1 + math.floor(math.log(max(1.0, total / MIN_WINDOWS / shortest), WINDOW_FACTOR)))
-    return [shortest * WINDOW_FACTOR**k for k in range(count)]
+    longest = max(shortest, total / MIN_WINDOWS)
+    count = 1 + math.ceil(math.log(longest / shortest) / math.log(WINDOW_FACTOR))
+    return [float(length) for length in np.geomspace(shortest, longest, count)]
 
 
-def _try_length(problem: EstimationProblem, start: Start, length: float, iterations: int) -> _WindowTrial:
-    """The fit in windows of one length, a segment each, with the diagnosis of its residuals."""
+def _try_length(problem: EstimationProblem, start: Start, length: float) -> _WindowTrial:
+    """The fit in windows of one length, a segment each."""
     # without gaps all stages are alike; steps are refined where the search has converged
-    last = replace(problem.method.stages[-1], iterations=iterations, refine=1)
+    last = replace(problem.method.stages[-1], refine=1)
     cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=(last,)))
     held, found = fit_fixing_unidentifiable(cut, start)
-    held = replace(held, method=replace(held.method, stages=problem.method.stages))
-    freedom = degrees_of_freedom(held, found)
-    return _WindowTrial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))
+    return _WindowTrial(length, replace(held, method=replace(held.method, stages=problem.method.stages)), found)

@@ -31,7 +31,6 @@ from pneuopt.identification.tolerances import (
     HOPELESS_RATIO,
     LEADER_RATIO,
     MAX_HELD_OUT_RATIO,
-    MAX_TRIALS,
     MIN_WINDOW_SAMPLES,
     NESTED_TEST_LEVEL,
     TIE,
@@ -220,7 +219,7 @@ def try_candidate(
     known: Trial | None = None,
     allowed: Sequence[float] = (),
 ) -> Trial:
-    """Search shortly from a model's first starts, and from `near`, a fit with another model of the same states.
+    """Search shortly from a model's first start, and from `near`, a fit with another model of the same states.
 
     A start is left where its squares exceed those `allowed` after a stage; `known` is the first start's trial.
     """
@@ -229,7 +228,7 @@ def try_candidate(
         problem = replace(pose_problem(system, experiments, parameters, method), window=window)
     candidates, best = problem.candidates, known or Trial()
     others = [problem.start_from(near)] if near and candidates[0].trial_parameters else []
-    for start in itertools.chain(others, itertools.islice(candidates, 1 if known else 0, MAX_TRIALS)):
+    for start in others if known else [*others, candidates[0]]:
         best = best.better(_try_start(problem, start, allowed))
         if not (allowed and best.is_hopeless):
             break

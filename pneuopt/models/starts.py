@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.signal import savgol_filter
 
 from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.logs.tolerances import MAX_REGRESSION_ROWS
@@ -86,6 +85,12 @@ class RegressionRows:
     columns: Mapping[str, Array]
     states: Mapping[str, Array]
 
+    def thin(self, every: int) -> "RegressionRows":
+        """The rows, thinned to one of so many."""
+        measured = Trajectory(self.measured.t[::every], {n: self.measured[n][::every] for n in self.measured})
+        columns, states = ({n: c[::every] for n, c in part.items()} for part in (self.columns, self.states))
+        return RegressionRows(measured, self.parameters, self.speed[::every], self.force[::every], columns, states)
+
 
 def friction_candidates(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> Sequence[Start]:
     """Starts from the rows of all logs, one for each set of values of the parameters that the law scans."""
@@ -110,16 +115,9 @@ def friction_candidates(friction: FrictionModel, logs: Mapping[str, RegressionRo
 
 def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:
     """Mean absolute force in sliding samples that friction does not explain [N]; of long logs, some samples tell."""
-    thinned = {}
-    for name, rows in logs.items():
-        every = slice(None, None, max(1, len(rows.measured) // MAX_REGRESSION_ROWS))
-        measured = Trajectory(rows.measured.t[every], {n: rows.measured[n][every] for n in rows.measured})
-        columns, states = ({n: c[every] for n, c in part.items()} for part in (rows.columns, rows.states))
-        speed, force = rows.speed[every], rows.force[every]
-        thinned[name] = RegressionRows(measured, rows.parameters, speed, force, columns, states)
-    if not all(np.isfinite(rows.force).all() for rows in thinned.values()):
+    if not all(np.isfinite(rows.force).all() for rows in logs.values()):
         return math.inf
-    return _unexplained_force(friction, thinned)[0]
+    return _unexplained_force(friction, logs)[0]
 
 
 def choose_filter_time(friction: FrictionModel, balances: Callable[[float], Mapping[str, RegressionRows]]) -> float:
@@ -140,10 +138,15 @@ def choose_filter_time(friction: FrictionModel, balances: Callable[[float], Mapp
 
 
 def _unexplained_force(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> tuple[float, float]:
-    """Mean absolute force that friction does not explain by the first values that are tried, and that of all [N]."""
+    """Mean absolute force that friction does not explain by the first values that are tried, and that of all [N].
+
+    Of long logs, some samples tell.
+    """
+    total = sum(len(rows.measured) for rows in logs.values())
+    thinned = {n: rows.thin(max(1, total // MAX_REGRESSION_ROWS)) for n, rows in logs.items()}
     parameters = next(iter(logs.values())).parameters
     tried = {name: values[0] for name, values in friction.start.scanned.items()}
-    _, unexplained, force = _regress(friction, logs, parameters, tried)
+    _, unexplained, force = _regress(friction, thinned, parameters, tried)
     return float(np.mean(np.abs(unexplained))), float(np.mean(np.abs(force)))
 
 
@@ -357,5 +360,21 @@ def filter_channel(measured: Trajectory, name: str, derivative: int, window: flo
         return np.interp(measured.t, grid, filter_channel(even, name, derivative, window))
     samples = max(5, 2 * round(window / step / 2) + 1)
     samples = min(samples, (len(measured) - 1) // 2 * 2 + 1)
-    column = measured.fill_gaps(name)
-    return np.asarray(savgol_filter(column, samples, min(3, samples - 1), deriv=derivative, delta=step))
+    return smooth(measured.fill_gaps(name), samples, derivative) / step**derivative
+
+
+def smooth(column: Array, samples: int, derivative: int) -> Array:
+    """Derivative, by the sample, of cubics through an odd number of samples (Savitzky, Golay, Anal. Chem. 36, 1964)."""
+    cubic, half = _cubic(samples)[derivative:], samples // 2
+    powers = np.arange(len(cubic))
+    factors = np.array([math.perm(int(k) + derivative, derivative) for k in powers]) / half**derivative
+    basis = factors * ((np.arange(samples) - half) / half)[:, None] ** powers
+    begin, end = basis[:half] @ (cubic @ column[:samples]), basis[half + 1 :] @ (cubic @ column[-samples:])
+    return np.concatenate([begin, np.convolve(column, (basis[half] @ cubic)[::-1], "valid"), end])
+
+
+@functools.lru_cache(maxsize=64)
+def _cubic(samples: int) -> Array:
+    """What each of an odd number of samples, from -1 to 1, adds to a cubic's coefficients, shape (4, samples)."""
+    half = samples // 2
+    return np.asarray(np.linalg.pinv(np.vander((np.arange(samples) - half) / half, min(4, samples), increasing=True)))

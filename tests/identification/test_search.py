@@ -31,6 +31,7 @@ from pneuopt.identification import identify as identification
 from pneuopt.identification import search
 from pneuopt.identification import search as windows
 from pneuopt.identification.forecast import predict, validate
+from pneuopt.identification.identifiability import pose_problem
 from pneuopt.identification.identify import identify
 from pneuopt.identification.losses import Huber
 from pneuopt.identification.misfit import t_quantile
@@ -882,22 +883,23 @@ def missed_by_gaps() -> tuple[Mock, Mock]:
     return problem, whole
 
 
-@pytest.mark.parametrize(("bias", "chosen"), [(0.5, 0.4), (3.0, 0.2)])
-def test_longer_windows_are_chosen_only_if_shorter_ones_agree(
-    bias: float, chosen: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("better", "chosen"), [(0.01, 0.4), (0.2, 0.1)])
+def test_shorter_windows_are_chosen_only_if_they_predict_better_than_by_chance(
+    better: float, chosen: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Narrow intervals of long windows, in which a model's errors add up, have held no truth."""
+    """The narrowest interval says nothing of what a wrong model predicts."""
     problem, whole = missed_by_gaps()
-    tried = list[float]()
+    tried, scatter = list[float](), np.random.default_rng(0).uniform(0.9, 1.1, (3, 16))
 
-    def trial(_: EstimationProblem, start: object, length: float, __: int) -> Mock:
+    def trial(_: EstimationProblem, start: object, length: float) -> Mock:
         tried.append(length)
         assert start is (problem.start_from.return_value if length == 0.4 else "warm")
-        value, width = (10.0 + bias, 1.0) if length == 0.4 else (10.0, 1.0 + (0.4 - length))
-        parameters = ParameterSet({"gain": Parameter(value, "1", free=True)})
-        own = Mock(length=length, is_answer=True, rank=(0, False, math.log(width)), half_widths=np.array([width]))
-        own.fit.parameters, own.problem.start_from.return_value = parameters, "warm"
-        own.agrees = lambda other: windows._WindowTrial.agrees(own, other)
+        own = Mock(length=length)
+        own.problem.start_from.return_value, own.fit.status.code = "warm", Code.CONVERGED
+        order = [0.4, 0.2, 0.1].index(length)
+        own.predict.return_value = np.outer(
+            [1e4, 1e2, 1.0], scatter[order] / scatter[order].mean() * (1 - better * order)
+        )
         return own
 
     monkeypatch.setattr(windows, "_lengths", lambda _: [0.1, 0.2, 0.4])
@@ -908,12 +910,30 @@ def test_longer_windows_are_chosen_only_if_shorter_ones_agree(
     assert tried == [0.4, 0.2, 0.1]  # each begins with the answer of the one before
 
 
+@pytest.mark.parametrize("horizon", [0.2, 2.0])
+def test_parts_are_predicted_as_by_a_fit_without_them(horizon: float) -> None:
+    log, truth = linear_log(FirstOrder())
+    free = truth.freed("plant.*")
+    problem = pose_problem(FirstOrder().system(), [log], free, LeastSquares())
+    trial = windows._try_length(problem, problem.candidates[0], 0.2)
+    found = trial.predict([2.0, horizon])[1]
+    speed, part = log.trajectory["speed"].copy(), log.trajectory.t < 2.0
+    speed[part] = math.nan
+    without = replace(log, trajectory=log.trajectory.with_columns({"speed": speed}))
+    refit = identify(FirstOrder().system(), without, free, window=0.2)
+    residual = log.trajectory["speed"] - predict(FirstOrder().system(), log, refit.parameters, window=horizon)["speed"]
+    assert found.shape == (15,)
+    assert found[0] == pytest.approx(np.sum((residual[part] / 0.02) ** 2), rel=0.01)
+    assert found.sum() > trial.fit.chi_square or horizon != 0.2
+
+
 def test_a_budget_that_ends_in_one_length_leaves_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     tried = list[float]()
 
-    def trial(_: EstimationProblem, __: object, length: float, ___: int) -> Mock:
+    def trial(_: EstimationProblem, __: object, length: float) -> Mock:
         tried.append(length)
-        own = Mock(length=length, is_answer=length == 0.4, rank=(0, False, 0.0))
+        own = Mock(length=length)
+        own.fit.status.converged = length == 0.4
         own.fit.status.code = Code.CONVERGED if length == 0.4 else Code.INTERRUPTED
         return own
 
