@@ -214,6 +214,7 @@ class Spread(NamedTuple):
 
     covariance: Array
     dof: Array  # Bell and McCaffrey's degrees of freedom of each variance
+    changes: Array  # what each cluster adds to the estimates, by which the covariance is made
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +267,7 @@ def jackknife(clusters: Clusters) -> Spread:
     """CR3: the variance by the changes when one cluster is left out (Bell and McCaffrey 2002, without recentring)."""
     K = clusters.count
     found = _spread(clusters, lambda own: 1 / (1 + LEFT_OUT_REGULARISATION - own))
-    return Spread((K - 1) / K * found.covariance, found.dof)
+    return Spread((K - 1) / K * found.covariance, found.dof, found.changes)
 
 
 def between_clusters(clusters: Clusters) -> Spread:
@@ -316,7 +317,7 @@ def _spread(clusters: Clusters, weigh: Callable[[Array], Array]) -> Spread:
     maps = np.einsum("gij,gj,gkj->gik", vectors, weigh(values), vectors)
     changes = np.einsum("gij,gj->gi", maps, clusters.scores @ scale.T) @ scale
     dof = np.array([_degrees_of_freedom(maps @ column, own) for column in scale.T])
-    return Spread(changes.T @ changes, dof)
+    return Spread(changes.T @ changes, dof, changes)
 
 
 def _degrees_of_freedom(directions: Array, own: Array) -> float:
