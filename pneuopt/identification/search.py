@@ -797,7 +797,8 @@ def _choose(trials: Sequence[_WindowTrial]) -> _WindowTrial:
     Errors over all horizons count alike, by the logarithms of their sums.
     """
     errors = [trial.predict([trial.length for trial in trials]) for trial in trials]
-    levels = [float(np.log(each.sum(axis=1)).sum()) for each in errors]
+    sums = [each.sum(axis=1) for each in errors]  # not positive where first order is no guide
+    levels = [float(np.log(np.where(each > 0, each, math.inf)).sum()) for each in sums]
     best = int(np.argmin(levels))
     for trial, each, level in zip(trials, errors, levels, strict=True):
         if math.isfinite(level):
