@@ -74,6 +74,7 @@ from pneuopt.identification.tolerances import (
     REFIT_STAGES,
     SAME_COST_RATIO,
     WINDOW_FACTOR,
+    WINDOW_ITERATIONS,
 )
 from pneuopt.identification.widths import estimated_widths
 from pneuopt.quantities.arrays import Array, Indices
@@ -690,20 +691,20 @@ def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
     if not (fit.status.code is Code.NOT_CONVERGED and absorbed and can_cut):
         return None
     lengths = [problem.window] if math.isfinite(problem.window) else _lengths(problem)
-    trials, start = list[_WindowTrial](), problem.start_from(fit)
+    trials, start, iterations = list[_WindowTrial](), problem.start_from(fit), 2 * WINDOW_ITERATIONS
     for length in reversed(lengths):
-        trials.append(_try_length(problem, start, length))
+        trials.append(_try_length(problem, start, length, iterations))
         if trials[-1].fit.status.code is Code.INTERRUPTED:
             break
-        start = trials[-1].problem.start_from(trials[-1].fit)
+        start, iterations = trials[-1].problem.start_from(trials[-1].fit), WINDOW_ITERATIONS
     found = [trial for trial in trials if trial.fit.status.converged]
-    if not found:
-        return None
-    best = found[-1] if len(found) == 1 or trials[-1].fit.status.code is Code.INTERRUPTED else _choose(found)
-    if not best.is_answer:
-        return None
-    window = ChosenWindow(best.length, lengths[0], lengths[-1], fit.stats["gap_share"])
-    return best.problem, best.fit.with_effort_of(fit), window
+    while found:
+        best = found[-1] if len(found) == 1 or trials[-1].fit.status.code is Code.INTERRUPTED else _choose(found)
+        if best.is_answer:
+            window = ChosenWindow(best.length, lengths[0], lengths[-1], fit.stats["gap_share"])
+            return best.problem, best.fit.with_effort_of(fit), window
+        found.remove(best)
+    return None
 
 
 def run_freely(problem: EstimationProblem, fit: Fit, window: float = math.inf) -> tuple[Trajectory, ...]:
@@ -821,10 +822,10 @@ def _lengths(problem: EstimationProblem) -> list[float]:
     return [float(length) for length in np.geomspace(shortest, longest, count)]
 
 
-def _try_length(problem: EstimationProblem, start: Start, length: float) -> _WindowTrial:
+def _try_length(problem: EstimationProblem, start: Start, length: float, iterations: int) -> _WindowTrial:
     """The fit in windows of one length, a segment each."""
     # without gaps all stages are alike; steps are refined where the search has converged
-    last = replace(problem.method.stages[-1], refine=1)
+    last = replace(problem.method.stages[-1], refine=1, iterations=iterations)
     cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=(last,)))
     held, found = fit_fixing_unidentifiable(cut, start)
     return _WindowTrial(length, replace(held, method=replace(held.method, stages=problem.method.stages)), found)

@@ -168,4 +168,5 @@ WIDTH_RANGE = 30.0  # [1] start of a width over its least: less keeps friction f
 
 MIN_WINDOWS = 12  # of all logs
 MIN_KNOWN_SHARE = 0.5  # [1] of the parameters that windows must determine to better than their own size
+WINDOW_ITERATIONS = 30  # in windows that begin with the answer of others; twice as many in the first ones
 WINDOW_FACTOR = 4.0  # [1] from one length to the next

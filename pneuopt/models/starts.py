@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.signal import savgol_filter
 
 from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.logs.tolerances import MAX_REGRESSION_ROWS
@@ -360,21 +361,5 @@ def filter_channel(measured: Trajectory, name: str, derivative: int, window: flo
         return np.interp(measured.t, grid, filter_channel(even, name, derivative, window))
     samples = max(5, 2 * round(window / step / 2) + 1)
     samples = min(samples, (len(measured) - 1) // 2 * 2 + 1)
-    return smooth(measured.fill_gaps(name), samples, derivative) / step**derivative
-
-
-def smooth(column: Array, samples: int, derivative: int) -> Array:
-    """Derivative, by the sample, of cubics through an odd number of samples (Savitzky, Golay, Anal. Chem. 36, 1964)."""
-    cubic, half = _cubic(samples)[derivative:], samples // 2
-    powers = np.arange(len(cubic))
-    factors = np.array([math.perm(int(k) + derivative, derivative) for k in powers]) / half**derivative
-    basis = factors * ((np.arange(samples) - half) / half)[:, None] ** powers
-    begin, end = basis[:half] @ (cubic @ column[:samples]), basis[half + 1 :] @ (cubic @ column[-samples:])
-    return np.concatenate([begin, np.convolve(column, (basis[half] @ cubic)[::-1], "valid"), end])
-
-
-@functools.lru_cache(maxsize=64)
-def _cubic(samples: int) -> Array:
-    """What each of an odd number of samples, from -1 to 1, adds to a cubic's coefficients, shape (4, samples)."""
-    half = samples // 2
-    return np.asarray(np.linalg.pinv(np.vander((np.arange(samples) - half) / half, min(4, samples), increasing=True)))
+    column = measured.fill_gaps(name)
+    return np.asarray(savgol_filter(column, samples, min(3, samples - 1), deriv=derivative, delta=step))

@@ -891,7 +891,7 @@ def test_shorter_windows_are_chosen_only_if_they_predict_better_than_by_chance(
     problem, whole = missed_by_gaps()
     tried, scatter = list[float](), np.random.default_rng(0).uniform(0.9, 1.1, (3, 16))
 
-    def trial(_: EstimationProblem, start: object, length: float) -> Mock:
+    def trial(_: EstimationProblem, start: object, length: float, __: int) -> Mock:
         tried.append(length)
         assert start is (problem.start_from.return_value if length == 0.4 else "warm")
         own = Mock(length=length)
@@ -915,7 +915,7 @@ def test_parts_are_predicted_as_by_a_fit_without_them(horizon: float) -> None:
     log, truth = linear_log(FirstOrder())
     free = truth.freed("plant.*")
     problem = pose_problem(FirstOrder().system(), [log], free, LeastSquares())
-    trial = windows._try_length(problem, problem.candidates[0], 0.2)
+    trial = windows._try_length(problem, problem.candidates[0], 0.2, 60)
     found = trial.predict([2.0, horizon])[1]
     speed, part = log.trajectory["speed"].copy(), log.trajectory.t < 2.0
     speed[part] = math.nan
@@ -930,7 +930,7 @@ def test_parts_are_predicted_as_by_a_fit_without_them(horizon: float) -> None:
 def test_a_budget_that_ends_in_one_length_leaves_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     tried = list[float]()
 
-    def trial(_: EstimationProblem, __: object, length: float) -> Mock:
+    def trial(_: EstimationProblem, __: object, length: float, ___: int) -> Mock:
         tried.append(length)
         own = Mock(length=length)
         own.fit.status.converged = length == 0.4

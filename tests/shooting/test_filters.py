@@ -206,7 +206,7 @@ def test_a_set_that_is_lost_costs_infinity_and_nothing_to_its_neighbour(monkeypa
     values = ParameterScaling.values
 
     def broken(scaling: ParameterScaling, each: Array) -> Array:
-        return values(scaling, each) * (np.inf if each >= z[1] else 1.0)
+        return np.full_like(values(scaling, each), np.inf) if each >= z[1] else values(scaling, each)
 
     monkeypatch.setattr(ParameterScaling, "values", broken)
     found = errors.evaluate(z, GATHERED)
