@@ -40,8 +40,9 @@ class Prediction:
 
     @property
     def stats(self) -> dict[str, float]:
-        """The largest share of a free run, as `IdentificationResult.stats` holds it; zero where nothing moves."""
-        return {"free_run_share": max(self.shares.values(), default=0.0)}
+        """The largest shares, as `IdentificationResult.stats` holds them; zero where nothing moves, or was looked at."""
+        over_horizon = max((self.over_horizon or {}).values(), default=0.0)
+        return {"free_run_share": max(self.shares.values(), default=0.0), "horizon_share": over_horizon}
 
     @property
     def is_useless(self) -> bool:
@@ -77,11 +78,12 @@ def predict_logs(problem: EstimationProblem, fit: Fit, runs: Sequence[Trajectory
     return Prediction(shares, True, horizon, _shares(problem, cut, horizon)[0])
 
 
-def refuse_drift(status: Status, share: float) -> Status:
+def refuse_drift(status: Status, stats: Mapping[str, float]) -> Status:
     """The status of a fit of which it is known what it lacks: a free run that is far off then has no excuse."""
-    if status.code is Code.MISFIT or not (status.converged and share > MAX_PREDICTION_SHARE):
+    is_excused = stats["free_run_share"] > MAX_PREDICTION_SHARE >= stats["horizon_share"]
+    if not (status.converged and is_excused):
         return status
-    verdict = f"does not predict its own log: the free run misses {_size(share)} motion"
+    verdict = f"does not predict its own log: the free run misses {_size(stats['free_run_share'])} motion"
     return Status(Code.MISFIT, (verdict, *status.sentences))
 
 

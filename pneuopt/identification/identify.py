@@ -240,7 +240,7 @@ def _fit_and_review(
         seconds = max(time.process_time() - begun, MIN_EXPLAINING_SECONDS)
         why, explains = explain_misfit(held, fit, min(seconds, problem.method.budget.part(1.0).seconds))
         if explains:
-            result = replace(result, status=refuse_drift(result.status, result.stats["free_run_share"]))
+            result = replace(result, status=refuse_drift(result.status, result.stats))
     return replace(result, status=result.status.with_details(why, offset, str(chosen) if chosen else ""))
 
 

@@ -280,8 +280,9 @@ class IdentificationResult(Result):
     status : Status
         How the fit ended, and the remedies.
     stats : mapping of str to float
-        Figures of the search: iterations, cost, gaps, chi_square_ratio, variance_inflation; free_run_share, the largest
-        error of a free run over the motion of an output [1].
+        Figures of the search: iterations, cost, gaps, chi_square_ratio, variance_inflation; free_run_share and
+        horizon_share, the largest error of a free run, and of runs over the motion's horizon where that is far off,
+        over the motion of an output [1].
     provenance : mapping of str to str
         Versions, options, start, and the logs' sha256.
     verdict : Verdict
