@@ -40,7 +40,7 @@ class Prediction:
 
     @property
     def stats(self) -> dict[str, float]:
-        """The largest shares, as `IdentificationResult.stats` holds them; zero where nothing moves, or was looked at."""
+        """The largest shares, as `IdentificationResult.stats` holds them; zero without any."""
         over_horizon = max((self.over_horizon or {}).values(), default=0.0)
         return {"free_run_share": max(self.shares.values(), default=0.0), "horizon_share": over_horizon}
 
