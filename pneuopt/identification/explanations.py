@@ -28,6 +28,7 @@ from pneuopt.identification.tolerances import (
     STRIBECK_SHARES,
     TURN_SHARE,
     WHOLE_SHARE,
+    WINDOW_ITERATIONS,
 )
 from pneuopt.identification.widths import estimated_widths
 from pneuopt.logs.experiment import Experiment
@@ -78,7 +79,7 @@ def explain_misfit(problem: EstimationProblem, fit: Fit, cpu_seconds: float) -> 
     if not isinstance(problem.system, System) or not problem.system.states:
         return Found("", False)
     horizon, budget = motion_horizon(problem), CpuBudget(max(cpu_seconds, 1e-9))
-    last = replace(problem.method.stages[-1], refine=1)
+    last = replace(problem.method.stages[-1], iterations=WINDOW_ITERATIONS, refine=1)
     method = replace(
         problem.method, segment_time=horizon, stages=(last,), budget=budget, allows_state_noise=False, progress=None
     )

@@ -272,9 +272,8 @@ class _Forecast:
             signed = np.repeat(changes[first : first + lanes], 2, axis=0)
             signed[1::2] *= -1
             with np.errstate(all="ignore"):  # infinite where the model leaves its range
-                factors = np.exp(
-                    np.where(logs, np.clip(signed / self.values, -1.0, 1.0), 0.0)
-                )  # as far as that reaches
+                folds = np.clip(signed / self.values, -1.0, 1.0)  # of an unidentifiable parameter it would be hundreds
+                factors = np.exp(np.where(logs, folds, 0.0))
                 values = np.clip(np.where(logs, self.values * factors, self.values + signed), lower, upper)
                 p = values[:, parts.parameter_positions].reshape(len(signed) * m, -1)
                 x, u, t, h = (np.concatenate([a] * len(signed)) for a in (self.nodes, parts.inputs, parts.t, parts.h))

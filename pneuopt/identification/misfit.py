@@ -112,8 +112,8 @@ class Misfit:
         if self.restarts:
             found.append("over whole logs the misfit exceeds the noise: estimates from windows may be biased")
         if self.rejected_widths:
-            widths = f"{join_names(self.rejected_widths)} that the logs reject"
-            found.append(f"the model has a value of {widths}: without it the fit estimates it")
+            widths = join_names(self.rejected_widths)
+            found.append(f"the stated {widths} is rejected by a score test: where it is not stated, it is estimated")
         if self.is_slow:
             found.append("the misfit is as slow as the logs, or different from log to log")
         if self.lone:

@@ -776,11 +776,9 @@ class _WindowTrial(NamedTuple):
         with np.errstate(all="ignore"):
             first = normal_equations(segments, nodes, q, *rest, substeps)
             step = first.arrow.eliminate(0.0)
-            return (
-                first
-                if step is None
-                else normal_equations(segments, nodes + step.nodes * segments.nominal, q, *rest, substeps)
-            )
+            if step is None:
+                return first
+            return normal_equations(segments, nodes + step.nodes * segments.nominal, q, *rest, substeps)
 
     def _parts(self, optimum: Optimum, length: float) -> Indices:
         """The part of the logs, a window of a length, in which each segment begins, shape (m,)."""

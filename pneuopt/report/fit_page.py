@@ -63,11 +63,8 @@ def fit_page(
     system = None if model is None else as_runnable(model)
     marks = result.estimates["mark"]
     biased = [str(n) for n, mark in marks.items() if mark == Mark.BIAS_POSSIBLE]
-    doubts = (
-        [f"an error of the model may have moved {join_names(biased)}: the intervals are as wide as that"]
-        if biased
-        else []
-    )
+    said = f"an error of the model may have moved {join_names(biased)}: the intervals are as wide as that"
+    doubts = [said] if biased else []
     unknown = result.verdict.sentences if result.verdict else ()
     runs = list(result.trajectories.values())
     compared = (_comparison(runs, experiments, "fitted"),) if experiments and runs else ()
@@ -141,9 +138,7 @@ def prediction_page(
 
 
 def _estimate_section(result: IdentificationResult) -> Section:
-    notes = result.estimates["note"].to_dict()
-    lines = tuple(Line(f"{n}: {note}") for n, note in notes.items() if isinstance(note, str) and note)
-    parts: list[Report | Picture] = [report_estimates(result.estimates), Report(lines)]
+    parts: list[Report | Picture] = [report_estimates(result.estimates)]
     if result.window is not None:
         parts.append(Report((Line(str(result.window)),)))
     if int(result.estimates["stderr"].notna().sum()) > 1:
@@ -171,7 +166,7 @@ def _held_out_section(
         table, runs = predict_logs(system, held_out, result)
     except (ConvergenceError, InputError) as error:
         return Section("Held-out runs", (Report((Line(f"not predicted: {error}", Tone.BAD),)),))
-    lead = Report((Line("logs that the fit has not seen, predicted from their first tenth on"),))
+    lead = Report((Line("logs that the fit has not seen, predicted from their first tenth, or 10 s, on"),))
     parts = (lead, report_agreement(table), report_band(table), _comparison(runs, held_out, "predicted"))
     return Section("Held-out runs", parts)
 

@@ -246,7 +246,7 @@ def test_a_width_that_the_logs_reject_bounds_a_bias_by_what_it_moves() -> None:
     plain = Misfit(None, np.full(2, 9.0), 1.0, 1.0, noisy_states=False, is_excessive=False)
     wide = replace(plain, widened=True, rejected_widths=("friction.smoothing",), shifts=np.array([-3.0, 0.0]))
     assert wide.bound_bias(np.ones(2)).tolist() == [3 * BIAS_SHIFTS, 0.0]
-    assert "friction.smoothing that the logs reject" in wide.sentences[0]
+    assert wide.sentences[0].startswith("the stated friction.smoothing is rejected by a score test")
 
 
 def test_an_estimate_without_a_deviation_is_not_exact() -> None:
