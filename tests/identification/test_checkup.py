@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pneuopt.files.drive import read_drive
+from pneuopt.identification import checkup
 from pneuopt.identification.checkup import check
 from pneuopt.identification.identify import identify
 from pneuopt.logs.doctor import Severity
@@ -41,6 +42,16 @@ def test_a_right_log_has_no_findings_and_is_identifiable() -> None:
     assert found.verdict is not None
     assert not found.verdict.unidentifiable
     assert str(found).startswith("nothing is wrong: the logs identify all of 2 free parameters")
+
+
+def test_what_a_check_promises_is_a_fit_of_its_own_or_is_called_a_right_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = check(DRIVE, LOG, GIVEN)
+    monkeypatch.setattr(checkup, "TRIAL_SECONDS", 1e-9)
+    for found in (check(DRIVE, LOG, GIVEN), check(DRIVE, LOG, GIVEN, trial=False)):
+        assert not found.is_tried
+        assert "identifiable, if the model is right: a fit takes longer, and may know less" in str(found)
+    assert tried.is_tried
+    assert "identifiable, by a trial fit" in str(tried)
 
 
 def test_what_is_read_is_said_with_rows_columns_and_rate(tmp_path: Path) -> None:

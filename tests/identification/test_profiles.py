@@ -300,6 +300,11 @@ def test_what_a_closed_profile_drags_has_an_interval_that_holds_where_it_went(mo
     problem = EstimationProblem(system, logs, system.parameters | result.parameters, LeastSquares())
     reviewed, _ = review.review_fit(problem, result)
     assert reviewed.estimates["ci_high"]["friction.static"] == 50.0
+    for bias, low in ((0.0, 0.01), (1e-3, 0.005)):  # a profile is of chance: the interval of a bias stays
+        given = result.estimates.copy()
+        given.loc[name, ["ci_low", "ci_high", "bias"]] = [0.005, 0.025, bias]
+        reviewed, _ = review.review_fit(problem, replace(result, estimates=given))
+        assert reviewed.estimates.loc[name, ["ci_low", "ci_high"]].tolist() == [low, 0.03]
     kept = review._widen_dragged(result, {name: closed, "friction.static": own}).estimates
     assert kept.to_dict(orient="index")["friction.static"] == before["friction.static"]
 

@@ -910,6 +910,22 @@ def test_shorter_windows_are_chosen_only_if_they_predict_better_than_by_chance(
     assert tried == [0.4, 0.2, 0.1]  # each begins with the answer of the one before
 
 
+def test_windows_that_predict_best_but_tell_too_little_leave_the_answer_to_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def trial(_: EstimationProblem, __: object, length: float, ___: int) -> Mock:
+        own = Mock(length=length, is_answer=length < 0.4)
+        own.fit.status.code = Code.CONVERGED
+        own.predict.return_value = np.full((3, 16), length == 0.4 or 2.0)
+        return own
+
+    monkeypatch.setattr(windows, "_lengths", lambda _: [0.1, 0.2, 0.4])
+    monkeypatch.setattr(windows, "_try_length", trial)
+    found = windows.fit_in_windows(*missed_by_gaps())
+    assert found is not None
+    assert found[2].duration == 0.2
+
+
 @pytest.mark.parametrize("horizon", [0.2, 2.0])
 def test_parts_are_predicted_as_by_a_fit_without_them(horizon: float) -> None:
     log, truth = linear_log(FirstOrder())
