@@ -304,7 +304,7 @@ def test_what_a_closed_profile_drags_has_an_interval_that_holds_where_it_went(mo
         given = result.estimates.copy()
         given.loc[name, ["ci_low", "ci_high", "bias"]] = [0.005, 0.025, bias]
         reviewed, _ = review.review_fit(problem, replace(result, estimates=given))
-        assert reviewed.estimates.loc[name, ["ci_low", "ci_high"]].tolist() == [low, 0.03]
+        assert [reviewed.estimates[n][name] for n in ("ci_low", "ci_high")] == [low, 0.03]
     kept = review._widen_dragged(result, {name: closed, "friction.static": own}).estimates
     assert kept.to_dict(orient="index")["friction.static"] == before["friction.static"]
 
