@@ -254,7 +254,7 @@ def check(
     parameters : ParameterSet
         As for `identify`.
     trial : bool
-        Whether a trial fit of a few seconds tells what the logs identify; else it is told at the first start.
+        Whether to try a fit of a few seconds; else the verdict is that of a right model at its first start.
 
     Returns
     -------

@@ -444,7 +444,7 @@ class RejectedWidth(NamedTuple):
     """A width that the logs reject."""
 
     name: str
-    fall: float  # of the squared residuals, in noise variances, to the width that the logs prefer
+    fall: float  # of the squared residuals, in noise variances, to the width of the best fit
     shifts: Array  # what each free parameter of the fit changes by to there, to first order; at most to a width of zero
 
 

@@ -342,7 +342,7 @@ def _open_names(problem: EstimationProblem, fit: Fit) -> tuple[str, ...]:
 def _loose_widths(problem: EstimationProblem, fit: Fit) -> tuple[str, ...]:
     """The estimated widths that still move, or at whose lower bound the kinks of the law keep others moving.
 
-    Nobody asks for a width: with it held, the others have their answer.
+    A width is not what a fit is made for: with it held, the others have their answer.
     """
     if not fit.unsettled:
         return ()
@@ -733,7 +733,7 @@ class _WindowTrial(NamedTuple):
 
     @property
     def is_answer(self) -> bool:
-        """Whether it tells most parameters better than their own size."""
+        """Whether it determines most parameters to better than their own size."""
         freedom, free = degrees_of_freedom(self.problem, self.fit), self.fit.parameters.free_names
         misfit = diagnose_misfit(self.problem, self.fit, self.fit.chi_square / freedom, freedom)
         if misfit.covariance is None:

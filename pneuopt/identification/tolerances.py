@@ -89,7 +89,7 @@ MOTION_LEVEL = 0.001  # [1] probability, over all signals and outputs, below whi
 MAX_MISFIT = 20.0
 MAX_NRMSE = 0.2  # [1] the same over the channel's own variation, where the noise is estimated
 # half widths of a 95 % interval of chance that hold 94 to 98 truths in 100 where residuals show an error of the model
-# (2 hold 86), and first-order shifts to the widths that the logs prefer that hold 96 where stated ones are rejected
+# (2 hold 86), and first-order shifts to the best widths that hold 96 where stated ones are rejected
 BIAS_HALF_WIDTHS, BIAS_SHIFTS = 4.0, 2.0
 HARMLESS_BIAS = 0.02  # [1] over the value, up to which no design notices it
 MIN_SIGNAL_SPREAD = 1e-6  # [1] of a signal over its size: a smaller one is rounding, and has no classes
