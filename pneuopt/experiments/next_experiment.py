@@ -64,6 +64,7 @@ from pneuopt.experiments.tolerances import (
 from pneuopt.identification.logged_loop import REFERENCE_CHANNELS
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.tracking import Tracking
+from pneuopt.identification.widths import count_widths, estimated_widths
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import InputError, ModelError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
@@ -420,6 +421,7 @@ class DesignSearch:
         channels = names(self.run.channels)
         runs = tuple(Trajectory(self._grid, dict(zip(channels, r.T, strict=True))) for r in shown)
         table = tabulate_design(nominal, self.run.free, self.judge.targets, self.known, gained)
+        table = table.drop(index=[n for n in estimated_widths(nominal) if n in table.index])
         origin = self.run.origin
         steps = tuple(tuple(b.describe(self.run.excited_quantity.unit) for b in blocks) for blocks in chosen)
         units, tried = {q.name: q.unit for q in self.run.channels}, sum(s.tried for s in (self, *self._parts.values()))
@@ -627,6 +629,7 @@ def next_experiment(
         with which the plant is identified; a force that is a command is held, ``with_intersample``.
     parameters : ParameterSet
         As estimated so far, with the controller's of a loop; the free ones are those that the next `identify` frees.
+        It also estimates the widths that are not stated, which therefore count, without a row in the table.
     duration : float
         Of a run [s].
     limits : mapping of str to (float, float)
@@ -676,10 +679,12 @@ def next_experiment(
         inflation = math.sqrt(max(1.0, float(fit.stats.get("variance_inflation", 1.0))))
         channels = fit.fit.reset_index().groupby("channel")
         noise = {str(n): float(own[["noise", "rmse"]].max(axis=1).median()) * inflation for n, own in channels}
+    parameters = count_widths(model.plant, parameters)
     run = _plan(model, parameters, duration, limits, noise or {}, sample_time, start, runs)
     whole = run.plant.parameters | (model.parameters | parameters)
     wanted = criterion or DOptimal()
-    targets = tuple(n for n in whole.match_names(*(wanted.targets or run.free)) if n in run.free)
+    own = tuple(n for n in run.free if n not in estimated_widths(whole))
+    targets = tuple(n for n in whole.match_names(*(wanted.targets or own)) if n in run.free)
     fixed = [n for n in wanted.targets if n in whole and n not in run.free]
     require(not fixed, f"criterion: {', '.join(fixed)} is not free; free what the next identification is to find")
     require(bool(targets), f"criterion: {', '.join(wanted.targets)}: none of these is free")

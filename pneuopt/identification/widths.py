@@ -11,6 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from pneuopt.dynamics.hooks import Width
+from pneuopt.dynamics.system import System
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.tolerances import WIDTH_RANGE
 from pneuopt.quantities.arrays import Array
@@ -24,15 +26,27 @@ ESTIMATED_WIDTH = "nobody has stated it: estimated with the rest"
 def free_widths(problem: EstimationProblem) -> EstimationProblem:
     """Free the widths that nobody has stated: they stand where the model has put them."""
     given, edits = problem.parameters, {}
-    for width in problem.system.plant.identification_hints.widths:
-        name = width.name
-        is_known = name not in given or any(name in e.conditions for e in problem.experiments)
-        if is_known or given[name].free or given[name] != problem.system.parameters[name]:
+    unstated = _unstated_widths(problem.system.plant, given)
+    for name, width in unstated.items():
+        if any(name in e.conditions for e in problem.experiments):
             continue
         value = width.start or given.value(name)
         lower = max(given[name].lower, value / WIDTH_RANGE)
         edits[name] = replace(given[name], value=value, lower=lower, free=True, log=True, source=ESTIMATED_WIDTH)
     return replace(problem, parameters=given | ParameterSet(edits)) if edits else problem
+
+
+def count_widths(plant: System, parameters: ParameterSet) -> ParameterSet:
+    """The parameters with the widths free, at their values, that the next fit will estimate with the rest."""
+    known = plant.parameters | parameters
+    unstated = _unstated_widths(plant, known)
+    return parameters | ParameterSet({n: replace(known[n], free=True, source=ESTIMATED_WIDTH) for n in unstated})
+
+
+def _unstated_widths(plant: System, given: ParameterSet) -> dict[str, Width]:
+    """The widths that stand where the model has put them, by name."""
+    widths = {w.name: w for w in plant.identification_hints.widths if w.name in given}
+    return {n: w for n, w in widths.items() if not given[n].free and given[n] == plant.parameters[n]}
 
 
 def estimated_widths(parameters: ParameterSet) -> list[str]:

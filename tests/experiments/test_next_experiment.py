@@ -20,7 +20,7 @@ from pneuopt.identification.identify import identify
 from pneuopt.logs.experiment import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drives import ForceDrive
-from pneuopt.models.friction import Stribeck, Viscous
+from pneuopt.models.friction import Coulomb, Stribeck, Viscous
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Intersample
@@ -117,6 +117,24 @@ def test_a_design_tells_more_than_steps_and_a_fit_achieves_what_it_predicts() ->
     compared = design().compare(planned, alone=True)
     assert compared["ratio"].between(0.9, 1.1).all(), compared
     assert (compared["shift"].abs() < 4).all(), compared
+
+
+def test_a_width_that_nobody_has_stated_counts_as_the_fit_counts_it() -> None:
+    """Designed as if it were known, a run achieved deviations four times as large as predicted."""
+    axis = ForceDrive(Coulomb())
+    loop, free = ClosedLoop(axis, PID(sample_time=STEP), measured="position"), ("friction.coulomb", "friction.viscous")
+    known = loop.parameters.with_values({n: v for n, v in (VALUES | GAINS).items() if n in loop.parameters})
+    given: dict[str, Any] = {"duration": 2.0, "limits": LIMITS, "noise": NOISE, "plants": {}, "cpu_seconds": 1}
+    found = next_experiment(loop, known.freed(*free), **given)
+    assert tuple(found.table.index) == free
+    start = loop.initial(known, reference=0.1)
+    wanted = Trajectory(found.runs[0].t, {"reference": found.excitation["position_reference"]})
+    run, rng = simulate(loop, wanted, known, initial=start), np.random.default_rng(1)
+    noisy = run["position"] + NOISE["position"] * rng.standard_normal(len(run))
+    log = Experiment(Trajectory(run.t, {"force": run["control"], "position": noisy}), NOISE, name="run")
+    asked = known.select(axis.parameters).freed(*free)
+    compared = found.compare(identify(axis, log.with_intersample({"force": Intersample.HELD}), asked), alone=True)
+    assert compared["ratio"].between(0.9, 1.1).all(), compared
 
 
 def test_an_exact_model_of_a_log_that_often_turns_is_not_taken_for_a_wrong_one() -> None:
