@@ -484,7 +484,7 @@ def _front_requirements(
         kind: Any = REQUIREMENTS_BY_KEY[key]
         message = f"{where} between: the tuning has no bounds for step_envelope; add them under [limits]"
         require(kind is not StepEnvelope or kind.__name__ in given, message)
-        plain = partial(kind, task.specification.band) if kind is SettlingTime else kind
+        plain = partial(kind, task.specification.band) if issubclass(kind, SettlingTime) else kind
         pair.append(given[kind.__name__] if kind.__name__ in given else plain())
     first, second = pair
     ends = {"lower": front_spec.lower, "upper": front_spec.upper}

@@ -26,7 +26,7 @@ from pneuopt.cli.shared import (
 )
 from pneuopt.cli.simulate import loop_view, task_metrics
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
-from pneuopt.evaluation.dither import judge_dither
+from pneuopt.evaluation.dither import DitherVerdict, judge_dither
 from pneuopt.evaluation.plants import expected_plants
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.rig import read_rig
@@ -216,6 +216,9 @@ def _compare_dither(
     nothing = dict[str, Any](), Report()
     if not result.status.converged or interruption_status() is not None:
         return nothing
+    if result.dither is not None:
+        show_report(console, result.dither.summary())
+        return {"dither": _dither_record(result.dither, dict(result.rival) or None)}, result.dither.summary()
     if task.loop.dither_period(result.parameters) is not None:
         rival = tune_rival(console, task, before, quiet)
         if interruption_status() is not None:
@@ -229,13 +232,17 @@ def _compare_dither(
             return {}, unknown
         show_report(console, verdict.summary())
         gains = None if rival is None else {n: rival.value(n) for n in rival.free_names}
-        found = {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": gains}
-        return {"dither": found}, verdict.summary()
+        return {"dither": _dither_record(verdict, gains)}, verdict.summary()
     if DITHER_AMPLITUDE in result.parameters.free_names:
         useless = Report((Line("the dither's amplitude is 0: the tuning found no use for it"),))
         show_report(console, useless)
         return {}, useless
     return nothing
+
+
+def _dither_record(verdict: DitherVerdict, rival: Mapping[str, float] | None) -> dict[str, Any]:
+    """What the JSON file says of a dither; `rival` are the other design's parameters."""
+    return {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": rival}
 
 
 def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet: bool) -> ParameterSet | None:

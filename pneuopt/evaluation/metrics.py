@@ -216,7 +216,8 @@ def batch_metrics(
     """Metrics (m,) of many step responses (m, n) on one grid at once; see `step_metrics`.
 
     `only` names the metrics that are needed; `averaged` (m, k) are known means over the dither's period from the step,
-    `meter` has the channels of the plant's meter (m, n), `wider` are further settling bands for "SettlingTimes".
+    `meter` has the channels of the plant's meter (m, n), `wider` are further settling bands for "SettlingTimes"; of the
+    signal itself where `only` names its settling time.
     """
     require(scale is not None or reference_final != initial, f"no step: the reference stays at {initial:g}")
     shape = t.shape if control is None else control.shape[-1:]
@@ -229,7 +230,8 @@ def batch_metrics(
     if band_centre is BandCentre.REFERENCE:
         centre, width = np.full_like(steady, reference_final), np.full_like(steady, band * abs(size))
     settled, settled_raw = (SettlingBand(centre, width).settling_times(part.t, part.y) for part in (smooth, raw))
-    times = [SettlingBand(centre, other / band * width).settling_times(smooth.t, smooth.y) for other in wider]
+    judged = raw if only is not None and "SettlingTimeRaw" in only else smooth
+    times = [SettlingBand(centre, other / band * width).settling_times(judged.t, judged.y) for other in wider]
     only_mean = np.isnan(settled_raw) & (settled > raw.t[-1] - MIN_SETTLED_PERIODS * (dither_period or 0.0))
     record = StepRecord(
         raw.t,

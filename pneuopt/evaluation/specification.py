@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeGuard
 
 from pneuopt.evaluation.limit_cycle import NoHunting
 from pneuopt.evaluation.metric import Band, Tolerance
@@ -17,6 +17,7 @@ from pneuopt.evaluation.requirements import (
     PeakControl,
     Requirement,
     SettlingTime,
+    SettlingTimeRaw,
     SteadyStateError,
     StepEnvelope,
     metric_name,
@@ -49,6 +50,11 @@ class Specification:
         """Names of the metrics that it limits or minimises."""
         return tuple(dict.fromkeys(metric_name(q) for q in (*self.weights, *self.limits)))
 
+    @property
+    def settling(self) -> type[SettlingTime]:
+        """The kind of settling time that counts: of the signal with its ripple where that is asked for."""
+        return SettlingTimeRaw if self.concerns(SettlingTimeRaw) else SettlingTime
+
     def limit(self, kind: Kind) -> float:
         """Largest value allowed for this kind of requirement, as `upper_limit`; inf without a limit."""
         return next((upper_limit(q) for q in self.limits if isinstance(q, kind)), inf)
@@ -66,7 +72,7 @@ class Specification:
 
         So an optimum, which lies on its limits, still keeps those requested once its gains are rounded and simulated.
         """
-        room: dict[type, float] = {SettlingTime: 0.0}
+        room: dict[type, float] = {SettlingTime: 0.0, SettlingTimeRaw: 0.0}
         room |= dict.fromkeys((PeakControl, MaxSensitivity, MaxComplementarySensitivity), peaks)
         limits = tuple(with_upper_limit(q, upper_limit(q) * (1 - room.get(type(q), margin))) for q in self.limits)
         return replace(self, limits=limits, band=self.band * (1 - margin))
@@ -82,7 +88,17 @@ class Specification:
         latest = (1 - TAIL_SHARE) * record  # what settles later than that counts as not settled
         if self.limit(SettlingTime) <= latest:
             return self
-        return replace(self, limits=(*self.without(SettlingTime).limits, SettlingTime(self.band, latest)))
+        return replace(self, limits=(*self.without(SettlingTime).limits, self.settling(self.band, latest)))
+
+    def on_signal(self) -> "Specification":
+        """Copy in which the signal has to settle, with its ripple, wherever the mean was not asked for by name."""
+        weights, limits = dict[Requirement, float](), list(self.limits)
+        for q, weight in self.weights.items():
+            own = SettlingTimeRaw(q.band) if _leaves_open(q) else q
+            weights[own] = weights.get(own, 0.0) + weight
+        if self.limit(SettlingTimeRaw) == inf:
+            limits += [SettlingTimeRaw(q.band, q.max) for q in self.limits if _leaves_open(q)]
+        return replace(self, weights=weights, limits=tuple(limits))
 
     def without(self, kind: Kind) -> "Specification":
         """Copy without the limit of this kind."""
@@ -115,6 +131,11 @@ class Specification:
     def violations(self, values: Mapping[str, float], slack: float = 0.0) -> tuple[Requirement, ...]:
         """Limits that `values` violate; `slack` is relative to the limit."""
         return tuple(q for q, share in self.excess(values).items() if not share <= slack)
+
+
+def _leaves_open(q: Requirement) -> TypeGuard[SettlingTime]:
+    """Whether a requirement asks for a settling time and does not say whether that of the mean will do."""
+    return type(q) is SettlingTime and not q.mean
 
 
 Objective = Requirement | Mapping[Requirement, float] | Specification

@@ -399,9 +399,10 @@ _ENVELOPE = Key(
     of=Key("an instant, its lower and its upper bound", Takes.LIST, read=_read_envelope_row),
     counts=(1, float("inf")),
 )
-_BAND_MEANING = 'half width of the band, a fraction of the step or as "0.1 mm"'
+_BAND = Key('half width of the band, a fraction of the step or as "0.1 mm"', usual=SettlingTime.band, read=_read_band)
 EXTRA_KEYS: Mapping[str, Mapping[str, Key]] = {
-    "settling_time": {"band": Key(_BAND_MEANING, usual=SettlingTime.band, read=_read_band)},
+    "settling_time": {"band": _BAND, "mean": Key("true: the mean counts, not the signal with its ripple", Takes.FLAG)},
+    "settling_time_raw": {"band": _BAND},
     "step_envelope": {"bounds": _ENVELOPE},
 }
 """The keys of some requirements beside their limit and weight."""

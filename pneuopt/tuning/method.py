@@ -31,6 +31,7 @@ class TuningTask:
     space: Space
     spec: Specification
     accept: tuple[Defect, ...] = ()
+    to_beat: float = inf  # an objective: a search that lags far behind it is given up
 
     @property
     def horizon(self) -> float:

@@ -192,6 +192,7 @@ def run_racing(
     """
     rng, space = np.random.default_rng(method.seed), simulator.space
     search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress)
+    search.most = LAGGING * task.to_beat
     try:
         search.run(method)
     except KeyboardInterrupt:
@@ -408,8 +409,9 @@ def compute_merits(values: Mapping[str, Array], spec: Specification, scale: floa
     horizon [s], so that a search can start.
     """
     filled = {n: np.where(np.isfinite(value), value, WORST_MERIT) for n, value in values.items()}
-    settles, late = np.isfinite(values["SettlingTime"]), penalty_settling_time(scale, filled["Excess"])
-    filled["SettlingTime"] = np.where(settles, filled["SettlingTime"], late)
+    settling = spec.settling.metric.name
+    settles, late = np.isfinite(values[settling]), penalty_settling_time(scale, filled["Excess"])
+    filled[settling] = np.where(settles, filled[settling], late)
     missed = np.where(settles, 0.0, late / scale) if spec.weight(SettlingTime) else np.zeros_like(late)
     for share in spec.excess(filled).values():
         missed += VIOLATION_PENALTY * np.maximum(0.0, share)
@@ -470,6 +472,7 @@ class _RacingSearch:
         self._polisher = Polish(simulator, spec)
         self.best, self.count, self.starts, self.agreeing = np.clip(start, 0.0, 1.0), 0, 0, 0
         self._ends, self._polished, self._points = list[Array](), list[Array](), POLISHED
+        self.most = np.inf  # merit above which it is given up
 
     def run(self, method: Racing) -> None:
         """Search from each start on coarse samples; from the best of all on fine ones, by gradients and by trials."""
@@ -495,6 +498,9 @@ class _RacingSearch:
             population[:, names.index("dither.amplitude")] = NO_DITHER * self._rng.random(method.members)
             if "dither.offset" in names:
                 population[:, names.index("dither.offset")] = self._rng.random(method.members)
+        if self._is_beaten(min(bests)):
+            self.best = self._ends[int(np.argmin(bests))][0].copy()
+            return
         trials = (1 - sum(START_SHARES)) * method.trials * len(names)
         fine = _Phase("fine samples", self._simulator, round(trials))
         population = self._best_first(np.vstack([*self._ends, given]), self._coarse)[0][:FINE_MEMBERS]
@@ -504,6 +510,10 @@ class _RacingSearch:
         population, merits = self.evolve(population[:FINE_MEMBERS], fine)
         if merits[0] < best:
             self._polish(population, merits, fine.simulator, method.polish)
+
+    def _is_beaten(self, merit: float) -> bool:
+        """Whether a merit lags too far behind what is to be beaten; one that breaks limits may still keep them."""
+        return self.most < merit < WORST_MERIT
 
     def best_so_far(self) -> Array:
         """The best of the present phase, which may ask for another band, and of the starts that have ended."""
@@ -525,7 +535,7 @@ class _RacingSearch:
             population, _ = self.evolve(population, phase)
         if stages:
             population, merits = self._best_first(population, self._simulator)
-            if merits[0] > most:
+            if merits[0] > most or self._is_beaten(merits[0]):
                 return population, merits
             population = self._polish(population, merits, self._simulator, method.polish)[0]
             self._polished.append(population[: self._points])
@@ -584,7 +594,7 @@ class _RacingSearch:
         settled = np.inf
         if may_be_cut(self._spec):
             values = self._coarse.respond(self._space.from_unit(self.best[None]), self._spec.band).values
-            settled = float(values["SettlingTime"][0])
+            settled = float(values[self._spec.settling.metric.name][0])
         race.cut(max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf)
 
 

@@ -46,7 +46,7 @@ def limits_with_settling(
     horizon = min(r.horizon - r.at for r in references)
     if not (always or spec.weight(SettlingTime)) or any(isinstance(q, SettlingTime) for q in spec.limits):
         return spec.limits
-    return (*spec.limits, SettlingTime(spec.band, max=(1 - TAIL_SHARE) * horizon))
+    return (*spec.limits, spec.settling(spec.band, max=(1 - TAIL_SHARE) * horizon))
 
 
 def relax_all(simulator: Simulator, space: Space, spec: Specification, points: Sequence[Array]) -> Array:
@@ -78,7 +78,7 @@ def limit_excess(values: Mapping[str, Array], spec: Specification) -> Array:
     unsettled = UNSETTLED_EXCESS + np.minimum(values["Excess"], UNSETTLED_EXCESS)
     worst = np.full_like(unsettled, -np.inf)
     if spec.concerns(SettlingTime):
-        worst = np.where(np.isfinite(values["SettlingTime"]), worst, unsettled)
+        worst = np.where(np.isfinite(values[spec.settling.metric.name]), worst, unsettled)
     for share in spec.excess(values).values():
         worst = np.maximum(worst, np.where(np.isfinite(share), share, unsettled))
     return worst

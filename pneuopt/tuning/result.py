@@ -10,6 +10,7 @@ import numpy as np
 
 from pneuopt.control.pid import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.evaluation.certificate import Certificate, report_margins, report_notes
+from pneuopt.evaluation.dither import DitherVerdict
 from pneuopt.evaluation.evaluate import report_metrics
 from pneuopt.evaluation.limit_cycle import RestCheck
 from pneuopt.evaluation.metric import Sense
@@ -113,6 +114,11 @@ class TuningResult(Result):
     best : mapping of str to float
         Where the given gains stand, the tuned parameters' values in the best candidate that was found, rounded [SI],
         of which `claimed` and `certified` tell; empty where the design is certified, or none was found.
+    dither : DitherVerdict, optional
+        Whether a dither that was tuned is worth it, against the same loop tuned without; of one that is left out for
+        it, why.
+    rival : mapping of str to float
+        With that verdict the other design's tuned parameters: without dither, or with the one that is left out.
     agreement : Agreement, optional
         How far the starts of the search agree.
     refusal : Refusal, optional
@@ -136,6 +142,8 @@ class TuningResult(Result):
     limits: Mapping[str, float] = field(default_factory=dict)
     rest: RestCheck | None = None
     best: Mapping[str, float] = field(default_factory=dict)
+    dither: DitherVerdict | None = None
+    rival: Mapping[str, float] = field(default_factory=dict)
     agreement: Agreement | None = field(default=None, metadata=NOT_SAVED)
     refusal: Refusal | None = field(default=None, metadata=NOT_SAVED)
 

@@ -24,6 +24,7 @@ from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     RiseTime,
     SettlingTime,
+    SettlingTimeRaw,
     SteadyStateError,
     describe_value,
     metric_name,
@@ -80,6 +81,7 @@ CONTACT_REMEDY = "shorten the horizon, take a smaller step, or start elsewhere, 
 # What is said of a design that has no value of a metric; where nothing stands here, it "has no" that metric.
 WORDS_WITHOUT_VALUE = {
     SettlingTime.metric.name: "does not settle within its horizon",
+    SettlingTimeRaw.metric.name: "leaves its settling band with its ripple",
     RiseTime.metric.name: "does not reach 90 % of its step within its horizon",
 }
 TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.metric.headline)

@@ -426,7 +426,8 @@ def read_metrics(
 ) -> dict[str, Array]:
     """The metrics `only`, shape (m,), of outputs y (m, n, n_outputs) of `loop_pieces` that do not run away.
 
-    Over several bands SettlingTime is the mean (`penalty_settling_time`); `period` [s] is the averaging time.
+    Over several bands the settling time is the mean (`penalty_settling_time`), of the signal where that is asked for;
+    `period` [s] is the averaging time.
     """
     reference, signal, since = grid.reference, y[:, :, SIGNAL_OUTPUT], slice(grid.step_index, None)
     late = slice(int(np.searchsorted(grid.t, 0.8 * reference.horizon + 0.2 * reference.at)), None)
@@ -453,9 +454,10 @@ def read_metrics(
     settings["wider"] = shares[1:]
     found = batch_metrics(*given, band=shares[0], envelope=envelope, only=only, meter=meter, **settings)
     if len(bands) > 1:
-        times = np.column_stack([found["SettlingTime"], found["SettlingTimes"]])
+        settling = "SettlingTimeRaw" if "SettlingTimeRaw" in only else "SettlingTime"
+        times = np.column_stack([found[settling], found["SettlingTimes"]])
         most = penalty_settling_time(reference.horizon - reference.at, excess)[:, None]
-        found["SettlingTime"] = np.where(np.isnan(times), most, times).mean(axis=1)
+        found[settling] = np.where(np.isnan(times), most, times).mean(axis=1)
     found["Excess"] = excess
     return {n: found[n] for n in only}
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
+from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import check_smooth
@@ -47,6 +47,7 @@ from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.rival import undithered, weigh_dither
 from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
 from pneuopt.tuning.two_phase import TwoPhase
@@ -158,7 +159,14 @@ def tune(
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     if result.status.code is Code.NOT_CERTIFIED:
         result, is_stopped = confirm_refusal(search, result)
+    if not is_stopped:
+        try:
+            result = weigh_dither(search, result, task.spec)
+        except KeyboardInterrupt:
+            result = _interrupt(task, result, "the search without dither was interrupted")
     tuned = search.space.names
+    shakes = task.loop.dither_period(result.parameters) is not None
+    spec = search.spec if shakes else task.spec  # without a dither the signal is its own mean
     untuned = [n for n in task.space.names if n not in tuned]
     note = f"{', '.join(untuned)} left as given: without effect on a linear loop's average" if untuned else ""
     found = {n: result.parameters.value(n) for n in tuned} if result.status.converged else {}
@@ -167,11 +175,11 @@ def tune(
         parameters=parameters.with_values(found),
         status=result.status.with_remedies(note),
         given={n: parameters.value(n) for n in parameters.free_names},
-        limits=metric_limits(specification.limits),
+        limits=metric_limits(spec.limits),
     )
     if is_stopped:
         result = _interrupt(task, result, "a second search was interrupted")
-    result = _prove_further(task, result, rig, plants, search.progress, begun)
+    result = _prove_further(replace(task, spec=spec), result, rig, plants, search.progress, begun)
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status.with_remedies('the given gains stand')}", result)
     return result
@@ -297,20 +305,27 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback)
 
     The third says whether the second was interrupted while the first one's design stands.
     """
-    search = prepare_search(task, method, progress)
+    search = _on_signal(prepare_search(task, method, progress))
     result = search.run()
     successor = search.method.successor
     found_once = result.agreement is not None and result.agreement.agreeing < 2  # perhaps the nearest of many optima
     doubtful = not result.status.converged or found_once
     if method is not None or successor is None or not doubtful or result.status.code is Code.INTERRUPTED:
         return search, result, False
-    other = prepare_search(task, successor, progress)
+    other = _on_signal(prepare_search(task, successor, progress))
     found = other.run()
     before, after = (certified_objective(task.spec, r) for r in (result, found))
     worse = not found.status.converged or after >= before
     if result.status.converged and worse:
         return search, result, found.status.code is Code.INTERRUPTED
     return other, found, False
+
+
+def _on_signal(search: Search) -> Search:
+    """The search, in which the signal with its ripple has to settle where the dither's amplitude is chosen."""
+    if DITHER_AMPLITUDE not in search.space.names:
+        return search
+    return replace(search, task=replace(search.task, spec=search.spec.on_signal()))
 
 
 def check_rig(rig: Rig | None, task: TuningTask) -> None:
@@ -530,7 +545,5 @@ def tune_without_dither(
     check_closed_loop(loop)
     check_parameters(parameters)
     require(loop.dither is not None, "this loop has no dither to leave out: tune it with `tune`")
-    full = loop.complete(parameters)
-    plain = full.with_bounds({DITHER_AMPLITUDE: (0.0, full[DITHER_AMPLITUDE].upper)})
-    plain = plain.with_values({DITHER_AMPLITUDE: 0.0}).fixed(DITHER_AMPLITUDE, DITHER_FREQUENCY)
+    plain = undithered(loop.complete(parameters))
     return tune(loop, references, plain, minimise=minimise, **{"plants": {}, **options})

@@ -30,7 +30,7 @@ MORE |= {"feedforward.gain": (-20.0, 40.0), "feedforward.time": (2e-3, 0.2)}
 FRICTION = ("friction.coulomb", "friction.static", "friction.viscous")
 SPREADS: dict[str | tuple[str, ...], float] = {"load.mass": 0.3, FRICTION: 0.3, "supply.pressure": 0.1}
 DRAWN = 32
-MINIMISE, OVERSHOOT, SENSITIVITY = po.SettlingTime(band=0.02), po.Overshoot(0.05), po.MaxSensitivity(2.0)
+MINIMISE, OVERSHOOT, SENSITIVITY = po.SettlingTime(band=0.02, mean=True), po.Overshoot(0.05), po.MaxSensitivity(2.0)
 
 Scenarios = Mapping[str, Mapping[str, Any]]
 
