@@ -27,12 +27,13 @@ from pneuopt.files.first_files import (
 from pneuopt.files.tolerances import SAMPLE_TIME
 from pneuopt.logs.columns import LogGuess, Question, guess_channels, guess_log
 from pneuopt.logs.foreign import parse_log
+from pneuopt.logs.noise import estimate_noise
 from pneuopt.logs.table import LogTable, read_bytes
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import check_output_paths, write_bytes
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.units import read_value, write_value
+from pneuopt.quantities.units import read_value, si_conversion, write_value
 
 USUAL_SIZE = "s32"  # of the catalogue: the middle one
 _PNEUMATIC = "pneumatic"  # the kind that has a catalogue, and its valve's centre as a parameter
@@ -94,6 +95,7 @@ def run_init(
         log=log.name if log else "log.csv",
         sample_time=sample_time,
         counts_from_zero=any(column.centre_is_estimated for column in guess.columns),
+        counts={} if table is None else _find_counts(table, guess, first_channels(name)),
         source=source,
         doubts=ask.assumed,
     )
@@ -146,6 +148,17 @@ def _guess_kind(table: LogTable) -> str:
     message = f"{table.path}: its columns do not say what drives the load; say it before --from"
     require("force" in found, f"{message}: pneuopt init KIND, one of {', '.join(first_kinds())}")
     return "force"
+
+
+def _find_counts(table: LogTable, guess: LogGuess, channels: Mapping[str, str]) -> dict[str, float]:
+    """The step of each channel that a sensor counts [SI], by the log's values; noise hides that of the others."""
+    found = dict[str, float]()
+    for column in (c for c in guess.columns if c.channel in channels and c.unit):
+        noise = estimate_noise(table.read([column.column])[column.column])
+        if noise.resolution > noise.random:  # of a moving signal the rounding alone looks like noise
+            factor = si_conversion(column.unit, channels[column.channel])[0]
+            found[column.channel] = float(f"{abs(factor) * noise.resolution:.6g}")
+    return found
 
 
 def _place_files(folder: Path, files: Mapping[str, str], log: Path | None) -> dict[Path, str]:

@@ -22,6 +22,7 @@ from pneuopt.cli.shared import (
     show_report,
     show_sentence,
     stats_and_provenance,
+    warn,
     write_files,
 )
 from pneuopt.cli.simulate import loop_view, task_metrics
@@ -193,7 +194,13 @@ class _Job:
 def _read_job(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs) -> _Job:
     """Read the files, once it is sure that the others can be written."""
     outputs.check([fit, tuning, *([rig] if rig is not None else [])], "bode")
-    return _Job(*read_fit_and_tuning(fit, tuning), fit, tuning, rig, outputs)
+    stored, task, parameters = read_fit_and_tuning(fit, tuning)
+    measured, axis = task.loop.feedback.name, task.loop.plant.axis
+    if task.loop.sensor is None and axis is not None and stored.noise and measured not in stored.noise:
+        unseen = f"the loop sees the {measured} itself, and no log of {fit} holds one: no sensor may give it"
+        keys = '[sensor] resolution = "10 um", one count, and filter = "5 ms"'
+        warn(f"{tuning}: {unseen}; if a controller differentiates the {axis.position}, write {keys}")
+    return _Job(stored, task, parameters, fit, tuning, rig, outputs)
 
 
 def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, Any]) -> Page:

@@ -4,10 +4,12 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.moves import Move
 from pneuopt.control.pid import PID
+from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.hooks import DEFAULT_WIDTH
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.moves import ExcitationRun
@@ -51,13 +53,15 @@ def first_files(
     log: str = "log.csv",
     sample_time: float = SAMPLE_TIME,
     counts_from_zero: bool = False,
+    counts: Mapping[str, float] = MappingProxyType({}),
     source: Sequence[str] = (),
     doubts: Sequence[str] = (),
 ) -> dict[str, str]:
     """The texts of the files, by their names within a folder.
 
     `columns` is what the sidecar states by channel ('"t [ms]"'), `doubts` what it states without being sure; with
-    `counts_from_zero` the command goes from 0 to twice the usual limit about a centre that is estimated.
+    `counts_from_zero` the command goes from 0 to twice the usual limit about a centre that is estimated. `counts` are
+    the steps of what sensors count [SI]: a speed that is not among `columns` is differentiated from them.
     """
     check_names("kind", [name], first_kinds(), "init")
     others = {sidecar_name(other) for other in _OTHER_FILES}
@@ -71,7 +75,7 @@ def first_files(
     rig = Template(_RIG_TITLE, RIG_KEYS, names={"sensors": sensor}, schema=_schema_path("rig"))
     templates = {
         "drive": _drive_template(kind, first, values, source),
-        "tuning": _tuning_template(loop, first, values, counts_from_zero),
+        "tuning": _tuning_template(loop, first, values, counts_from_zero, _encoder_keys(loop, columns, counts)),
         "study": _study_template(loop, first, values),
         "rig": rig,
         "sidecar": _sidecar_template(loop, first, values, columns, log, doubts),
@@ -133,6 +137,7 @@ def _tuning_template(
     first: FirstFiles,
     values: ParameterSet,
     counts_from_zero: bool,
+    encoder: Mapping[str, str],
     *,
     dither_samples: int = 5,  # least a period: fewer bend its wave; more slow it down for a slow controller
 ) -> Template:
@@ -144,6 +149,7 @@ def _tuning_template(
     stated = {"pid.form": '"parallel"', "pid.sample_time": _quote(sample_time)}
     stated |= {f"pid.{n}": _value_text(given[f"pid.{n}"], free=True, bounds=True) for n in first.gains}
     stated["pid.limits"] = "[" + ", ".join(_quote(write_value(end, command)) for end in ends) + "]"
+    stated |= encoder
     if first.dither is not None:
         frequency, most = first.dither
         frequency = min(frequency, 1.0 / (dither_samples * (loop.pid.sample_time or SAMPLE_TIME)))
@@ -172,6 +178,16 @@ def _tuning_template(
         _tuning_names(loop, first, values),
         _schema_path("tuning"),
     )
+
+
+def _encoder_keys(loop: ClosedLoop, columns: Mapping[str, str], counts: Mapping[str, float]) -> dict[str, str]:
+    """The sensor of a loop whose log counts a position and has no speed: the controller's speed comes from there."""
+    axis = loop.plant.axis
+    if axis is None or loop.feedback.name != axis.speed or axis.speed in columns or axis.position not in counts:
+        return {}
+    unit = next(q.unit for q in loop.plant.outputs if q.name == axis.position)
+    lag = write_value(Encoder.filter, "s")
+    return {"sensor.resolution": _quote(write_value(counts[axis.position], unit)), "sensor.filter": _quote(lag)}
 
 
 def _tuning_names(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> dict[str, str]:

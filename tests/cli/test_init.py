@@ -480,3 +480,44 @@ def test_the_first_dither_can_be_sampled_by_a_controller_as_slow_as_the_log(
     loop = read_tuning(tmp_path / "tuning.toml", read_drive(tmp_path / "drive.toml")[0].system()).loop
     if loop.dither is not None:
         loop.dither.check(loop.parameters.value("dither.frequency"), loop.pid.sample_time)
+
+
+def _write_counted(path: Path, *, step: float, noise: float = 0.0, speed: bool = False) -> None:
+    """A log of a force drive, its position in whole steps [mm], or noisy, and its speed beside on request."""
+    t = np.arange(600) * 2e-3
+    true = 40 + 20 * np.sin(2 * np.pi * 0.7 * t) + noise * np.random.default_rng(1).standard_normal(t.size)
+    rows = zip(t, 30 * np.cos(9 * t), step * np.round(true / step) if step else true, strict=True)
+    head = "t [s],force [N],position [mm]" + (",speed [m/s]" if speed else "")
+    tail = ",0.1" if speed else ""
+    path.write_text("\n".join([head, *(f"{a:.4f},{f:.3f},{x:.6f}{tail}" for a, f, x in rows)]) + "\n")
+
+
+def test_a_loop_sees_its_speed_through_the_encoder_that_the_log_shows(tmp_path: Path) -> None:
+    """One count of 20 um; where the position is noisy, or the speed was logged, no encoder is assumed."""
+    for name, given in (("counted", {"step": 0.02}), ("noisy", {"step": 0.0, "noise": 0.05})):
+        _write_counted(tmp_path / f"{name}.csv", **given)
+    _write_counted(tmp_path / "tacho.csv", step=0.02, speed=True)
+    for name in ("counted", "noisy", "tacho"):
+        code, output = run("init", "force", "--from", str(tmp_path / f"{name}.csv"), "-o", str(tmp_path / name))
+        assert code == 0, output
+    found = {name: read_all(tmp_path / name) for name in ("counted", "noisy", "tacho")}
+    assert {name: task.loop.sensor is not None for name, task in found.items()} == {
+        "counted": True,
+        "noisy": False,
+        "tacho": False,
+    }
+    assert found["counted"].parameters.value("sensor.resolution") == pytest.approx(20e-6)
+
+
+def test_a_speed_that_no_log_holds_is_said_to_have_no_sensor(tmp_path: Path) -> None:
+    """The controller would differentiate the position; of a logged speed, and of a stated sensor, nothing is said."""
+    assert run("init", "force", "-o", str(tmp_path))[0] == 0
+    drive, tuning = ((tmp_path / n).read_text("utf-8") for n in ("drive.toml", "tuning.toml"))
+    seen = tuning.replace("# [sensor]", "[sensor]").replace('# lag = "5 ms"', 'lag = "5 ms"')
+    said = []
+    for logged, text in (("position", tuning), ("speed", tuning), ("position", seen)):
+        (tmp_path / "fit.toml").write_text(f"{drive}\n[agreement.run]\n{logged} = {{ rmse = 1e-5 }}\n", "utf-8")
+        (tmp_path / "tuning.toml").write_text(text, "utf-8")
+        _, output = run("certify", str(tmp_path / "fit.toml"), str(tmp_path / "tuning.toml"))
+        said.append("no sensor may give it" in " ".join(output.split()))
+    assert said == [True, False, False]
