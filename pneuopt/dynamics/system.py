@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces
+from pneuopt.dynamics.dead_time import DeadTime
 from pneuopt.dynamics.hooks import (
     Axis,
     HardwareCheckHook,
@@ -46,6 +47,9 @@ class Linearisation:
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    dead_time: float = 0.0  # of the input [s], in the matrices a Padé approximant, in a `frequency_response` the delay
+    pade_order: int = 0
+    sample_time: float | None = None  # [s], of a sampled system in the form of ``z = (1 + s h/2)/(1 - s h/2)``
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +84,8 @@ class System:
     centre : str, optional
         The parameter from which the command counts, where a log's may count from elsewhere; a controller's counts from
         there.
+    dead_time : DeadTime, optional
+        Of an input, which the equations approximate; margins take the delay itself.
     """
 
     states: tuple[Quantity, ...]
@@ -96,6 +102,7 @@ class System:
     identification_hints: IdentificationHints = field(default_factory=IdentificationHints)
     axis: Axis | None = None
     centre: str | None = None
+    dead_time: DeadTime | None = None
 
     def __repr__(self) -> str:
         return describe(self)
