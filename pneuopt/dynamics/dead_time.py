@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import Quantity
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,16 @@ class DeadTime:
     parameter: str  # the dead time [s]
     input: str
     states: tuple[str, ...]
+
+
+MAX_PADE_ORDER = 5  # the greatest order whose stability limit is known
+
+
+def delay_line(source: Quantity, order: int) -> tuple[Quantity, ...]:
+    """The states of an input's dead time; none of order 0."""
+    valid = isinstance(order, int) and 0 <= order <= MAX_PADE_ORDER
+    require(valid, f"pade_order must be 0 to {MAX_PADE_ORDER}, got {order}", ModelError)
+    return tuple(Quantity(f"{source.name}_delay_{k}", source.unit, 2 * source.nominal) for k in range(1, order + 1))
 
 
 def pade_delay(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[ca.SX]]:

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces
-from pneuopt.dynamics.dead_time import DeadTime
+from pneuopt.dynamics.dead_time import DeadTime, delay_line, pade_delay
 from pneuopt.dynamics.hooks import (
     Axis,
     HardwareCheckHook,
@@ -28,7 +28,7 @@ from pneuopt.dynamics.hooks import (
 from pneuopt.dynamics.integrators import rk4
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, ModelError, check_names, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 Symbols = Mapping[str, ca.SX]
@@ -339,6 +339,49 @@ def define(
     y = _stack_in_order("output", measured, outputs)
     ode = ca.Function("ode", [t, *map(stack, (x, u, p))], [xdot, y], ["t", "x", "u", "p"], ["xdot", "y"])
     return System(tuple(states), tuple(inputs), tuple(outputs), parameters, ode, start_hook, rest_hook)
+
+
+def add_dead_time(system: System, order: int = 3) -> System:
+    """A system whose one input acts late, by its parameter "dead_time" [s].
+
+    Parameters
+    ----------
+    system : System
+        With one input.
+    order : int
+        Of the Padé approximant by which it is simulated, 1 to 5; margins take the delay itself.
+
+    Returns
+    -------
+    System
+        With so many states more.
+
+    Raises
+    ------
+    ModelError
+        If the system has other than one input, or has a dead time.
+
+    Examples
+    --------
+    >>> lag = lambda t, x, u, p: ({"y": u["u"] - x["y"]}, {"y": x["y"]})
+    >>> u, y = Quantity("u", "V"), Quantity("y", "V")
+    >>> list(add_dead_time(define([y], [u], [y], ParameterSet(), lag)).parameters)
+    ['dead_time']
+    """
+    require(len(system.inputs) == 1, f"a dead time needs one input, got {', '.join(names(system.inputs))}", ModelError)
+    require(system.dead_time is None, "the system has a dead time; change its parameter instead", ModelError)
+    (source,) = system.inputs
+    line, name, n = delay_line(source, max(1, order)), "dead_time", len(system.states)
+    meaning = "delay from the input to its effect"
+    parameters = system.parameters | ParameterSet(
+        {name: Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)}
+    )
+    t, x, u, p = (ca.SX.sym(k, size) for k, size in (("t", 1), ("x", n + len(line)), ("u", 1), ("p", len(parameters))))
+    late, rates = pade_delay(u, ca.vertsplit(x[n:]), p[len(parameters) - 1])
+    xdot, y = system.ode(t, x[:n], late, p[: len(parameters) - 1])
+    ode = ca.Function("ode", [t, x, u, p], [ca.vertcat(xdot, *rates), y], ["t", "x", "u", "p"], ["xdot", "y"])
+    made = System((*system.states, *line), system.inputs, system.outputs, parameters, ode)
+    return replace(made, dead_time=DeadTime(name, source.name, names(line)))
 
 
 @lru_cache(maxsize=64)

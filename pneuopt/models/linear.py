@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from scipy import optimize, signal
 
-from pneuopt.dynamics.dead_time import DeadTime, pade_delay, pade_matrices
+from pneuopt.dynamics.dead_time import DeadTime, delay_line, pade_delay, pade_matrices
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
@@ -339,16 +339,6 @@ def _in_input_unit(parameters: ParameterSet, source: Quantity) -> ParameterSet:
             unit = re.sub(r"\bN\b", difference_unit(source.unit), q.unit)
             shrunk[n] = replace(q, value=value, lower=low, upper=high, unit=unit)
     return ParameterSet(shrunk)
-
-
-MAX_PADE_ORDER = 5  # the greatest order whose stability limit is known
-
-
-def delay_line(source: Quantity, order: int) -> tuple[Quantity, ...]:
-    """The states of an input's dead time; none of order 0."""
-    valid = isinstance(order, int) and 0 <= order <= MAX_PADE_ORDER
-    require(valid, f"pade_order must be 0 to {MAX_PADE_ORDER}, got {order}", ModelError)
-    return tuple(Quantity(f"{source.name}_delay_{k}", source.unit, 2 * source.nominal) for k in range(1, order + 1))
 
 
 def delay_states(u: Array, step: float, order: int, dead_time: float) -> Array:
