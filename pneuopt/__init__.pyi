@@ -326,6 +326,7 @@ __all__ = [
     "Viscous",
     "WantedPrecision",
     "Waveform",
+    "add_dead_time",
     "apply_scenario",
     "average_dither",
     "bootstrap",

@@ -158,7 +158,7 @@ class OwnLoop:
         for _ in range(starts):
             z = np.log(centre) + rng.normal(0.0, 0.7, len(centre))
             while not np.isfinite(self.peaks(np.exp(z))[0]):
-                z[0] -= 0.3
+                z[:2] += (-0.3, 0.1)
             size = self.iae(np.exp(z))
             found = minimize(
                 lambda z: np.log(self.iae(np.exp(z)) / size),
