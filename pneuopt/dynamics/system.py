@@ -373,9 +373,7 @@ def add_dead_time(system: System, order: int = 3) -> System:
     (source,) = system.inputs
     line, name, n = delay_line(source, max(1, order)), "dead_time", len(system.states)
     meaning = "delay from the input to its effect"
-    parameters = system.parameters | ParameterSet(
-        {name: Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)}
-    )
+    parameters = system.parameters | ParameterSet({name: Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)})
     t, x, u, p = (ca.SX.sym(k, size) for k, size in (("t", 1), ("x", n + len(line)), ("u", 1), ("p", len(parameters))))
     late, rates = pade_delay(u, ca.vertsplit(x[n:]), p[len(parameters) - 1])
     xdot, y = system.ode(t, x[:n], late, p[: len(parameters) - 1])

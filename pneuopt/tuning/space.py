@@ -127,7 +127,7 @@ class Space:
             found += [np.where(np.arange(len(rounded)) == k, v, rounded) for v in sides if low <= v <= up]
         return np.reshape(found, (-1, len(rounded)))
 
-    def lattice(self, rounded: Array, digits: int, most: int = 20_000, reach: int = 10) -> Array:
+    def lattice(self, rounded: Array, digits: int, most: int = 20_000, reach: int = 40) -> Array:
         """The points that differ from a rounded one by some last places in every coordinate, shape (m, n).
 
         By up to `reach` places; where these are more than `most` points by fewer, and of many gains some at random.
