@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces
-from pneuopt.dynamics.dead_time import DeadTime, delay_line, pade_delay
+from pneuopt.dynamics.dead_time import DeadTime, check_pade_order, delay_line, pade_delay
 from pneuopt.dynamics.hooks import (
     Axis,
     HardwareCheckHook,
@@ -370,16 +370,31 @@ def add_dead_time(system: System, order: int = 3) -> System:
     """
     require(len(system.inputs) == 1, f"a dead time needs one input, got {', '.join(names(system.inputs))}", ModelError)
     require(system.dead_time is None, "the system has a dead time; change its parameter instead", ModelError)
-    (source,) = system.inputs
-    line, name, n = delay_line(source, max(1, order)), "dead_time", len(system.states)
-    meaning = "delay from the input to its effect"
-    parameters = system.parameters | ParameterSet({name: Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)})
-    t, x, u, p = (ca.SX.sym(k, size) for k, size in (("t", 1), ("x", n + len(line)), ("u", 1), ("p", len(parameters))))
-    late, rates = pade_delay(u, ca.vertsplit(x[n:]), p[len(parameters) - 1])
-    xdot, y = system.ode(t, x[:n], late, p[: len(parameters) - 1])
+    (source,), name, meaning = system.inputs, "dead_time", "delay from the input to its effect"
+    late = Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)
+    empty = DeadTime(name, source.name, (), system)
+    check_pade_order(max(1, order))
+    return with_pade_order(
+        replace(system, parameters=system.parameters | ParameterSet({name: late}), dead_time=empty), order
+    )
+
+
+@lru_cache(maxsize=16)
+def with_pade_order(system: System, order: int) -> System:
+    """A system with its dead time simulated by an approximant of this order; one without a dead time as it is."""
+    late = system.dead_time
+    if late is None or len(late.states) == order:
+        return system
+    inner = late.undelayed
+    (source,), n, m = inner.inputs, len(inner.states), len(system.parameters)
+    line = delay_line(source, order)
+    t, x, u, p = (ca.SX.sym(k, size) for k, size in (("t", 1), ("x", n + order), ("u", 1), ("p", m)))
+    place = list(system.parameters).index
+    delayed, rates = pade_delay(u, ca.vertsplit(x[n:]), p[place(late.parameter)])
+    xdot, y = inner.ode(t, x[:n], delayed, p[[place(k) for k in inner.parameters]])
     ode = ca.Function("ode", [t, x, u, p], [ca.vertcat(xdot, *rates), y], ["t", "x", "u", "p"], ["xdot", "y"])
-    made = System((*system.states, *line), system.inputs, system.outputs, parameters, ode)
-    return replace(made, dead_time=DeadTime(name, source.name, names(line)))
+    states = (*inner.states, *line)
+    return replace(system, states=states, inputs=inner.inputs, ode=ode, dead_time=replace(late, states=names(line)))
 
 
 @lru_cache(maxsize=64)

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from scipy import optimize, signal
 
-from pneuopt.dynamics.dead_time import DeadTime, delay_line, pade_delay, pade_matrices
+from pneuopt.dynamics.dead_time import DeadTime, check_pade_order, delay_line, pade_delay, pade_matrices
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
@@ -286,6 +286,7 @@ def _assemble_plant(
     per: str = "",
 ) -> System:
     """Assemble a plant from its dynamics, its gain, whose unit is also per `per`, and its dead time."""
+    check_pade_order(plant.pade_order)
     order, source, unit = plant.pade_order, plant.input, difference_unit(plant.input.unit)
     line, gain_unit = delay_line(source, order), _quotient_unit(plant.output, f"({unit}{per})" if per else unit)
     gain = Parameter(1.0, gain_unit, meaning="steady output, or of an integrator its rate, per input")
@@ -304,7 +305,7 @@ def _assemble_plant(
     others = tuple(n for n in names(states) if n not in {plant.output.name, "drive"})
     find = LinearStarts(shape, source.name, plant.output.name, names(line), others)
     system = define(states + line, (source,), (plant.output,), parameters, rhs, find)
-    late = DeadTime(PLANT_DEAD_TIME, source.name, names(line)) if order else None
+    late = DeadTime(PLANT_DEAD_TIME, source.name, names(line), replace(plant, pade_order=0).system()) if order else None
     return replace(system, centre=INPUT_OFFSET, dead_time=late)
 
 

@@ -108,11 +108,11 @@ class OwnLoop:
         return w, self.plant.response(w)
 
     @cached_property
-    def _fourier(self) -> tuple[float, Array, NDArray[np.complex128]]:
-        """The step of time [s], frequencies of the transform but zero, and P there."""
+    def _fourier(self) -> tuple[Array, NDArray[np.complex128]]:
+        """The frequencies of the transform but zero, and P there."""
         record = RECORDS * PERIODS / self.plant.ultimate[0]
         w = 2 * np.pi / record * np.arange(1, SAMPLES // 2 + 1)
-        return record / SAMPLES, w, self.plant.response(w)
+        return w, self.plant.response(w)
 
     def controller(self, gains: Array, w: Array) -> NDArray[np.complex128]:
         """C(jw)."""
@@ -146,7 +146,7 @@ class OwnLoop:
 
     def iae(self, gains: Array) -> float:
         """The integral of the absolute error after a load of one at the plant's input."""
-        h, w, P = self._fourier
+        w, P = self._fourier
         signal = P / (1 + P * self.controller(gains, w)) / (1j * w)
         spectrum = np.concatenate([[gains[1] / gains[0]], signal])  # at zero it is 1/Ki
         return float(np.abs(np.fft.irfft(spectrum, SAMPLES)).sum())
@@ -160,9 +160,8 @@ class OwnLoop:
             z = np.log(centre) + rng.normal(0.0, 0.7, len(centre))
             while not np.isfinite(self.peaks(np.exp(z))[0]):
                 z[:2] += (-0.3, 0.1)
-            size = self.iae(np.exp(z))
             found = minimize(
-                lambda z: np.log(self.iae(np.exp(z)) / size),
+                lambda z: np.log(self.iae(np.exp(z))),
                 z,
                 method="SLSQP",
                 constraints={"type": "ineq", "fun": lambda z: most - np.minimum(self.peaks(np.exp(z)), 10.0)},

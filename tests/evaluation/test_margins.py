@@ -209,14 +209,12 @@ def late_open_loop(w: np.ndarray, dead_time: float, h: float | None, delay: int)
 
     whole = int(dead_time / h + 1e-9)
     (first, old), (last, new) = driven(dead_time - whole * h), driven(h - (dead_time - whole * h))
-    z, found = np.exp(1j * w * h), []
-    for each in z.tolist():
-        slope = (1 - 1 / each) / h
-        controller = Kp + Ki / slope + Kd * slope / (Tf * slope + 1)
-        driving = new + last @ old / each
-        plant = C @ np.linalg.solve(each * np.eye(2) - last @ first, driving)
-        found.append(controller * plant[0, 0] / each ** (whole + delay))
-    return np.array(found)
+    z = np.exp(1j * w * h)
+    slope = (1 - 1 / z) / h
+    controller = Kp + Ki / slope + Kd * slope / (Tf * slope + 1)
+    driving = new + (last @ old) / z[:, None, None]
+    plant = C @ np.linalg.solve(z[:, None, None] * np.eye(2) - last @ first, driving)
+    return np.asarray(controller * plant[:, 0, 0] / z ** (whole + delay))
 
 
 @pytest.mark.parametrize(
