@@ -3,15 +3,16 @@
 The states of a dead time form a lossless ladder and keep the input's unit and size at every dead time, so that the
 dead time is an ordinary, differentiable parameter. Its fastest pole is at 2, 3.5, 5.1, 6.8, 8.5 over the dead time
 (orders 1 to 5), and RK4 steps of h are stable for dead times above 0.72, 1.22, 1.87, 2.57, 3.26 h, the lower limit.
-At zero the approximant is singular; order 0 leaves it out. Its phase is the delay's to 1e-3 rad up to .23, .95, 2, 3.2
-and 4.5 rad of orders 1 to 5, up to 15 rad of order 12, with which certificates are simulated. Its gain is one at every frequency, as the delay's, so that
-the quotient of the two (`delay_over_pade`) turns a response by what the approximant lacks in phase.
+At zero the approximant is singular; order 0 leaves it out.
+
+Its phase is the delay's to 1e-3 rad up to .23, .95, 2, 3.2 and 4.5 rad of orders 1 to 5, and up to 15 rad of order 12,
+with which certificates are simulated. Its gain is one at every frequency, as the delay's, so that the quotient of the
+two (`delay_over_pade`) turns a response by what the approximant lacks in phase.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
 from math import factorial
-
 from typing import TYPE_CHECKING
 
 import casadi as ca

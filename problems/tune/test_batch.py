@@ -2,8 +2,8 @@
 
     python problems/tune/test_batch.py [--plants NAME ...] [--json FILE] [--out DIR]
 
-A load of one at the plant's input, the least IAE with MaxSensitivity and MaxComplementarySensitivity of at most M, for M
-of 1.4, 1.6 and 2.0. PI: Kp (1 + 1/(Ti s)); PIDF: Kp (1 + 1/(Ti s) + Td s/(Td s/10 + 1)). The plants are those of K. J.
+A load of one at the plant's input; the least IAE with MaxSensitivity and MaxComplementarySensitivity of at most M
+= 1.4, 1.6 and 2.0. PI: Kp (1 + 1/(Ti s)); PIDF: Kp (1 + 1/(Ti s) + Td s/(Td s/10 + 1)). The plants are those of K. J.
 Astrom, T. Hagglund, Revisiting the Ziegler-Nichols step response method for PID control, J. Process Control 14 (2004)
 635-650: lags, right-half-plane zeros, an integrator, an oscillator, and dead times.
 
@@ -123,7 +123,7 @@ class OwnLoop:
         """Ms and Mt, infinite of an unstable loop; on a grid, then on finer ones about its highest point."""
         w, P = self._grid
         L = P * self.controller(gains, w)
-        if not self._is_stable(w, L):
+        if not self._is_stable(L):
             return np.inf, np.inf
         return self._peak(gains, np.abs(1 / (1 + L)), False), self._peak(gains, np.abs(L / (1 + L)), True)
 
@@ -138,7 +138,7 @@ class OwnLoop:
             best, low, high = max(best, float(found[k])), near[max(0, k - 1)], near[min(20, k + 1)]
         return best
 
-    def _is_stable(self, w: Array, L: NDArray[np.complex128]) -> bool:
+    def _is_stable(self, L: NDArray[np.complex128]) -> bool:
         """Nyquist's count; from the grid's lowest frequency a plant's and the controller's integrals turn to zero."""
         poles = 1 + int(abs(self.plant.denominator[-1]) < 1e-12)  # at zero, the controller's among them
         turned = np.unwrap(np.angle(1 + L))
