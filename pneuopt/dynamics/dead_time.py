@@ -10,10 +10,8 @@ with which certificates are simulated. Its gain is one at every frequency, as th
 two (`delay_over_pade`) turns a response by what the approximant lacks in phase.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from math import factorial
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -22,20 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Quantity
-
-if TYPE_CHECKING:
-    from pneuopt.dynamics.system import System
-
-
-@dataclass(frozen=True)
-class DeadTime:
-    """The dead time of a system between an input and its effect; `states` are those of its Padé approximant."""
-
-    parameter: str  # the dead time [s]
-    input: str
-    states: tuple[str, ...]
-    undelayed: "System"  # the same system without it
-
 
 MAX_PADE_ORDER = 5  # the greatest order whose stability limit is known
 

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces
-from pneuopt.dynamics.dead_time import DeadTime, check_pade_order, delay_line, pade_delay
+from pneuopt.dynamics.dead_time import check_pade_order, delay_line, pade_delay
 from pneuopt.dynamics.hooks import (
     Axis,
     HardwareCheckHook,
@@ -50,6 +50,16 @@ class Linearisation:
     dead_time: float = 0.0  # of the input [s], in the matrices a Padé approximant, in a `frequency_response` the delay
     pade_order: int = 0
     sample_time: float | None = None  # [s], of a sampled system in the form of ``z = (1 + s h/2)/(1 - s h/2)``
+
+
+@dataclass(frozen=True)
+class DeadTime:
+    """The dead time of a system between an input and its effect; `states` are those of its Padé approximant."""
+
+    parameter: str  # the dead time [s]
+    input: str
+    states: tuple[str, ...]
+    undelayed: "System"  # the same system without it
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,9 @@ import casadi as ca
 import numpy as np
 from scipy import optimize, signal
 
-from pneuopt.dynamics.dead_time import DeadTime, check_pade_order, delay_line, pade_delay, pade_matrices
+from pneuopt.dynamics.dead_time import check_pade_order, delay_line, pade_delay, pade_matrices
 from pneuopt.dynamics.hooks import Log, Start
-from pneuopt.dynamics.system import Symbols, System, define, names
+from pneuopt.dynamics.system import DeadTime, Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.models.declaration import DriveKind, DriveSections, FirstFiles
 from pneuopt.models.drives import FORCE, POSITION, SPEED
