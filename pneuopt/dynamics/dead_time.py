@@ -17,11 +17,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.dynamics.tolerances import MAX_PADE_ORDER
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Quantity
-
-MAX_PADE_ORDER = 5  # the greatest order whose stability limit is known
 
 
 def check_pade_order(order: int) -> None:

@@ -593,7 +593,7 @@ def _read_loops(
 
         def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
             L, C = approximate(w)
-            return L * sensitivity.turned(w), C
+            return L * sensitivity.delay_factor(w), C
 
         found |= _read_responses(responses, at_infinity, w, lowest_noise, [n for n in only if n not in found])
     return _mark_unstable(found, are_stable(closed, sensitivity.closed) & (turned == 0))
@@ -820,7 +820,7 @@ class SensitivityReader:
     pade_order: int = 0
     sample_time: float | None = None
 
-    def turned(self, w: Array) -> ComplexArray | float:
+    def delay_factor(self, w: Array) -> ComplexArray | float:
         """What the approximants lack of the delays at frequencies of shape (n,) or (m, n)."""
         if not self.pade_order:
             return 1.0
@@ -870,7 +870,7 @@ class SensitivityReader:
             S = np.broadcast_to(1 / (1 + self.direct[:, None]), omega.shape).astype(complex)
             for p, q in zip(self.opened.T[..., None], self.closed.T[..., None], strict=True):
                 S *= (s - p) / (s - q)
-            return S, (1 / S - 1) * self.turned(omega)
+            return S, (1 / S - 1) * self.delay_factor(omega)
 
     def _size(self, metric: str, omega: Array) -> Array:
         S, L = self._responses(omega)
