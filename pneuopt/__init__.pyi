@@ -36,7 +36,7 @@ from .control.sensor import Encoder, SensorLag
 from .dynamics.python_control import from_control, to_control
 from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
 from .dynamics.stick_slip import EventKind
-from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
+from .dynamics.system import DiscreteSystem, Linearisation, System, add_dead_time, define, discretise
 from .evaluation.certificate import Certificate, Defect, Finding, certificate
 from .evaluation.dither import (
     CompensatorVerdict,
@@ -326,6 +326,7 @@ __all__ = [
     "Viscous",
     "WantedPrecision",
     "Waveform",
+    "add_dead_time",
     "apply_scenario",
     "average_dither",
     "bootstrap",

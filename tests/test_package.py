@@ -27,6 +27,7 @@ PUBLIC_NAMES = [
     "Actuator",
     "AirUse",
     "AntiWindup",
+    "add_dead_time",
     "apply_scenario",
     "Asymmetric",
     "Assumption",

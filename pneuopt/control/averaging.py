@@ -573,32 +573,13 @@ def operating_gains(
     return Kp, Ki, Kd, Tf
 
 
-def pade_delay_response(omega: ArrayLike, dead_time: float) -> NDArray[np.complex128]:
-    """``e^(-jw dead_time)`` as Padé's approximant of second order has it, shape (n,); omega [rad/s].
-
-    Examples
-    --------
-    >>> round(float(np.angle(pade_delay_response([1.0], 1.0), deg=True)[0]), 2)
-    -57.22
-    """
-    s = 1j * np.asarray(omega, dtype=float) * dead_time
-    return np.asarray((1 - s / 2 + s**2 / 12) / (1 + s / 2 + s**2 / 12))
-
-
-def controller_matrices(gains: Any, dead_time: float) -> tuple[Array, Array, Array, Array]:
-    """A, B, C, D of m PIDs, gains (4, m), from the control error to the command, with a dead time [s] in Padé form."""
+def controller_matrices(gains: Any) -> tuple[Array, Array, Array, Array]:
+    """A, B, C, D of m continuous PIDs, gains (4, m), from the control error to the command."""
     Kp, Ki, Kd, Tf = np.reshape(gains, (4, -1, 1))
-    zero, one, rate = np.zeros_like(Tf), np.ones_like(Tf), 1 / Tf
+    zero, rate = np.zeros_like(Tf), 1 / Tf
     A = np.stack([np.hstack([zero, zero]), np.hstack([zero, -rate])], axis=1)
-    B, C, D = np.stack([Ki, rate], axis=1), np.stack([one, -Kd * rate], axis=2), (Kp + Kd * rate)[..., None]
-    if dead_time:  # `pade_delay_response` is 1 - (12 s/T)/(s^2 + 6 s/T + 12/T^2), here with states of one size
-        m, root = len(Kp), np.sqrt(12) / dead_time
-        lags, fed = np.array([[0.0, root], [-root, -6 / dead_time]]), np.array([[0.0], [1.0]])
-        taken = np.array([[0.0, -12 / dead_time]])
-        A = np.block([[A, np.zeros((m, 2, 2))], [fed @ C, np.broadcast_to(lags, (m, 2, 2))]])
-        B = np.concatenate([B, fed @ D], axis=1)
-        C = np.concatenate([C, np.broadcast_to(taken, (m, 1, 2))], axis=2)
-    return A, B, C, D
+    C = np.stack([np.ones_like(Tf), -Kd * rate], axis=2)
+    return A, np.stack([Ki, rate], axis=1), C, (Kp + Kd * rate)[..., None]
 
 
 def controller_response(
@@ -608,7 +589,7 @@ def controller_response(
     s = 1j * np.broadcast_to(np.asarray(omega, dtype=float), len(p))
     Kp, Ki, Kd, Tf = linear_gains(loop, p.T, measured, command).full()
     controller = Kp + Ki / s + Kd * s / (1 + Tf * s)
-    return np.asarray(controller * pade_delay_response(s.imag, loop.dead_time) / (1 + s * loop.sensor_lag(p.T)))
+    return np.asarray(controller * np.exp(-s * loop.dead_time) / (1 + s * loop.sensor_lag(p.T)))
 
 
 def operating_point(
@@ -622,9 +603,8 @@ def operating_point(
 
 
 def linear_controller(loop: ClosedLoop, parameters: ParameterSet, x: Array, u: Mapping[str, float]) -> Linearisation:
-    """The controller from the control error to the command, with the loop's dead time in second-order Padé form."""
+    """The continuous PID from the control error to the command."""
     gains = np.reshape(operating_gains(loop, parameters, x, u), (4, 1))
     require(gains[3, 0] > 0, "a continuous derivative needs a filter, Tf > 0")
-    A, B, C, D = (matrix[0] for matrix in controller_matrices(gains, loop.dead_time))
-    own = ("pid.integral", "pid.filter", "pid.held", "pid.held_before")[: len(A)]
-    return Linearisation(A, B, C, D, own, ("error",), ("control",))
+    A, B, C, D = (matrix[0] for matrix in controller_matrices(gains))
+    return Linearisation(A, B, C, D, ("pid.integral", "pid.filter"), ("error",), ("control",))

@@ -1,11 +1,13 @@
 """The loop linearised: `linear_plant`, the plant as the controller sees it; `open_loop`, whose margins count.
 
-Loops whose controller feeds back several signals (`ComposedLoops`) are cut at the command. The controller's law is
-differentiated as it runs (`Controller.update`), so there is one law. A sampled one is exact: the plant on a held
-command by its matrix exponential, the controller from sample to sample with its delay, and the discrete loop L(z) in
-continuous form by the bilinear transformation ``z = (1 + s h/2)/(1 - s h/2)``, which maps the unit circle to the
-imaginary axis. Margins and peaks are those of L(z); a frequency w is shown as ``2/h tan(w h/2)`` [rad/s], which is w
-but for 1 % at a tenth of the sampling frequency over pi.
+Sampled loops, and loops whose controller feeds back several signals, are cut at the command (`ComposedLoops`). The
+controller's law is differentiated as it runs (`Controller.update`), so there is one law. A sampled one is exact: the
+plant on a held command by its matrix exponential, the controller from sample to sample with its delay, and the discrete
+loop L(z) in continuous form by the bilinear transformation ``z = (1 + s h/2)/(1 - s h/2)``, which maps the unit circle
+to the imaginary axis.
+
+A plant's dead time is in the matrices as a Padé approximant, which decides nothing: responses take the delay itself
+(`delay_over_pade`). On a held command that part of it which is no whole number of samples is exact in the matrices.
 """
 
 from collections.abc import Mapping
@@ -22,7 +24,8 @@ from pneuopt.control.controller import Controller
 from pneuopt.control.dither import DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag, Signals
-from pneuopt.control.tolerances import LARGEST_TAYLOR_NORM, TAYLOR_TERMS
+from pneuopt.control.tolerances import LARGEST_TAYLOR_NORM, LEAST_SAMPLES, TAYLOR_TERMS
+from pneuopt.dynamics.dead_time import pade_matrices
 from pneuopt.dynamics.system import Linearisation, names, stack
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet, with_prefix, without_prefix
@@ -71,7 +74,21 @@ def linear_plant(
         A = np.block([[A, np.zeros((n, 1))], [C / lag, np.array([[-1 / lag]])]])
         B, C, D = np.vstack([B, D / lag]), np.eye(1, n + 1, n), np.zeros((1, 1))
         states = (*states, "sensor.reading")
-    return Linearisation(A, B, C, D, states, (loop.command.name,), (loop.feedback.name,))
+    late, order = dead_times(loop, p[None])
+    return Linearisation(A, B, C, D, states, (loop.command.name,), (loop.feedback.name,), float(late[0]), order)
+
+
+def dead_times(loop: ClosedLoop, p: Array) -> tuple[Array, int]:
+    """The plant's dead times between command and effect (m,) [s], of loop parameters p (m, ...), and the Padé order."""
+    late = loop.plant.dead_time
+    if late is None or late.input != loop.command.name:
+        return np.zeros(len(p)), 0
+    return p[:, list(loop.parameters).index(late.parameter)], len(late.states)
+
+
+def is_cut_at_command(loop: ClosedLoop) -> bool:
+    """Whether a loop is linearised by `ComposedLoops`; a continuous PID of one signal needs only its gains."""
+    return loop.is_composed or loop.pid.sample_time is not None
 
 
 def open_loop(
@@ -79,19 +96,19 @@ def open_loop(
 ) -> Linearisation:
     """``L(s) = C(s) P(s)`` under negative feedback, cut at the measured output, without saturation.
 
-    P is the `linear_plant`, averaged under dither.
-    A sampled PID counts as its continuous equivalent (`linear_gains`) with the `dead_time` in second-order Padé form,
-    its integral as one without dead band and resets. Compensators that act always count by their slopes at the
-    operating point; a knocker's pulses do not. A loop with further feedback (`ClosedLoop.is_composed`) is cut at the
-    command, and a sampled one of these is exact, see `composed_loops`. Parameters as for `linear_plant`.
+    P is the `linear_plant`, averaged under dither. An integral counts as one without dead band and resets. Compensators
+    that act always count by their slopes at the operating point; a knocker's pulses do not. A sampled loop, and one
+    with further feedback (`ClosedLoop.is_composed`), is cut at the command; a sampled one is the loop L(z) from sample
+    to sample, hold and computing delay included. Parameters as for `linear_plant`.
 
     Returns
     -------
     Linearisation
-        From the control error, input "error", to the measured output; the plant's states come first.
+        From the control error, input "error", to the measured output; the plant's states come first. A sampled loop is
+        in the form of ``z = (1 + s h/2)/(1 - s h/2)``, see its `sample_time`.
     """
     x, u = operating_point(loop, parameters, x, u)
-    if loop.is_composed:
+    if is_cut_at_command(loop):
         return _composed_loops(loop, parameters, x, u)[0]
     plant, controller = linear_plant(loop, parameters, x, u), linear_controller(loop, parameters, x, u)
     m, n = len(controller.A), len(plant.A)
@@ -103,13 +120,15 @@ def open_loop(
         plant.states + controller.states,
         ("error",),
         (loop.feedback.name,),
+        plant.dead_time,
+        plant.pade_order,
     )
 
 
 def noise_path(
     loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
 ) -> Linearisation:
-    """The controller of a loop with further feedback, from noise on what the PID or outer loop sees to the command."""
+    """The controller of a loop cut at the command, from noise on what the PID or outer loop sees to the command."""
     return _composed_loops(loop, parameters, *operating_point(loop, parameters, x, u))[1]
 
 
@@ -120,13 +139,16 @@ def _composed_loops(
     loop.check(parameters)
     at = np.array([[u.get(n, 0.0) for n in names(loop.plant.inputs)]])
     found = _composed_loop(loop)(loop.parameter_vector(parameters)[None], np.asarray(x, dtype=float)[None], at)
-    plant = names(loop.plant.states)
+    h, late = loop.pid.sample_time, loop.plant.dead_time
+    # of a sampled loop the dead time stands behind the controller, not in the plant
+    plant = tuple(n for n in names(loop.plant.states) if h is None or late is None or n not in late.states)
     own = [f"controller.{k}" for k in range(found.loop[0].shape[-1] - len(plant))]
     A, B, C, D = (M[0] for M in found.loop)
-    opened = Linearisation(A, B, C, D, (*plant, *own), ("error",), (loop.command.name,))
+    ends, delay = (("error",), (loop.command.name,)), (float(found.dead_time[0]), found.pade_order, h)
+    opened = Linearisation(A, B, C, D, (*plant, *own), *ends, *delay)
     A, B, C, D = (M[0] for M in found.noise)
     states = tuple(f"controller.{k}" for k in range(found.noise[0].shape[-1]))
-    return opened, Linearisation(A, B, C, D, states, ("noise",), (loop.command.name,))
+    return opened, Linearisation(A, B, C, D, states, ("noise",), (loop.command.name,), sample_time=h)
 
 
 class OpenLoops(NamedTuple):
@@ -135,6 +157,8 @@ class OpenLoops(NamedTuple):
     loop: Matrices  # under negative feedback; the plant's states come first
     # the controllers alone, from noise on what the PID sees, in a cascade on the position, to the command
     noise: Matrices
+    dead_time: Array  # (m,) [s], in the loops' matrices as a Padé approximant of this order
+    pade_order: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,15 +182,23 @@ class ComposedLoops:
         seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])
         v = loop.controller.uncompensated_command(loop.controller_part(p.T), seen, seen, command, read)
         law = _Laws(*(_split_columns(M.full(), len(p)) for M in self._law(shown.T, v[None], p.T)))
-        h, direct = loop.pid.sample_time, np.zeros((*plant[2].shape[:2], 1))
+        h, direct, (late, order) = loop.pid.sample_time, np.zeros((*plant[2].shape[:2], 1)), dead_times(loop, p)
         if h is None:
-            return OpenLoops(_join((*plant, direct), law.feedback), law.noise)
-        held = _bilinear((*_hold(*plant[:2], h), plant[2], direct), h)
+            return OpenLoops(_join((*plant, direct), law.feedback), law.noise, late, order)
+        samples = np.floor(late / h + LEAST_SAMPLES)
+        held = _bilinear((*_hold(*plant, h, np.maximum(late - samples * h, 0.0)), direct), h)
         joined = _join(held, _bilinear(law.feedback, h))
         if loop.pid.delay:  # a sample behind it, 1/z = (1 - s h/2)/(1 + s h/2)
             one = np.ones((len(p), 1, 1))
             joined = _join(joined, (-2 / h * one, 2 / np.sqrt(h) * one, 2 / np.sqrt(h) * one, -one))
-        return OpenLoops(joined, _bilinear(law.noise, h))
+        if not samples.any():
+            return OpenLoops(joined, _bilinear(law.noise, h), np.zeros(len(p)), 0)
+        whole = np.maximum(samples, LEAST_SAMPLES) * h  # so that all have the same states
+        Ad, Bd, Cd, Dd = pade_matrices(order)
+        rate, one = 1 / whole[:, None, None], np.ones((len(p), 1, 1))
+        return OpenLoops(
+            _join(joined, (Ad * rate, Bd * rate, Cd * one, Dd * one)), _bilinear(law.noise, h), whole, order
+        )
 
     def _plants(self, p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array], Array]:
         """A, B and C of the plants with a sensor's lag, in scaled states, and their outputs, shape (m, n_outputs)."""
@@ -176,6 +208,11 @@ class ComposedLoops:
         own = p[:, [list(loop.parameters).index(n) for n in loop.plant.parameters]]
         slopes, shown = self._outputs(x.T, u.T, own.T)
         C = _split_columns(slopes.full(), len(x)) * scale
+        order = dead_times(loop, p)[1]
+        if loop.pid.sample_time is not None and order:  # without the dead time's states, whose gain at once is +-1
+            late = loop.plant.dead_time.states if loop.plant.dead_time else ()
+            kept = [k for k, n in enumerate(names(loop.plant.states)) if n not in late]
+            A, B, C = A[:, kept][:, :, kept], (-1.0) ** order * B[:, kept], C[:, :, kept]
         if isinstance(loop.sensor, SensorLag):
             rate = 1 / np.reshape(loop.sensor_lag(p.T), (-1, 1, 1)) + np.zeros((len(x), 1, 1))
             k, n = names(loop.plant.outputs).index(loop.pid_signal.name), A.shape[-1]
@@ -303,13 +340,26 @@ def _join(plant: Matrices, controller: Matrices) -> Matrices:
     return joined, np.concatenate([B, Bc @ D], axis=1), np.concatenate([Dc @ C, Cc], axis=2), Dc @ D
 
 
-def _hold(A: Array, B: Array, h: float) -> tuple[Array, Array]:
-    """Matrices of plants from sample to sample on a held command."""
+def _hold(A: Array, B: Array, C: Array, h: float, late: Array) -> tuple[Array, Array, Array]:
+    """Plants from sample to sample on a command that is held, and arrives late by less than a sample (m,) [s].
+
+    K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed., Prentice Hall 1997, section 2.3.
+    """
+    if not late.any():
+        return *_advance(A, B, np.full(len(A), h)), C
+    (first, old), (last, new) = _advance(A, B, late), _advance(A, B, h - late)
+    held = np.zeros((len(A), 1, A.shape[-1] + 1))
+    moved = np.concatenate([np.concatenate([last @ first, last @ old], axis=2), held], axis=1)
+    return moved, np.concatenate([new, np.ones((len(A), 1, 1))], axis=1), np.pad(C, ((0, 0), (0, 0), (0, 1)))
+
+
+def _advance(A: Array, B: Array, h: Array) -> tuple[Array, Array]:
+    """Matrices of plants over times (m,) [s] in which their inputs are held."""
     m, n = A.shape[:2]
     both = np.concatenate([np.concatenate([A, B], axis=2), np.zeros((m, 1, n + 1))], axis=1)
     sound = np.isfinite(both).all(axis=(1, 2))
     moved = np.full_like(both, np.nan)
-    moved[sound] = _exponentials(both[sound] * h)
+    moved[sound] = _exponentials(both[sound] * h[sound, None, None])
     return moved[:, :n, :n], moved[:, :n, n:]
 
 

@@ -45,3 +45,4 @@ BALANCE_TOLERANCE = 1e-4  # last step of `AveragedPlant`, of the swing; what is 
 # Norm of a matrix and terms of the series of its exponential, whose remainder is then .5^17/17!, below rounding: a
 # larger norm needs more terms, a smaller one more squarings, each of which doubles the rounding.
 LARGEST_TAYLOR_NORM, TAYLOR_TERMS = 0.5, 16
+LEAST_SAMPLES = 1e-6  # of a dead time, which are none: an angle of 3e-6 rad at the highest frequency

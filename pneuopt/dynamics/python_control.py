@@ -21,7 +21,8 @@ GAIN = "plant.gain"
 def to_control(linear: Linearisation) -> "control.StateSpace":
     """A linearised system as python-control has it, with the names of its signals.
 
-    Its transfer function is ``control.tf(to_control(...))``. Margins of an `open_loop` are the same by either tool.
+    Its transfer function is ``control.tf(to_control(...))``, of a sampled loop one of z. Margins of an `open_loop` are
+    the same by either tool, but for a dead time, which python-control gets as its Padé approximant.
 
     Parameters
     ----------
@@ -51,7 +52,13 @@ def to_control(linear: Linearisation) -> "control.StateSpace":
         kind: [n.replace(".", "_") for n in given]
         for kind, given in (("states", linear.states), ("inputs", linear.inputs), ("outputs", linear.outputs))
     }
-    return _import_control().ss(linear.A, linear.B, linear.C, linear.D, **names)
+    A, B, C, D, h = linear.A, linear.B, linear.C, linear.D, linear.sample_time
+    if h is None:
+        return _import_control().ss(A, B, C, D, **names)
+    one, root = np.eye(len(A)), np.sqrt(h)
+    inverse = np.linalg.inv(one - h / 2 * A)  # z = (1 + s h/2)/(1 - s h/2), undone
+    C, D = root * C @ inverse, D + h / 2 * C @ inverse @ B
+    return _import_control().ss((one + h / 2 * A) @ inverse, root * inverse @ B, C, D, h, **names)
 
 
 def from_control(

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces
+from pneuopt.dynamics.dead_time import check_pade_order, delay_line, pade_delay
 from pneuopt.dynamics.hooks import (
     Axis,
     HardwareCheckHook,
@@ -27,7 +28,7 @@ from pneuopt.dynamics.hooks import (
 from pneuopt.dynamics.integrators import rk4
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError, ModelError, check_names, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 Symbols = Mapping[str, ca.SX]
@@ -46,6 +47,19 @@ class Linearisation:
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    dead_time: float = 0.0  # of the input [s], in the matrices a Padé approximant, in a `frequency_response` the delay
+    pade_order: int = 0
+    sample_time: float | None = None  # [s], of a sampled system in the form of ``z = (1 + s h/2)/(1 - s h/2)``
+
+
+@dataclass(frozen=True)
+class DeadTime:
+    """The dead time of a system between an input and its effect; `states` are those of its Padé approximant."""
+
+    parameter: str  # the dead time [s]
+    input: str
+    states: tuple[str, ...]
+    undelayed: "System"  # the same system without it
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +94,8 @@ class System:
     centre : str, optional
         The parameter from which the command counts, where a log's may count from elsewhere; a controller's counts from
         there.
+    dead_time : DeadTime, optional
+        Of an input, which the equations approximate; margins take the delay itself.
     """
 
     states: tuple[Quantity, ...]
@@ -96,6 +112,7 @@ class System:
     identification_hints: IdentificationHints = field(default_factory=IdentificationHints)
     axis: Axis | None = None
     centre: str | None = None
+    dead_time: DeadTime | None = None
 
     def __repr__(self) -> str:
         return describe(self)
@@ -332,6 +349,62 @@ def define(
     y = _stack_in_order("output", measured, outputs)
     ode = ca.Function("ode", [t, *map(stack, (x, u, p))], [xdot, y], ["t", "x", "u", "p"], ["xdot", "y"])
     return System(tuple(states), tuple(inputs), tuple(outputs), parameters, ode, start_hook, rest_hook)
+
+
+def add_dead_time(system: System, order: int = 3) -> System:
+    """A system whose one input acts late, by its parameter "dead_time" [s].
+
+    Parameters
+    ----------
+    system : System
+        With one input.
+    order : int
+        Of the Padé approximant by which it is simulated, 1 to 5; margins take the delay itself.
+
+    Returns
+    -------
+    System
+        With so many states more.
+
+    Raises
+    ------
+    ModelError
+        If the system has other than one input, or has a dead time.
+
+    Examples
+    --------
+    >>> lag = lambda t, x, u, p: ({"y": u["u"] - x["y"]}, {"y": x["y"]})
+    >>> u, y = Quantity("u", "V"), Quantity("y", "V")
+    >>> list(add_dead_time(define([y], [u], [y], ParameterSet(), lag)).parameters)
+    ['dead_time']
+    """
+    require(len(system.inputs) == 1, f"a dead time needs one input, got {', '.join(names(system.inputs))}", ModelError)
+    require(system.dead_time is None, "the system has a dead time; change its parameter instead", ModelError)
+    (source,), name, meaning = system.inputs, "dead_time", "delay from the input to its effect"
+    late = Parameter(0.01, "s", 1e-3, 10.0, log=True, meaning=meaning)
+    empty = DeadTime(name, source.name, (), system)
+    check_pade_order(max(1, order))
+    return with_pade_order(
+        replace(system, parameters=system.parameters | ParameterSet({name: late}), dead_time=empty), order
+    )
+
+
+@lru_cache(maxsize=16)
+def with_pade_order(system: System, order: int) -> System:
+    """A system with its dead time simulated by an approximant of this order; one without a dead time as it is."""
+    late = system.dead_time
+    if late is None or len(late.states) == order:
+        return system
+    inner = late.undelayed
+    (source,), n, m = inner.inputs, len(inner.states), len(system.parameters)
+    line = delay_line(source, order)
+    t, x, u, p = (ca.SX.sym(k, size) for k, size in (("t", 1), ("x", n + order), ("u", 1), ("p", m)))
+    place = list(system.parameters).index
+    delayed, rates = pade_delay(u, ca.vertsplit(x[n:]), p[place(late.parameter)])
+    xdot, y = inner.ode(t, x[:n], delayed, p[[place(k) for k in inner.parameters]])
+    ode = ca.Function("ode", [t, x, u, p], [ca.vertcat(xdot, *rates), y], ["t", "x", "u", "p"], ["xdot", "y"])
+    states = (*inner.states, *line)
+    return replace(system, states=states, inputs=inner.inputs, ode=ode, dead_time=replace(late, states=names(line)))
 
 
 @lru_cache(maxsize=64)

@@ -1,6 +1,10 @@
 """The numbers that decide in `dynamics`, each with its unit and what it decides."""
 
 
+# Dead time
+
+MAX_PADE_ORDER = 5  # of a dead time in a file; the greatest order whose stability limit with RK4 is known
+
 # Compiled/compiler
 
 COMPILE_TIMEOUT = 300  # [s]; below, large models on slow machines fall back to the VM; above, a hung compiler blocks

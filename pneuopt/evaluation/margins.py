@@ -13,13 +13,16 @@ A passage through the friction's falling branch on the way is no such point: it 
 can grow. Under dither the points are those of the response without its ripple, and the loop is averaged over the ripple
 there. A mean over the dither's period alone would smooth a fast command, even under a dither of a picovolt.
 
-Searches read the margins and sensitivity peaks of many loops at once (`sensitivity_peaks`). The sensitivity of a loop
-whose open loop rolls off is ``S(s) = prod (s - p)/prod (s - q)`` over the poles p of the open and q of the closed loop,
-so it takes no frequency response of the plant, and the resonances lie near the closed loop's poles.
+Searches read the margins and sensitivity peaks of many loops at once (`SensitivityReader`). The sensitivity is
+``S(s) = S(oo) prod (s - p)/prod (s - q)`` over the poles p of the open and q of the closed loop, so it takes no
+frequency response of the plant, and the resonances lie near the closed loop's poles.
+
+A plant's dead time is the delay itself in every response. Whether the closed loop is stable follows from its Padé
+approximant, which has poles, and from how often the two curves of 1 + L run round each other (`turns`).
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import inf, isnan, nan
 from typing import Any
@@ -31,23 +34,26 @@ from scipy.linalg import eig, eigvals, matrix_balance
 from scipy.optimize import brentq, minimize_scalar
 from scipy.sparse.csgraph import connected_components
 
-from pneuopt.control.averaging import (
-    AveragedPlant,
-    controller_matrices,
-    is_affine,
-    linear_gains,
-    operating_gains,
-    pade_delay_response,
+from pneuopt.control.averaging import AveragedPlant, controller_matrices, is_affine, linear_gains, operating_gains
+from pneuopt.control.linear_loop import (
+    ComposedLoops,
+    dead_times,
+    is_cut_at_command,
+    linear_plant,
+    noise_path,
+    open_loop,
 )
-from pneuopt.control.linear_loop import ComposedLoops, linear_plant, noise_path, open_loop
 from pneuopt.control.loop import ClosedLoop, find_rest, set_sliding_direction
 from pneuopt.control.reference import Reference, disturbance_input
+from pneuopt.dynamics.dead_time import delay_over_pade
 from pneuopt.dynamics.system import Linearisation, names
 from pneuopt.evaluation.metric import Source, period_mean, remove_ripple
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.tolerances import (
+    DELAY_ANGLE,
     FLAT,
     MOST_POLE_ROUNDING,
+    MOST_TANGENT,
     NOISE_ANGLE,
     POLE_ROUNDING,
     RESTING_SPEED,
@@ -157,7 +163,20 @@ def margins(open_loop: Linearisation, on_grid: GridResponse | None = None) -> Ma
     Ms, at = _response_peak(lambda _, L: 1 / (1 + L), open_loop, on_grid, 1 / (1 + D))
     Mt, _ = _response_peak(lambda _, L: 1 - 1 / (1 + L), open_loop, on_grid, D / (1 + D))
     stable = bool(are_stable(_closed_loop(open_loop)[None])[0])
+    if open_loop.dead_time:
+        approximate = replace(open_loop, dead_time=0.0)
+        stable &= bool(turns(1 + L[None], 1 + frequency_response(approximate, omega)[None])[0] == 0)
     return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, stable)
+
+
+def turns(curves: ComplexArray, others: ComplexArray) -> Array:
+    """How often curves (m, n) run round zero more than others do, from frequency 0 to infinity, in half turns (m,).
+
+    So many pairs of poles more lie on the right (H. Nyquist, Regeneration theory, Bell Syst. Tech. J. 11 (1932) 126).
+    """
+    with np.errstate(all="ignore"):
+        angles = np.unwrap(np.angle(curves / others), axis=1)
+    return np.asarray(np.round((angles[:, -1] - angles[:, 0]) / np.pi))
 
 
 def _crossing_frequencies(function: Callable[[float], float], omega: Array, values: Array) -> list[float]:
@@ -249,11 +268,12 @@ def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> Comple
     ----------
     linearisation : Linearisation
     omega : array_like, shape (n,)
-        [rad/s], positive.
+        [rad/s], positive, of a sampled system below half its sampling frequency.
 
     Returns
     -------
     ndarray of complex, shape (n,)
+        With its dead time, if it has one, as the delay itself; of a sampled system that of its samples.
 
     Examples
     --------
@@ -265,10 +285,13 @@ def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> Comple
     require(single, f"one input and one output expected, got D of shape {linearisation.D.shape}", ModelError)
     w = np.asarray(omega, dtype=float)
     require(bool(np.all(w > 0)), "frequencies must be positive [rad/s]")
-    return np.asarray(
-        batch_frequency_response(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0]
-        + linearisation.D[0, 0]
-    )
+    h, delay = linearisation.sample_time, (linearisation.dead_time, linearisation.pade_order)
+    if h is not None:
+        message = f"sampled every {h:g} s, the system has responses below {np.pi / h:.4g} rad/s only"
+        require(bool(np.all(w * h < np.pi)), message)
+        w = 2 / h * np.tan(w * h / 2)
+    found = batch_frequency_response(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0]
+    return np.asarray((found + linearisation.D[0, 0]) * delay_over_pade(w, *delay, h))
 
 
 def batch_frequency_response(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
@@ -310,7 +333,12 @@ def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
     grid = np.geomspace(1e-3 * low, 1e3 * high, int(np.ceil(decades * per_decade)) + 1)
     ringing = roots[(roots.imag > 0) & (np.abs(roots.real) < 0.2 * roots.imag) & (roots.real != 0)]
     around = [r.imag + abs(r.real) * np.linspace(-4, 4, 41) for r in ringing]
-    return np.unique(np.concatenate([grid, *around]))
+    found = np.unique(np.concatenate([grid, *around]))
+    if open_loop.dead_time:  # beyond the approximant's poles the delay turns on
+        even = np.linspace(0.0, DELAY_ANGLE / open_loop.dead_time, per_decade + 1)[1:]
+        found = np.unique(np.concatenate([found, even]))
+    h = open_loop.sample_time
+    return found if h is None else np.unique(2 / h * np.arctan(np.minimum(found * h / 2, MOST_TANGENT)))
 
 
 def _closed_loop(open_loop: Linearisation) -> Array:
@@ -355,13 +383,14 @@ def sensitivity_terms(loop: ClosedLoop, omega: ArrayLike, parameters: ParameterS
     for fits, reason in (
         (loop.outer is None, "a cascade's speed loop has a response of its own"),
         (loop.schedule is None, "scheduled gains change with the operating point"),
+        (loop.pid.sample_time is None, "a sampled PID's delay is no such function"),
         (not shaping, f"{shaping}: its slope at the operating point counts in the sensitivity"),
     ):
         require(fits, f"{reason}; use margins(open_loop(...))", ModelError)
     free = ", ".join(n for n in parameters.free_names if n in loop.plant.parameters)
     require(not free, f"{free}: free, but the sensitivity needs a fixed plant; fix it", ModelError)
     w = np.asarray(omega, dtype=float)
-    P = frequency_response(linear_plant(loop, parameters), w) * pade_delay_response(w, loop.dead_time)
+    P = frequency_response(linear_plant(loop, parameters), w)
     p = ca.SX.sym("p", len(loop.parameters))
     Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
     ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
@@ -436,7 +465,8 @@ def margin_rows(
         at = (loop, parameters, point.x, point.inputs)
         linear = open_loop(*at)
         on_grid = GridResponse.of(linear)
-        robust, controller = margins(linear, on_grid), noise_path(*at) if loop.is_composed else operating_gains(*at)
+        cut = is_cut_at_command(loop)
+        robust, controller = margins(linear, on_grid), noise_path(*at) if cut else operating_gains(*at)
         found = {
             "MaxSensitivity": robust.max_sensitivity,
             "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
@@ -446,7 +476,7 @@ def margin_rows(
         }
         if not robust.stable:
             found = {n: nan if n.endswith("Margin") else inf for n in found}
-        slope = friction_slope(loop, parameters, linear)
+        slope = friction_slope(loop, parameters, linear_plant(*at) if linear.sample_time else linear)
         rows.append({"point": point.name, "t": point.t, **found, **slope, "stable": robust.stable})
     return tuple(rows)
 
@@ -498,7 +528,7 @@ def worst_open_loop(
     return loops[int(np.argmax(peaks))]
 
 
-MAX_SENSITIVITY = "MaxSensitivity"
+MAX_SENSITIVITY, MAX_COMPLEMENTARY = "MaxSensitivity", "MaxComplementarySensitivity"
 Matrices = tuple[Array, Array, Array]  # A, B, C of m plants, shapes (m, n, n), (m, n, 1), (m, 1, n)
 Matrices4 = tuple[Array, Array, Array, Array]  # and D, shape (m, 1, 1)
 
@@ -513,14 +543,16 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
     """Function that gives margins, sensitivities and noise gains for many gains and operating points at once.
 
     The frequencies `omega` [rad/s], shape (n,), are positive, increasing; from `lowest_noise` on a noise gain counts.
+    Of a sampled loop they are those of s in ``z = (1 + s h/2)/(1 - s h/2)``.
     The function ``(p, x, u, only) -> found`` takes parameters, shape (m, n_parameters), in the order of
     ``loop.parameters``, and the plant's states and inputs at k operating points of each, shapes (k, m, n_plant_states)
     and (k, m, n_plant_inputs), means under dither. It gives the worst over the points, shape (m,), for each name in
     `only`, as `Margins` and `noise_gain` have them, NaN and infinite where a closed loop is unstable.
     """
     w = np.asarray(omega, dtype=float)
-    if loop.is_composed:
-        return _read_worst(_composed_reader(loop, w, lowest_noise))
+    read_loops = partial(_read_loops, w=w, lowest_noise=lowest_noise)
+    if is_cut_at_command(loop):
+        return _read_worst(_composed_reader(loop, w, read_loops))
     average, command = AveragedPlant(loop, compiled=True), names(loop.plant.inputs).index(loop.command.name)
     scale = np.array([s.nominal for s in loop.plant.states])
 
@@ -529,21 +561,42 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
         A, B, C = A * scale / scale[:, None], B / scale, C * scale  # so the matrix of eigenvectors is well conditioned
         plants = _Plants(A, B, C, D, measured, np.reshape(loop.sensor_lag(p.T), (-1, 1)))
         gains = linear_gains(loop, p.T, plants.measured, u[:, command]).full()
-        controllers, matrices = controller_matrices(gains, loop.dead_time), plants.with_sensor()
-        (A, B, C), (Ac, Bc, Cc, Dc) = matrices, controllers
+        controllers, (A, B, C) = controller_matrices(gains), plants.with_sensor()
+        Ac, Bc, Cc, Dc = controllers
         closed = np.block([[A - B @ Dc @ C, B @ Cc], [-Bc @ C, Ac]])
-        poles = _poles(closed)
-        if set(only) == {MAX_SENSITIVITY} and not plants.D.any():
-            opened = np.concatenate([_poles(matrices[0]), _poles(controllers[0])], axis=1)
-            found = {MAX_SENSITIVITY: sensitivity_peaks(opened, poles, w[0], w[-1])}
-        else:
-            respond, at_infinity = _pid_responses(gains, plants.response(loop.dead_time, w))
-            found = _read_responses(respond, at_infinity, w, lowest_noise, only)
-        if MAX_SENSITIVITY in only:  # at infinity the loop is open
-            found[MAX_SENSITIVITY] = np.maximum(found[MAX_SENSITIVITY], 1.0)
-        return _mark_unstable(found, closed, poles)
+        if not D.any():
+            opened = np.concatenate([_poles(A), _poles(Ac)], axis=1)
+            sensitivity = SensitivityReader(opened, _poles(closed), np.zeros(len(p)), *dead_times(loop, p))
+            return read_loops(closed, sensitivity, lambda: _pid_responses(gains, plants.response(w)), only=only)
+        responses, at_infinity = _pid_responses(gains, plants.response(w))
+        found = _read_responses(responses, at_infinity, w, lowest_noise, only)
+        return _mark_unstable(found, are_stable(closed))
 
     return _read_worst(read_points)
+
+
+def _read_loops(
+    closed: Array,
+    sensitivity: "SensitivityReader",
+    respond: Callable[[], tuple[Responses, Array]],
+    only: Collection[str],
+    w: Array,
+    lowest_noise: float,
+) -> dict[str, Array]:
+    """Margins and peaks of loops by their closed loops' matrices and their poles, by responses where these are asked.
+
+    `respond` gives the approximate loops' responses and noise gains at infinity.
+    """
+    found, turned = sensitivity.peaks(only, w[0], w[-1])
+    if not set(only) <= set(found):
+        approximate, at_infinity = respond()
+
+        def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
+            L, C = approximate(w)
+            return L * sensitivity.delay_factor(w), C
+
+        found |= _read_responses(responses, at_infinity, w, lowest_noise, [n for n in only if n not in found])
+    return _mark_unstable(found, are_stable(closed, sensitivity.closed) & (turned == 0))
 
 
 def _read_worst(read_points: MarginFunction) -> MarginFunction:
@@ -562,31 +615,32 @@ def _read_worst(read_points: MarginFunction) -> MarginFunction:
     return read_margins
 
 
-def _composed_reader(loop: ClosedLoop, w: Array, lowest_noise: float) -> MarginFunction:
-    """Function that reads the margins of loops with further feedback, for parameters and points of shape (m, n)."""
+def _composed_reader(loop: ClosedLoop, w: Array, read_loops: Callable[..., dict[str, Array]]) -> MarginFunction:
+    """Function that reads the margins of loops cut at the command, for parameters and points of shape (m, n)."""
     linearise = ComposedLoops(loop, compiled=True)
 
     def read_points(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
-        opened, noise = linearise(p, x, u)
-        parts = [_partial_fraction_response(A, B[..., 0], C[:, 0], w) for A, B, C, _ in (opened, noise)]
-        (A, B, C, D), ends = opened, (opened[3][:, 0, 0], noise[3][:, 0, 0])
+        loops = linearise(p, x, u)
+        (A, B, C, D), ends = loops.loop, (loops.loop[3][:, 0, 0], loops.noise[3][:, 0, 0])
 
-        def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
-            L, control = (part(w) + end[:, None] for part, end in zip(parts, ends, strict=True))
-            return L, control
+        def respond() -> tuple[Responses, Array]:
+            each = loops.loop, loops.noise
+            parts = [_partial_fraction_response(A, B[..., 0], C[:, 0], w) for A, B, C, _ in each]
 
-        found = _read_responses(responses, np.abs(ends[1] / (1 + ends[0])), w, lowest_noise, only)
-        if MAX_SENSITIVITY in only:
-            found[MAX_SENSITIVITY] = np.maximum(found[MAX_SENSITIVITY], np.abs(1 / (1 + ends[0])))
-        closed = A - B @ C / (1 + D)
-        return _mark_unstable(found, closed, _poles(closed))
+            def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
+                L, control = (part(w) + end[:, None] for part, end in zip(parts, ends, strict=True))
+                return L, control
+
+            return responses, np.abs(ends[1] / (1 + ends[0]))
+
+        closed, delay = A - B @ C / (1 + D), (loops.dead_time, loops.pade_order, loop.pid.sample_time)
+        return read_loops(closed, SensitivityReader(_poles(A), _poles(closed), ends[0], *delay), respond, only=only)
 
     return read_points
 
 
-def _mark_unstable(found: dict[str, Array], closed: Array, poles: ComplexArray) -> dict[str, Array]:
-    """Metrics with those of unstable loops NaN or infinite, by the closed loops' matrices and poles."""
-    stable = are_stable(closed, poles)
+def _mark_unstable(found: dict[str, Array], stable: NDArray[np.bool_]) -> dict[str, Array]:
+    """Metrics with those of unstable loops NaN or infinite."""
     return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
 
 
@@ -620,12 +674,12 @@ def _read_responses(
     return found
 
 
-def _refine_peaks(
-    size: Callable[[Array], Array], omega: Array, on_grid: Array, refinements: int = 4, points: int = 9
-) -> Array:
-    """Largest value of functions of frequency, shape (m,), on a grid (n,) or (m, n) and on finer ones about two peaks.
+def _refine_peaks(size: Callable[[Array], Array], omega: Array, on_grid: Array) -> Array:
+    """Largest value of functions of frequency, shape (m,), from a grid (n,) or (m, n), about its two highest peaks.
 
-    The function takes frequencies (m, k) and gives values (m, k), `on_grid` those of the grid.
+    The function takes frequencies (m, k) and gives values (m, k), `on_grid` those of the grid. At last a grid is so
+    fine that its peak is a parabola's, about whose vertex the next one lies: to 1e-8 of a peak that is not sharper than
+    the first grid.
     """
     rows, last = np.arange(len(on_grid))[:, None], on_grid.shape[1] - 1
     edged = np.pad(on_grid, ((0, 0), (1, 1)), constant_values=-inf)
@@ -633,12 +687,19 @@ def _refine_peaks(
     k = np.argpartition(np.where(is_peak, -on_grid, 0.0), 1, axis=1)[:, :2]  # the two highest
     grid = np.broadcast_to(np.log(omega), on_grid.shape)
     low, high = grid[rows, np.maximum(k - 1, 0)], grid[rows, np.minimum(k + 1, last)]
-    largest, shares = on_grid.max(axis=1), np.linspace(0.0, 1.0, points)
-    for _ in range(refinements):
-        grids = low[..., None] + (high - low)[..., None] * shares
+    largest = on_grid.max(axis=1)
+    for points, reach in ((9, 1.0), (9, 0.5), (9, 0.5), (5, 0.0)):  # reach in cells about the next grid's middle
+        grids = low[..., None] + (high - low)[..., None] * np.linspace(0.0, 1.0, points)
         sizes = size(np.exp(grids.reshape(len(rows), -1))).reshape(grids.shape)
-        largest, at = np.fmax(largest, sizes.max(axis=(1, 2))), sizes.argmax(axis=2)[..., None]
-        low, high = (np.take_along_axis(grids, np.clip(at + d, 0, points - 1), axis=2)[..., 0] for d in (-1, 1))
+        largest, at = np.fmax(largest, sizes.max(axis=(1, 2))), sizes.argmax(axis=2)
+        near = np.clip(at, 1, points - 2)[..., None] + np.arange(-1, 2)
+        below, mid, above = np.moveaxis(np.take_along_axis(sizes, near, axis=2), 2, 0)
+        with np.errstate(all="ignore"):
+            vertex = 0.5 * (below - above) / (below - 2 * mid + above)
+        inside = (at == near[..., 1]) & (np.abs(vertex) <= 0.5) & (reach < 1)
+        cell = (high - low) / (points - 1)
+        middle = low + cell * (at + np.where(inside, vertex, 0.0))
+        low, high = np.maximum(middle - reach * cell, low), np.minimum(middle + reach * cell, high)
     return np.asarray(largest)
 
 
@@ -653,13 +714,12 @@ class _Plants:
     measured: Array
     lag: Array
 
-    def response(self, dead_time: float, typical: Array) -> Callable[[Array], ComplexArray]:
-        """Responses with sensor and hold, a function of frequencies (n,) or (m, n); checked on typical ones."""
+    def response(self, typical: Array) -> Callable[[Array], ComplexArray]:
+        """Responses with sensor, a function of frequencies (n,) or (m, n); checked on typical ones."""
         plant = _partial_fraction_response(self.A, self.B, self.C, typical)
 
         def response(w: Array) -> ComplexArray:
-            delay = pade_delay_response(w, dead_time)
-            return np.asarray((plant(w) + self.D[:, None]) * delay / (1 + 1j * w * self.lag))
+            return np.asarray((plant(w) + self.D[:, None]) / (1 + 1j * w * self.lag))
 
         return response
 
@@ -716,7 +776,7 @@ _MARGIN_FUNCTIONS: dict[str, Callable[[ComplexArray], Array]] = {
 }
 _PEAK_FUNCTIONS: dict[str, Callable[[ComplexArray, ComplexArray], Array]] = {
     MAX_SENSITIVITY: lambda L, _: 1 / np.abs(1 + L),
-    "MaxComplementarySensitivity": lambda L, _: np.abs(L / (1 + L)),
+    MAX_COMPLEMENTARY: lambda L, _: np.abs(L / (1 + L)),
     NOISE_GAIN: lambda L, C: np.abs(C / (1 + L)),
 }
 
@@ -745,27 +805,75 @@ def _partial_fraction_response(A: Array, B: Array, C: Array, typical: Array) -> 
     return response
 
 
-def sensitivity_peaks(
-    opened: ComplexArray, closed: ComplexArray, low: float, high: float, spread: int = 48, at_a_time: int = 128
-) -> Array:
-    """The largest ``|S(jw)|`` of m loops (m,) by their poles (m, n) [rad/s], for low <= w <= high [rad/s].
+@dataclass(frozen=True, eq=False)
+class SensitivityReader:
+    """Sensitivities of m loops by the poles of the open and of the closed loop (m, n) [rad/s], and by L(oo) (m,).
 
-    Its first grid has the frequencies about the closed loop's poles, and so many that are spread evenly: with fewer a
-    broad maximum is missed. More loops at a time do not fit the processor's cache.
+    Dead times (m,) [s] count as delays; in the poles they are Padé approximants of that order. Frequencies are those of
+    `delay_over_pade`.
     """
-    parts, peaks = np.arange(0, len(opened), at_a_time)[1:], list[Array]()
-    for p, q in zip(np.split(opened, parts), np.split(closed, parts), strict=True):
-        even = np.broadcast_to(np.geomspace(low, high, spread), (len(p), spread))
-        around = (np.abs(q) + share * np.abs(q.real) for share in (-1, 0, 1))  # a resonance and its flanks
-        omega = np.sort(np.concatenate([even, *(np.clip(w, low, high) for w in around)], axis=1), axis=1)
-        peaks.append(_refine_peaks(partial(_squares, p, q), omega, _squares(p, q, omega)))
-    return np.sqrt(np.concatenate(peaks))
 
+    opened: ComplexArray
+    closed: ComplexArray
+    direct: Array
+    dead_time: Array
+    pade_order: int = 0
+    sample_time: float | None = None
 
-def _squares(opened: ComplexArray, closed: ComplexArray, omega: Array) -> Array:
-    """``|S(jw)|^2``, shape (m, k); pole by pole, so that no product leaves the range of a double."""
-    with np.errstate(all="ignore"):
-        found = np.ones_like(omega)
-        for p, q in zip(opened.T[..., None], closed.T[..., None], strict=True):
-            found *= (np.square(omega - p.imag) + np.square(p.real)) / (np.square(omega - q.imag) + np.square(q.real))
-    return found
+    def delay_factor(self, w: Array) -> ComplexArray | float:
+        """What the approximants lack of the delays at frequencies of shape (n,) or (m, n)."""
+        if not self.pade_order:
+            return 1.0
+        return delay_over_pade(w, self.dead_time[:, None], self.pade_order, self.sample_time)
+
+    def peaks(
+        self, only: Collection[str], low: float, high: float, spread: int = 48, at_a_time: int = 128
+    ) -> tuple[dict[str, Array], Array]:
+        """Those of Ms and Mt that are asked for, for low <= w <= high [rad/s] and at infinity; and `turns`, (m,).
+
+        The first grid has the frequencies about the closed loop's poles, and so many that are spread evenly: with fewer
+        a broad maximum is missed. More loops at a time do not fit the processor's cache.
+        """
+        named = [n for n in (MAX_SENSITIVITY, MAX_COMPLEMENTARY) if n in only]
+        found, turned = {n: np.empty(len(self.opened)) for n in named}, np.zeros(len(self.opened))
+        if not named and not self.pade_order:
+            return found, turned
+        for first in range(0, len(self.opened), at_a_time):
+            rows = slice(first, first + at_a_time)
+            part = replace(self, **{n: getattr(self, n)[rows] for n in ("opened", "closed", "direct", "dead_time")})
+            omega = part._grid(low, high, spread)
+            S, L = part._responses(omega)
+            if self.pade_order:
+                turned[rows] = turns(1 + L, 1 / S)
+            for n in named:
+                size = partial(part._size, n)
+                found[n][rows] = _refine_peaks(size, omega, size(omega))
+        with np.errstate(all="ignore"):
+            ends = {MAX_SENSITIVITY: 1 / np.abs(1 + self.direct)}
+            ends[MAX_COMPLEMENTARY] = np.abs(self.direct) * ends[MAX_SENSITIVITY]
+        return {n: np.fmax(value, ends[n]) for n, value in found.items()}, turned
+
+    def _grid(self, low: float, high: float, spread: int) -> Array:
+        q, m = self.closed, len(self.closed)
+        even = [np.broadcast_to(np.geomspace(low, high, spread), (m, spread))]
+        if self.pade_order:  # beyond the approximant's poles the delay turns on
+            even.append(DELAY_ANGLE / self.dead_time[:, None] * np.linspace(0.0, 1.0, 2 * spread + 1)[1:])
+        # a resonance and its flanks, by either of a pair of poles others, for equal ones would hide a second peak
+        shares = zip((-1.0, 0.0, 1.0), (-0.5, 0.5, 2.0), strict=True)
+        around = (np.abs(q) + np.where(q.imag < 0, theirs, ours) * np.abs(q.real) for ours, theirs in shares)
+        return np.sort(np.clip(np.concatenate([*even, *around], axis=1), low, high), axis=1)
+
+    def _responses(self, omega: Array) -> tuple[ComplexArray, ComplexArray]:
+        """The approximate loops' S, and the L with its delay, shape (m, k); pole by pole, so that no product is inf."""
+        s = 1j * omega
+        with np.errstate(all="ignore"):
+            S = np.broadcast_to(1 / (1 + self.direct[:, None]), omega.shape).astype(complex)
+            for p, q in zip(self.opened.T[..., None], self.closed.T[..., None], strict=True):
+                S *= (s - p) / (s - q)
+            return S, (1 / S - 1) * self.delay_factor(omega)
+
+    def _size(self, metric: str, omega: Array) -> Array:
+        S, L = self._responses(omega)
+        with np.errstate(all="ignore"):
+            S = 1 / (1 + L) if self.pade_order else S
+            return np.abs(S if metric == MAX_SENSITIVITY else 1 - S)

@@ -13,6 +13,7 @@ from pneuopt.evaluation.requirements import (
     EnvelopeBounds,
     MaxComplementarySensitivity,
     MaxSensitivity,
+    NoiseGain,
     Overshoot,
     PeakControl,
     Requirement,
@@ -28,6 +29,7 @@ from pneuopt.evaluation.tolerances import STABILITY_SENSITIVITY, TAIL_SHARE
 from pneuopt.quantities.errors import require
 
 Kind = type | tuple[type, ...]
+LINEAR_PEAKS = (MaxSensitivity, MaxComplementarySensitivity, NoiseGain)
 NO_WEIGHTS: Mapping[Requirement, float] = MappingProxyType({})
 
 
@@ -67,13 +69,15 @@ class Specification:
         """Whether this kind of requirement is a term or a limit."""
         return self.weight(kind) > 0 or self.limit(kind) < inf
 
-    def tighten(self, margin: float, peaks: float) -> "Specification":
+    def tighten(self, margin: float, peaks: float, linear: float | None = None) -> "Specification":
         """Copy with band and limits smaller by the share `margin`; peak control and sensitivities by the share `peaks`.
 
         So an optimum, which lies on its limits, still keeps those requested once its gains are rounded and simulated.
+        `linear` is the share for the peaks of a linear loop's responses, which no simulation blurs; None: as others.
         """
         room: dict[type, float] = {SettlingTime: 0.0, SettlingTimeRaw: 0.0}
         room |= dict.fromkeys((PeakControl, MaxSensitivity, MaxComplementarySensitivity), peaks)
+        room |= {} if linear is None else dict.fromkeys(LINEAR_PEAKS, linear)
         limits = tuple(with_upper_limit(q, upper_limit(q) * (1 - room.get(type(q), margin))) for q in self.limits)
         return replace(self, limits=limits, band=self.band * (1 - margin))
 

@@ -2,6 +2,7 @@
 
 # Simulations and readings
 
+CERTIFIED_PADE_ORDER = 12  # of a dead time in every simulation of `evaluate`: responses are the delay's to 1e-5
 SIMULATION_TOLERANCE = 1e-8  # relative, of continuations and rest checks; the absolute one is a hundredth of it
 READINGS_A_HORIZON = 1000  # at least: with fewer, a signal leaves the band between two readings unseen
 MIN_READINGS_A_SAMPLE, MAX_READINGS_A_SAMPLE = 2, 16  # of the controller, whatever the horizon
@@ -49,6 +50,8 @@ SPEED_TOLERANCE = 1e-3  # share by which a speed may miss the largest one and co
 POLE_ROUNDING = 1e-13  # share of a matrix's size by which rounding moves its well conditioned poles
 MOST_POLE_ROUNDING = 1e-7  # share of the fastest pole beyond which rounding moves no double pole at zero
 NOISE_ANGLE = 0.3  # of the slowest noise that counts, over a horizon [rad]: slower noise is a drift
+DELAY_ANGLE = 25.0  # of a dead time [rad], up to which frequencies are spread evenly: loops roll off before four turns
+MOST_TANGENT = 1e6  # of half a sample's angle: nearer to half the sampling frequency an angle has no digits left
 FLAT = 1e-3  # relative change of a response over a grid's two lowest frequencies, below which it is that at rest
 
 # The certificate

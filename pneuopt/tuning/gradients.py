@@ -65,6 +65,7 @@ from pneuopt.tuning.tolerances import (
     DIFFERENCE_STEP,
     INFINITE_BOUND,
     KEPT_STATES,
+    LIMIT_TOLERANCE,
     MAX_CUTTING_ROUNDS,
     NEAR_LIMIT,
     PENALTY_RAISES,
@@ -97,7 +98,11 @@ class Polish:
 
     def improve(self, unit: Array, on: Simulator, iterations: int) -> tuple[Array, int]:
         """Descend from points of the unit cube (m, n) on some samples; where each ends, and points simulated."""
-        inside, count, space = self.spec.tighten(PROGRAM_MARGIN, PROGRAM_MARGIN), 0, self.simulator.space
+        inside, count, space = (
+            self.spec.tighten(PROGRAM_MARGIN, PROGRAM_MARGIN, LIMIT_TOLERANCE / 2),
+            0,
+            self.simulator.space,
+        )
         first = to_records(on.values(space.from_unit(unit[:1]), self.spec))[0]
         unknown = {SettlingTime.metric.name: max(grid.reference.horizon for grid in on.grids)}
         known = {n: v if np.isfinite(v) else unknown.get(n, 1.0) for n, v in first.items()}

@@ -93,6 +93,10 @@ class Method(Protocol):
         """The share of `margin` by which limits on peaks of command and sensitivity are tightened."""
 
     @property
+    def linear_margin(self) -> float:
+        """Likewise on the sensitivities and the noise gain of a loop whose plant is linear."""
+
+    @property
     def digits(self) -> int | None:
         """To how many significant digits the gains are rounded; None: not at all."""
 

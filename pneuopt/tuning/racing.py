@@ -107,6 +107,7 @@ class Racing:
     digits: int | None = 4
 
     peak_margin: ClassVar[float] = 1 / 5  # of which coarse samples miss as much
+    linear_margin: ClassVar[float] = 0.0  # peaks that no sample blurs are exact
     parameters_without_effect: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ may hold where the best one hunts, creeps, or breaks a limit after its horizon.
 """
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.optimize import OptimizeResult, differential_evolution
 
+from pneuopt.control.averaging import is_affine
 from pneuopt.evaluation.certificate import Certificate, Defect, judge_evaluations
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
 from pneuopt.evaluation.requirements import (
@@ -64,10 +65,10 @@ from pneuopt.tuning.tolerances import (
     MAX_CANDIDATES,
     MAX_CERTIFIED_POINTS,
     MAX_REFINED_SEARCHES,
+    MAX_ROUNDINGS,
     MEMBERS_A_GAIN,
     NEARBY,
     RELAXATION_MARGIN,
-    ROUNDING_ROUNDS,
     SAME_OBJECTIVE,
     SAMPLING_TOLERANCE,
     TRIALS_A_GAIN,
@@ -454,35 +455,53 @@ class Search:
         It asks for a stable loop, too, whatever was asked for.
         """
         spec = self.spec.with_rest(self.task.horizon) if self.rests else self.spec
-        return spec.tighten(margin, margin * self.method.peak_margin).with_stability()
+        linear = margin * self.method.linear_margin if is_affine(self.task.loop.plant) else None
+        return spec.tighten(margin, margin * self.method.peak_margin, linear).with_stability()
 
     def _round_gains(self, simulator: Simulator, found: SearchResult, margin: float) -> Iterator[Array]:
-        """Roundings of the gains found: the nearest one, then neighbours that keep the limits and lose little."""
-        digits, spec, tried = self.method.digits, self.tighten(margin / 2), list[list[float]]()
+        """Roundings of the gains found that keep the limits, those first that lose least; at least one rounding.
+
+        The rounded gains about the point form a lattice, of which a line through any of them and its two neighbours
+        says along each gain what is worth simulating: an active limit is then missed by a hundredth of a last place.
+        """
+        digits, spec = self.method.digits, self.tighten(margin / 2)
         if digits is None:
             yield found.point
             return
-        nearest = self.space.round_point(found.point, digits)
-        points, most = nearest[None], found.optimum * (1 + SAME_OBJECTIVE)
-        for _ in range(ROUNDING_ROUNDS):
-            values = simulator.values(points, spec)
-            order, rows = np.argsort(compute_merits(values, spec, self.task.horizon)), to_records(values)
-            for k in order.tolist():
-                good = not spec.violations(rows[k]) and spec.objective(rows[k]) <= most
-                if good and len(tried) < MAX_CERTIFIED_POINTS and points[k].tolist() not in tried:
-                    tried.append(points[k].tolist())
-                    yield points[k]
-            points = self.space.neighbours(points[order[0]], digits)
-            if not len(points):
-                break
-        if tried:
-            return
-        # no single last place keeps the limits
-        points = np.vstack([nearest, self.space.neighbourhood(nearest, digits)])
-        rows = to_records(self.simulator.values(points, spec))
+        nearest, most = self.space.round_point(found.point, digits), found.optimum * (1 + SAME_OBJECTIVE)
+        points = np.vstack([nearest, self.space.neighbours(nearest, digits)])
+        near = simulator.values(points, spec)
+        lattice = self.space.lattice(nearest, digits)
+        merits = compute_merits(extrapolate(points, near, lattice), spec, self.task.horizon)
+        likely = lattice[np.argsort(merits, kind="stable")[:MAX_ROUNDINGS]]
+        points = np.vstack([points, *(self.space.round_point(point, digits) for point in likely)])
+        far = simulator.values(points[-len(likely) :], spec)
+        rows = to_records({n: np.append(near[n], far[n]) for n in near})
         costs = [np.inf if spec.violations(row) else spec.objective(row) for row in rows]
-        best = [k for k in np.argsort(costs).tolist() if costs[k] <= most][:MAX_CERTIFIED_POINTS]
-        yield from points[best or [0]]
+        best = [k for k in np.argsort(costs, kind="stable").tolist() if costs[k] <= most]
+        tried = list[list[float]]()
+        for point in points[best or [0]]:
+            if len(tried) < MAX_CERTIFIED_POINTS and point.tolist() not in tried:
+                tried.append(point.tolist())
+                yield point
+
+
+def extrapolate(points: Array, values: Mapping[str, Array], others: Array) -> dict[str, Array]:
+    """Values at other points (m, n) by parabolas along each gain, from the first of the points and from its neighbours.
+
+    A neighbour differs from the first point in one gain; a gain with one neighbour has a line, one without has none.
+    """
+    found = {n: np.full(len(others), value[0]) for n, value in values.items()}
+    for k, (at, moved) in enumerate(zip(points[0], (others - points[0]).T, strict=True)):
+        beside = np.flatnonzero(points[:, k] != at)
+        steps = points[beside, k] - at
+        for n, value in values.items():
+            with np.errstate(invalid="ignore"):
+                slopes = (value[beside] - value[0]) / steps
+            if len(beside) and np.isfinite(slopes).all():
+                bend = np.diff(slopes) / np.diff(steps) if len(beside) == 2 else np.zeros(1)
+                found[n] += moved * (slopes[0] + bend[0] * (moved - steps[0]))
+    return found
 
 
 def _ends_elsewhere(result: TuningResult) -> bool:

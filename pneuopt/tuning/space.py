@@ -127,26 +127,31 @@ class Space:
             found += [np.where(np.arange(len(rounded)) == k, v, rounded) for v in sides if low <= v <= up]
         return np.reshape(found, (-1, len(rounded)))
 
-    def neighbourhood(self, rounded: Array, digits: int, most: int = 5**4) -> Array:
-        """The points that differ from a rounded one by up to two last places in every coordinate, shape (m, n).
+    def lattice(self, rounded: Array, digits: int, most: int = 20_000, reach: int = 40) -> Array:
+        """The points that differ from a rounded one by some last places in every coordinate, shape (m, n).
 
-        Where they are more than `most`, those of four gains, that many are drawn at random.
+        By up to `reach` places; where these are more than `most` points by fewer, and of many gains some at random.
 
         Examples
         --------
         >>> from pneuopt.quantities.parameters import Parameter
         >>> space = Space(ParameterSet({"pid.Kp": Parameter(0.4, "1", 0.0, 0.4001, free=True)}), ("pid.Kp",))
-        >>> space.neighbourhood(space.start, 4).ravel().tolist()
+        >>> space.lattice(space.start, 4, reach=2).ravel().round(4).tolist()
         [0.3998, 0.3999, 0.4, 0.4001]
         """
-        n, sides = len(rounded), np.arange(-2, 3)
-        few = len(sides) ** n <= most
-        drawn = np.random.default_rng(0).integers(-2, 3, (most, n))
-        offsets = np.array(list(itertools.product(sides, repeat=n))) if few else np.unique(drawn, axis=0)
         places = np.array([_last_place(value, digits) for value in rounded.tolist()])
-        points = [[_round_digits(v, digits) for v in row] for row in (rounded + offsets * places).tolist()]
+        n = np.count_nonzero(places)
+        reach = max(1, min(reach, int((most ** (1 / max(1, n)) - 1) / 2)))
+        sides = np.arange(-reach, reach + 1)
+        if len(sides) ** n > most:
+            offsets = np.random.default_rng(0).integers(-reach, reach + 1, (most, n))
+        else:
+            offsets = np.array(list(itertools.product(sides, repeat=n)))
+        points = np.tile(rounded, (len(offsets), 1))
+        points[:, places > 0] += offsets * places[places > 0]
         low, up = self.bounds.T
-        return np.array([point for point in points if np.all((point >= low) & (point <= up))]).reshape(-1, n)
+        slack = 1e-3 * places
+        return np.asarray(points[((points >= low - slack) & (points <= up + slack)).all(axis=1)])
 
 
 def _last_place(value: float, digits: int) -> float:

@@ -90,6 +90,7 @@ class TwoPhase:
     solver: FullSpace = field(default_factory=lambda: FullSpace(max_iterations=400, first_barrier=1e-2))
 
     peak_margin: ClassVar[float] = 1 / 300  # the exact problem misses no peak
+    linear_margin: ClassVar[float] = 1 / 300  # of which its frequencies miss as much
     parameters_without_effect: ClassVar[tuple[str, ...]] = PARAMETERS_WITHOUT_EFFECT
 
     def __post_init__(self) -> None:

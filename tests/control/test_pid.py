@@ -585,8 +585,9 @@ def test_whatever_its_form_the_same_law_runs(
     w = np.geomspace(0.1, 400.0, 30)
     L = [frequency_response(open_loop(loop, p), w) for loop, p in pairs]
     np.testing.assert_allclose(L[0], L[1], rtol=1e-10)
-    terms = [sensitivity_terms(loop, w, p)(loop.parameter_vector(p)).full() for loop, p in pairs]
-    np.testing.assert_allclose(terms[0], terms[1], rtol=1e-10)
+    if sample_time is None:
+        terms = [sensitivity_terms(loop, w, p)(loop.parameter_vector(p)).full() for loop, p in pairs]
+        np.testing.assert_allclose(terms[0], terms[1], rtol=1e-10)
     only = ("MaxSensitivity", "NoiseGain")
     reads = [
         batch_margin_function(loop, w)(loop.parameter_vector(p)[None], np.zeros((1, 1, 2)), np.zeros((1, 1, 1)), only)

@@ -162,7 +162,7 @@ def test_a_fine_encoder_is_a_lag_of_its_filter_and_half_a_sample() -> None:
     runs = [respond(loop, Step(0.1, horizon=0.2), loop.parameters.with_values(SPEED_GAINS)) for loop in loops]
     assert runs[0]["speed"] == pytest.approx(runs[1]["speed"], abs=2e-4)
     fine, lagging = (open_loop(loop, loop.parameters.with_values(SPEED_GAINS)) for loop in loops)
-    np.testing.assert_allclose(fine.A, lagging.A)
+    assert margins(fine).max_sensitivity == pytest.approx(margins(lagging).max_sensitivity, rel=2e-3)
 
 
 @pytest.mark.parametrize("h", [1e-3, 5e-3])
@@ -177,7 +177,7 @@ def test_an_encoders_margins_are_those_of_the_sampled_loop(h: float, filter_time
     slope = (1 - 1 / z) / h
     L = control.sample_system(plant, h, "zoh")(z) * slope / (1 + filter_time * slope) * (300 + 4000 / slope)
     ours = open_loop(loop, given)
-    assert margins(ours).max_sensitivity == pytest.approx(np.max(1 / np.abs(1 + L)), rel=0.02)
+    assert margins(ours).max_sensitivity == pytest.approx(np.max(1 / np.abs(1 + L)), rel=1e-5)
     x, numbers = np.zeros((1, 2)), loop.parameter_vector(given)[None]
     found = batch_margin_function(loop, np.geomspace(1.0, 1e3, 2000))(
         numbers, x[None], np.zeros((1, 1, 1)), ("MaxSensitivity",)

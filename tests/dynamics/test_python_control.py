@@ -14,7 +14,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.python_control import from_control, to_control
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.margins import margins
+from pneuopt.evaluation.margins import frequency_response, margins
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Quantity
 
@@ -24,12 +24,25 @@ EQ16 = control.tf([1270.12], [1, 17.5, 86.34])
 
 
 def test_margins_of_an_open_loop_are_those_of_python_control(second_order: System) -> None:
-    loop = ClosedLoop(second_order, PID(sample_time=1e-3))
+    loop = ClosedLoop(second_order, PID())
     linear = open_loop(loop, loop.parameters.with_values(GAINS))
     ours, theirs = margins(linear), control.stability_margins(to_control(linear))
-    assert ours.gain_margin == pytest.approx(theirs[0], rel=1e-4)
-    assert ours.phase_margin == pytest.approx(theirs[1], rel=1e-4)
-    assert 1 / ours.max_sensitivity == pytest.approx(theirs[2], rel=1e-4)
+    assert ours.phase_margin == pytest.approx(theirs[1], rel=1e-6)
+    assert 1 / ours.max_sensitivity == pytest.approx(theirs[2], rel=1e-6)
+
+
+@pytest.mark.parametrize("h", [1e-3, 5e-3])
+def test_a_sampled_open_loop_is_sampled_there(second_order: System, h: float) -> None:
+    loop = ClosedLoop(second_order, PID(sample_time=h, delay=1))
+    linear = open_loop(loop, loop.parameters.with_values(GAINS))
+    theirs, w = to_control(linear), np.geomspace(0.1, 0.99 * np.pi / h, 50)
+    assert theirs.dt == h
+    np.testing.assert_allclose(theirs(np.exp(1j * w * h)), frequency_response(linear, w), rtol=1e-7)
+    dense = np.geomspace(0.1, 0.999 * np.pi / h, 4000)
+    _, phase_margin, vector_margin, *_ = control.stability_margins(control.frd(theirs, dense, smooth=True))
+    ours = margins(linear)
+    assert ours.phase_margin == pytest.approx(phase_margin, abs=0.02)
+    assert 1 / ours.max_sensitivity == pytest.approx(vector_margin, rel=1e-3)
 
 
 def test_names_go_along(second_order: System) -> None:

@@ -19,8 +19,10 @@ from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.models.catalog import r25
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import FrictionModel, Karnopp, LuGre, Stribeck, Viscous
+from pneuopt.models.linear import FirstOrder
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
@@ -155,3 +157,38 @@ def test_hunting_is_measured_and_a_ringing_that_dies_out_is_not() -> None:
     calm = evaluate(loop, Step(0.05, horizon=2.0), p)["0 to 0.05"]
     assert calm["LimitCycleAmplitude"] == 0.0
     assert np.isnan(calm["LimitCycleFrequency"])
+
+
+def late_response(Kp: float, Ki: float, h: float, horizon: float) -> Array:
+    """``dy/dt = -y + u(t - 1)`` under a PI after a step of 1, by the method of steps: RK4, the command by cubics."""
+    late, count = round(1 / h), round(horizon / h)
+    y, integral = np.zeros(count + 1), 0.0
+    u = np.full(count + 1, Kp)
+    for k in range(count):
+        first, middle, last = 0.0, 0.0, 0.0
+        if k >= late:
+            j = k - late
+            i = max(j - 1, 0)  # four of the commands about the step, of which the middle is wanted
+            weights = (5, 15, -5, 1) if i == j else (-1, 9, 9, -1)
+            first, middle, last = u[j], np.dot(weights, u[i : i + 4]) / 16, u[j + 1]
+        k1 = first - y[k]
+        k2 = middle - y[k] - h / 2 * k1
+        k3 = middle - y[k] - h / 2 * k2
+        k4 = last - y[k] - h * k3
+        y[k + 1] = y[k] + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        between = (y[k] + y[k + 1]) / 2 + h / 8 * (k1 - (last - y[k + 1]))
+        integral += Ki * h / 6 * (6 - y[k] - 4 * between - y[k + 1])
+        u[k + 1] = Kp * (1 - y[k + 1]) + integral
+    return y
+
+
+@pytest.mark.parametrize("order", [1, 3])
+def test_a_dead_time_is_the_delay_itself_whatever_a_files_order(order: int) -> None:
+    loop = ClosedLoop(FirstOrder(pade_order=order).system(), PID(limits=False))
+    values = {"plant.time_constant": 1.0, "plant.dead_time": 1.0, "pid.Kp": 0.6, "pid.Ki": 0.5}
+    found = evaluate(loop, Step(1.0, horizon=20.0), loop.parameters.with_values(values)).iloc[:, 0]
+    h = 0.002
+    y = late_response(0.6, 0.5, h, 20.0)
+    assert found["Overshoot"] == pytest.approx(100 * (y.max() - 1), abs=1e-3)
+    assert found["IAE"] == pytest.approx(np.trapezoid(np.abs(1 - y), dx=h), rel=1e-5)
+    assert found["SettlingTime"] == pytest.approx(h * np.flatnonzero(np.abs(y - 1) > 0.02)[-1], abs=h)

@@ -14,6 +14,7 @@ from pneuopt.evaluation.certificate import Defect, Finding
 from pneuopt.evaluation.requirements import (
     IAE,
     ITAE,
+    MaxComplementarySensitivity,
     MaxSensitivity,
     Overshoot,
     PhaseMargin,
@@ -29,7 +30,15 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import Refusal, TuningResult
-from pneuopt.tuning.search import Search, _excess, confirm_infeasible, confirm_refusal, find_candidates, relax
+from pneuopt.tuning.search import (
+    Search,
+    _excess,
+    confirm_infeasible,
+    confirm_refusal,
+    extrapolate,
+    find_candidates,
+    relax,
+)
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, search_space
 from pneuopt.tuning.tolerances import MAX_CANDIDATES, NEARBY
@@ -63,6 +72,32 @@ def _refuses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def asked() -> Any:
     return {"minimise": SettlingTime(), "subject_to": [Overshoot(0.05)], "method": SMALL, "plants": {}, "throw": False}
+
+
+@pytest.mark.parametrize("dead_time", [0.0, 0.1])
+def test_sensitivities_of_a_linear_loop_are_tuned_to_their_limit(dead_time: float) -> None:
+    """To 1e-4 with gains of four digits, and never beyond."""
+    plant = SecondOrder(2 if dead_time else 0)
+    loop, free = ClosedLoop(plant.system(), PID(limits=False)), {"pid.Kp": (0.01, 5.0), "pid.Ki": (0.1, 30.0)}
+    values = {"plant.natural_frequency": 10.0, "plant.damping": 1.0, "pid.Kp": 0.2, "pid.Ki": 1.0}
+    values |= {"plant.dead_time": dead_time} if dead_time else {}
+    given = loop.parameters.with_values(values).with_bounds(free).freed(*free)
+    step = Step(0.0, horizon=8.0, disturbance={"valve_voltage": 1.0}, scale=1.0)
+    limits, method = [MaxSensitivity(1.4), MaxComplementarySensitivity(1.4)], Racing(members=20, trials=300)
+    found = tune(loop, step, given, minimise=IAE(), subject_to=limits, method=method, plants={})
+    assert 1.4 - 1e-4 <= found.certified.loc["MaxSensitivity"].max() <= 1.4
+
+
+def test_a_lattice_is_judged_by_parabolas_through_neighbours() -> None:
+    points = np.array([[1.0, 2.0, 3.0], [0.9, 2.0, 3.0], [1.1, 2.0, 3.0], [1.0, 2.5, 3.0]])
+    others = np.array([[1.3, 2.5, 3.0], [0.5, 1.0, 4.0]])
+
+    def value(p: Array) -> Array:
+        return np.asarray(3 * p[:, 0] ** 2 - p[:, 0] + 4 * p[:, 1])
+
+    found = extrapolate(points, {"value": value(points), "nan": np.array([1.0, np.nan, 2.0, 3.0])}, others)
+    np.testing.assert_allclose(found["value"], value(others))
+    np.testing.assert_allclose(found["nan"], [3.0, -3.0])
 
 
 @pytest.mark.usefixtures("_refuses")
