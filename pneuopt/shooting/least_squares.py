@@ -664,7 +664,7 @@ def iterate(state: SearchState, iterations: int) -> SearchState:
     creeping = 0
     try:
         for _ in range(iterations):
-            if state.stage.refine > 1 and state.corrects_residuals and state.correction is None:
+            if state.is_coarse and state.corrects_residuals and state.correction is None:
                 state = correct_residuals_by(state, fine_steps(state.segments, state.substeps, state.stage.refine))
                 descent.objective = state.objective()
             descent.damps_nodes = state.noisy_gaps or state.is_near_end
