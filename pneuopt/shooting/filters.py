@@ -97,37 +97,50 @@ def update_states(
     """Update the states of some segments by their data: Gauss-Newton, whose steps are cut where they do not help.
 
     Segment `at` (g,) has states `before` (g, n) of covariance `P` (g, n, n) in nominal sizes, and parameters (g, k).
+    A step that promises hardly anything is taken as it is linearised, without another run.
     """
     n, nominal = before.shape[1], segments.nominal
     prior = solve_each(P, np.tile(np.eye(n), (len(at), 1, 1)))
     given = segments.inputs[at], values, segments.t[at], segments.h[at], segments.measured[at], segments.weights[at]
     scale = np.append(nominal, np.ones(segments.sensitivities.n_columns - n + 1))
-    both = np.outer(scale, scale)
-    x, step, kept = before.copy(), np.zeros_like(before), None
+    both, stretch = np.outer(scale, scale), scale[:-1] / nominal[:, None]
+    x, step, rows, kept = before.copy(), np.zeros_like(before), np.arange(len(at)), None
     for _ in range(UPDATES):
-        run = segments.sensitivities.gram(x * nominal, *given, substeps=substeps)
-        gram, away = run.grams * both, x - before
-        pull = (prior @ away[..., None])[..., 0]
+        run = segments.sensitivities.gram(x[rows] * nominal, *(each[rows] for each in given), substeps=substeps)
+        gram, away = run.grams * both, x[rows] - before[rows]
+        pull = (prior[rows] @ away[..., None])[..., 0]
         squares = gram[:, -1, -1] + np.sum(away * pull, axis=1)
-        moved = run.dx_end * (scale[:-1] / nominal[:, None])
-        trial = StateUpdate(x, run.x_end / nominal, squares, gram, moved, prior, prior + gram[:, :n, :n])
+        information = prior[rows] + gram[:, :n, :n]
+        trial = StateUpdate(
+            x[rows], run.x_end / nominal, squares, gram, run.dx_end * stretch, prior[rows], information
+        )
+        downhill, is_better = -gram[:, :n, -1] - pull, np.ones(len(rows), dtype=bool)
         if kept is None:
-            better = np.arange(len(at))
             kept = trial._replace(squares=np.where(np.isfinite(squares), squares, np.inf))
         else:
-            is_settled = bool((np.abs(squares - kept.squares) < SETTLED_SQUARES).all())
-            better = np.flatnonzero(squares < kept.squares)
+            is_better = squares < kept.squares[rows]
             for old, new in zip(kept, trial, strict=True):
-                old[better] = new[better]
-            if is_settled:
-                break
-        downhill = -gram[:, :n, -1] - pull
-        step *= STEP_CUT
-        step[better] = solve_each(trial.information[better], downhill[better][..., None])[..., 0]
-        x = kept.state + step
+                old[rows[is_better]] = new[is_better]
+        step[rows] *= STEP_CUT
+        step[rows[is_better]] = solve_each(information[is_better], downhill[is_better][..., None])[..., 0]
+        is_settled = is_better & ~(np.sum(downhill * step[rows], axis=1) > SETTLED_SQUARES)
+        take_step(kept, rows[is_settled], step, downhill[is_settled])
+        rows = rows[~is_settled]
+        if not rows.size:
+            break
+        x[rows] = kept.state[rows] + step[rows]
     assert kept is not None
     kept.end[~np.isfinite(kept.squares)] = np.nan
     return kept
+
+
+def take_step(update: StateUpdate, rows: Indices, steps: Array, downhill: Array) -> None:
+    """Move some of the states by their steps (g, n) in place, as they are linearised."""
+    n, step = steps.shape[1], steps[rows]
+    update.state[rows] += step
+    update.squares[rows] -= np.sum(downhill * step, axis=1)
+    update.end[rows] += (update.moved[rows, :, :n] @ step[..., None])[..., 0]
+    update.gram[rows, :-1, -1] += (update.gram[rows, :-1, :n] @ step[..., None])[..., 0]
 
 
 def solve_each(A: Array, b: Array) -> Array:
