@@ -13,6 +13,7 @@ filter has no such unknowns: it predicts each segment from those before it, and 
 nodes following them, which sum to zero at an optimum; and the information J'J of the same residuals.
 """
 
+import itertools
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,7 +31,6 @@ from pneuopt.shooting.tolerances import (
     GATHERED_DEVIATION,
     GIVEN_UP_DAMPING,
     KNOWN_DEVIATION,
-    LEAD_SEGMENTS,
     LEAST_DAMPING,
     MAX_BATCH_NUMBERS,
     PIECE_SEGMENTS,
@@ -48,20 +48,22 @@ def filter_nodes(segments: Segments, nodes: Array, q: Array, gathered: float = G
 
     `q` (k,) holds all parameters; `gathered` is the deviation of a state from node to node, in nominal sizes.
     """
-    first = np.arange(0, segments.count, PIECE_SEGMENTS)
     segments, substeps = choose_integration(segments, nodes, q)
     rough, found = nodes / segments.nominal, nodes / segments.nominal
-    heads = np.append(True, ~segments.linked[:-1])
+    heads = np.flatnonzero(np.append(True, ~segments.linked[:-1]))
+    runs = itertools.pairwise([*heads.tolist(), segments.count])
+    first, ends = np.array([(k, min(k + PIECE_SEGMENTS, b)) for a, b in runs for k in range(a, b, PIECE_SEGMENTS)]).T
+    begins = np.maximum(first - PIECE_SEGMENTS, heads[np.searchsorted(heads, first, "right") - 1])
     start = np.where(np.isfinite(segments.fixed_start), KNOWN_DEVIATION, START_DEVIATION) ** 2
-    x, P = rough[first], np.zeros((len(first), nodes.shape[1], nodes.shape[1]))
-    for step in range(-LEAD_SEGMENTS, PIECE_SEGMENTS):
-        at = np.clip(first + step, 0, segments.count - 1)
-        begins = (step == -LEAD_SEGMENTS) | heads[at] | ~np.isfinite(x).all(axis=1) | ~np.isfinite(P).all(axis=(1, 2))
-        x = np.where(begins[:, None], rough[at], x)
-        P = np.where(begins[:, None, None], start[at][:, None] * np.eye(nodes.shape[1]), P)
-        updated = update_states(segments, at, x, P, q[segments.parameter_positions[at]], substeps)
-        x, P = updated.end, updated.spread(gathered)
-        own = np.flatnonzero((step >= 0) & (first + step < segments.count) & np.isfinite(updated.state).all(axis=1))
+    x, P = rough[begins], start[begins][:, None] * np.eye(nodes.shape[1])
+    for step in range(int((ends - begins).max())):
+        rows = np.flatnonzero(begins + step < ends)
+        at = begins[rows] + step
+        is_lost = ~np.isfinite(x[rows]).all(axis=1) | ~np.isfinite(P[rows]).all(axis=(1, 2))
+        x[rows[is_lost]], P[rows[is_lost]] = rough[at[is_lost]], start[at[is_lost]][:, None] * np.eye(nodes.shape[1])
+        updated = update_states(segments, at, x[rows], P[rows], q[segments.parameter_positions[at]], substeps)
+        x[rows], P[rows] = updated.end, updated.spread(gathered)
+        own = (at >= first[rows]) & np.isfinite(updated.state).all(axis=1)
         found[at[own]] = updated.state[own]
     return np.asarray(found * segments.nominal)
 
@@ -97,50 +99,37 @@ def update_states(
     """Update the states of some segments by their data: Gauss-Newton, whose steps are cut where they do not help.
 
     Segment `at` (g,) has states `before` (g, n) of covariance `P` (g, n, n) in nominal sizes, and parameters (g, k).
-    A step that promises hardly anything is taken as it is linearised, without another run.
     """
     n, nominal = before.shape[1], segments.nominal
     prior = solve_each(P, np.tile(np.eye(n), (len(at), 1, 1)))
     given = segments.inputs[at], values, segments.t[at], segments.h[at], segments.measured[at], segments.weights[at]
     scale = np.append(nominal, np.ones(segments.sensitivities.n_columns - n + 1))
-    both, stretch = np.outer(scale, scale), scale[:-1] / nominal[:, None]
-    x, step, rows, kept = before.copy(), np.zeros_like(before), np.arange(len(at)), None
+    both = np.outer(scale, scale)
+    x, step, kept = before.copy(), np.zeros_like(before), None
     for _ in range(UPDATES):
-        run = segments.sensitivities.gram(x[rows] * nominal, *(each[rows] for each in given), substeps=substeps)
-        gram, away = run.grams * both, x[rows] - before[rows]
-        pull = (prior[rows] @ away[..., None])[..., 0]
+        run = segments.sensitivities.gram(x * nominal, *given, substeps=substeps)
+        gram, away = run.grams * both, x - before
+        pull = (prior @ away[..., None])[..., 0]
         squares = gram[:, -1, -1] + np.sum(away * pull, axis=1)
-        information = prior[rows] + gram[:, :n, :n]
-        trial = StateUpdate(
-            x[rows], run.x_end / nominal, squares, gram, run.dx_end * stretch, prior[rows], information
-        )
-        downhill, is_better = -gram[:, :n, -1] - pull, np.ones(len(rows), dtype=bool)
+        moved = run.dx_end * (scale[:-1] / nominal[:, None])
+        trial = StateUpdate(x, run.x_end / nominal, squares, gram, moved, prior, prior + gram[:, :n, :n])
         if kept is None:
+            better = np.arange(len(at))
             kept = trial._replace(squares=np.where(np.isfinite(squares), squares, np.inf))
         else:
-            is_better = squares < kept.squares[rows]
+            is_settled = bool((np.abs(squares - kept.squares) < SETTLED_SQUARES).all())
+            better = np.flatnonzero(squares < kept.squares)
             for old, new in zip(kept, trial, strict=True):
-                old[rows[is_better]] = new[is_better]
-        step[rows] *= STEP_CUT
-        step[rows[is_better]] = solve_each(information[is_better], downhill[is_better][..., None])[..., 0]
-        is_settled = is_better & ~(np.sum(downhill * step[rows], axis=1) > SETTLED_SQUARES)
-        take_step(kept, rows[is_settled], step, downhill[is_settled])
-        rows = rows[~is_settled]
-        if not rows.size:
-            break
-        x[rows] = kept.state[rows] + step[rows]
+                old[better] = new[better]
+            if is_settled:
+                break
+        downhill = -gram[:, :n, -1] - pull
+        step *= STEP_CUT
+        step[better] = solve_each(trial.information[better], downhill[better][..., None])[..., 0]
+        x = kept.state + step
     assert kept is not None
     kept.end[~np.isfinite(kept.squares)] = np.nan
     return kept
-
-
-def take_step(update: StateUpdate, rows: Indices, steps: Array, downhill: Array) -> None:
-    """Move some of the states by their steps (g, n) in place, as they are linearised."""
-    n, step = steps.shape[1], steps[rows]
-    update.state[rows] += step
-    update.squares[rows] -= np.sum(downhill * step, axis=1)
-    update.end[rows] += (update.moved[rows, :, :n] @ step[..., None])[..., 0]
-    update.gram[rows, :-1, -1] += (update.gram[rows, :-1, :n] @ step[..., None])[..., 0]
 
 
 def solve_each(A: Array, b: Array) -> Array:
