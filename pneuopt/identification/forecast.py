@@ -13,6 +13,7 @@ fitted alike, and the mean square of the errors by time since the start is what 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -46,6 +47,7 @@ from pneuopt.identification.tolerances import (
     FORECAST_STARTS,
     LEVEL,
     MIN_WINDOW_SAMPLES,
+    REFIT_STAGES,
     START_SHARE,
 )
 from pneuopt.logs.experiment import Experiment
@@ -226,13 +228,18 @@ class _Forecast:
     values: Array  # of all parameters
     substeps: int
     heads: Indices  # (m,): samples to which the start is fitted
-    y: Array  # (m, n, n_outputs)
+
+    @cached_property
+    def y(self) -> Array:
+        """The outputs of the runs, (m, n, n_outputs), by the steps of the search."""
+        with np.errstate(all="ignore"):
+            return self.segments.run(self.nodes, self.values, self.substeps).y
 
     def join(self, log: Experiment, fit: Fitted | None) -> Trajectory:
         """The run of a log along its parts, by an independent simulation, with its band."""
         errors, columns = None if fit is None else fit.forecast_error, dict[str, Array]()
         covariance = None if fit is None else fit.covariance
-        variance = np.zeros(self.y.shape) if covariance is None else self.variance(covariance)
+        variance = np.zeros(self.segments.measured.shape) if covariance is None else self.variance(covariance)
         known, behaviour = apply_conditions(self.parameters, log), input_behaviour(self.system, log)
         for part, own in enumerate(self.experiments):
             inputs = own.trajectory
@@ -252,7 +259,7 @@ class _Forecast:
 
     def variance(self, covariance: "pd.DataFrame") -> Array:
         """Variance of the outputs (m, n, n_outputs) by the parameters."""
-        order, total = list(self.segments.transcription.parameters), np.zeros(self.y.shape)
+        order, total = list(self.segments.transcription.parameters), np.zeros(self.segments.measured.shape)
         matrix = covariance.to_numpy(dtype=float)
         rows = [i for i, n in enumerate(covariance.index) if n in order and matrix[i, i] > 0]
         place, scale = [order.index(str(covariance.index[i])) for i in rows], np.sqrt(np.diag(matrix)[rows])
@@ -298,7 +305,9 @@ def _forecast(
         except LogError:  # as of inputs that do not move yet, which tell nothing of parameters
             rest = {s.name: v for s, v in zip(system.states, system.rest_state(known), strict=True)}
             guess = Start({e.name: _constant(e, rest) for e in short}, {})
-        fit = solve_least_squares(problem.transcription(guess), method)
+        last = replace(method, stages=method.stages[-REFIT_STAGES:], checks_steps=False, allows_state_noise=False)
+        settled = problem.filter_states(guess, last.stages[-1].gap)
+        fit = solve_least_squares(problem.transcription(settled), last)
         starts, substeps = [run.matrix(names(system.states))[0] for run in fit.trajectories], int(fit.stats["substeps"])
     guesses = {
         part.name: _constant(part, dict(zip(names(system.states), start, strict=True)))
@@ -309,9 +318,7 @@ def _forecast(
     values = np.array([p.value for p in segments.transcription.parameters.values()])
     nodes = start_nodes(segments)
     segments, substeps = choose_integration(segments, nodes, values, substeps)
-    with np.errstate(all="ignore"):
-        y = segments.run(nodes, values, substeps).y
-    return _Forecast(system, known, tuple(parts), segments, nodes, values, substeps, heads, y)
+    return _Forecast(system, known, tuple(parts), segments, nodes, values, substeps, heads)
 
 
 def _constant(log: Experiment, states: Mapping[str, float]) -> Trajectory:

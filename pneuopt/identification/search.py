@@ -356,13 +356,14 @@ def _hold_unidentifiable(
 ) -> tuple[EstimationProblem, Fit]:
     """Hold one undetermined parameter after the other, at its given value or where the first fit has left it."""
     held, fit, given = problem, first, problem.unknowns()
-    warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
+    worst = HOPELESS_MISFIT * max(1.0, 2 * first.stats["cost"] / max(1, first.count))
+    warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:], max_misfit=worst)
     source = given if is_given else first.parameters
     while (names := _open_names(held, fit)) and len(held.fixed) + len(names) < len(given.free_names):
         held = replace(held, fixed={**held.fixed, **{n: source.value(n) for n in names}})
         before, fit = fit, solve_least_squares(held.transcription(held.start_from(fit, label)), warm)
         fit = fit.with_effort_of(before)
-        if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):
+        if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED) or fit.end is SearchEnd.ABANDONED:
             break
     return held, fit
 

@@ -13,6 +13,7 @@ filter has no such unknowns: it predicts each segment from those before it, and 
 nodes following them, which sum to zero at an optimum; and the information J'J of the same residuals.
 """
 
+import itertools
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,7 +31,6 @@ from pneuopt.shooting.tolerances import (
     GATHERED_DEVIATION,
     GIVEN_UP_DAMPING,
     KNOWN_DEVIATION,
-    LEAD_SEGMENTS,
     LEAST_DAMPING,
     MAX_BATCH_NUMBERS,
     PIECE_SEGMENTS,
@@ -48,20 +48,22 @@ def filter_nodes(segments: Segments, nodes: Array, q: Array, gathered: float = G
 
     `q` (k,) holds all parameters; `gathered` is the deviation of a state from node to node, in nominal sizes.
     """
-    first = np.arange(0, segments.count, PIECE_SEGMENTS)
     segments, substeps = choose_integration(segments, nodes, q)
     rough, found = nodes / segments.nominal, nodes / segments.nominal
-    heads = np.append(True, ~segments.linked[:-1])
+    heads = np.flatnonzero(np.append(True, ~segments.linked[:-1]))
+    runs = itertools.pairwise([*heads.tolist(), segments.count])
+    first, ends = np.array([(k, min(k + PIECE_SEGMENTS, b)) for a, b in runs for k in range(a, b, PIECE_SEGMENTS)]).T
+    begins = np.maximum(first - PIECE_SEGMENTS, heads[np.searchsorted(heads, first, "right") - 1])
     start = np.where(np.isfinite(segments.fixed_start), KNOWN_DEVIATION, START_DEVIATION) ** 2
-    x, P = rough[first], np.zeros((len(first), nodes.shape[1], nodes.shape[1]))
-    for step in range(-LEAD_SEGMENTS, PIECE_SEGMENTS):
-        at = np.clip(first + step, 0, segments.count - 1)
-        begins = (step == -LEAD_SEGMENTS) | heads[at] | ~np.isfinite(x).all(axis=1) | ~np.isfinite(P).all(axis=(1, 2))
-        x = np.where(begins[:, None], rough[at], x)
-        P = np.where(begins[:, None, None], start[at][:, None] * np.eye(nodes.shape[1]), P)
-        updated = update_states(segments, at, x, P, q[segments.parameter_positions[at]], substeps)
-        x, P = updated.end, updated.spread(gathered)
-        own = np.flatnonzero((step >= 0) & (first + step < segments.count) & np.isfinite(updated.state).all(axis=1))
+    x, P = rough[begins], start[begins][:, None] * np.eye(nodes.shape[1])
+    for step in range(int((ends - begins).max())):
+        rows = np.flatnonzero(begins + step < ends)
+        at = begins[rows] + step
+        is_lost = ~np.isfinite(x[rows]).all(axis=1) | ~np.isfinite(P[rows]).all(axis=(1, 2))
+        x[rows[is_lost]], P[rows[is_lost]] = rough[at[is_lost]], start[at[is_lost]][:, None] * np.eye(nodes.shape[1])
+        updated = update_states(segments, at, x[rows], P[rows], q[segments.parameter_positions[at]], substeps)
+        x[rows], P[rows] = updated.end, updated.spread(gathered)
+        own = (at >= first[rows]) & np.isfinite(updated.state).all(axis=1)
         found[at[own]] = updated.state[own]
     return np.asarray(found * segments.nominal)
 

@@ -41,9 +41,9 @@ MIN_LOG_INFORMATION = 1e-6
 
 # Filters
 
-PIECE_SEGMENTS = 300  # segments a piece: more take more steps one after the other, fewer waste more on the lead
-# segments before a piece from which its states come: fewer leave it the error of its start, more cost time
-LEAD_SEGMENTS = 300
+# segments a piece, and before it, from which its states come: fewer leave it the error of its start, more take more
+# steps one after the other
+PIECE_SEGMENTS = 100
 START_DEVIATION = 0.1  # of the state where a piece or a log begins, in nominal sizes [1]: about that of rough states
 # deviation that a state gathers from one node to the next, in nominal sizes [1], by parameters that are not known well:
 # lower follows wrong ones away from the measurements, higher leaves states that do not fit together

@@ -21,15 +21,14 @@ def values(segments: Segments) -> Array:
 
 
 def test_pieces_side_by_side_give_the_filter_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lead forgets where a piece starts, here within four time constants; without one it would show."""
+    """The segments before a piece forget where it starts, here within four time constants; fewer would show it."""
     segments = first_order_log(FILTERED).segments
     rough, q = start_nodes(segments), values(segments)
     whole = filters.filter_nodes(segments, rough, q)
-    monkeypatch.setattr(filters, "PIECE_SEGMENTS", 4)
-    monkeypatch.setattr(filters, "LEAD_SEGMENTS", 8)
+    monkeypatch.setattr(filters, "PIECE_SEGMENTS", 8)
     pieces = filters.filter_nodes(segments, rough, q)
     np.testing.assert_allclose(pieces, whole, atol=1e-4)
-    monkeypatch.setattr(filters, "LEAD_SEGMENTS", 0)
+    monkeypatch.setattr(filters, "PIECE_SEGMENTS", 1)
     assert np.abs(filters.filter_nodes(segments, rough, q) - whole).max() > 1e-3
 
 
