@@ -65,6 +65,7 @@ from pneuopt.tuning.tolerances import (
     ROUNDING_ROUNDS,
     SAME_OBJECTIVE,
     SAMPLING_TOLERANCE,
+    UNSETTLED_EXCESS,
     WORST_MERIT,
 )
 
@@ -413,7 +414,7 @@ class Search:
         return result
 
     def _certify_ends(self, found: SearchResult, margin: float) -> TuningResult:
-        """Certify the point found; where it ends elsewhere or late, other ends of the search, without integral perhaps."""
+        """Certify the point found; where it ends elsewhere or late, the search's other ends as well."""
         result = self.certify_roundings(found, margin)
         others = found.others if _ends_elsewhere(result) or _fails_late(result) else ()
         tried = (self.certify_roundings(self.restate(replace(found, point=point)), margin) for point in others)
@@ -647,8 +648,10 @@ def _describe_closest(excess: float) -> str:
 
     Examples
     --------
-    >>> _describe_closest(0.123), _describe_closest(-0.61)
-    ('the closest is 12.3 % beyond them', 'the best stays 61 % below them')
+    >>> _describe_closest(0.123), _describe_closest(-0.61), _describe_closest(10.2)
+    ('the closest is 12.3 % beyond them', 'the best stays 61 % below them', 'none is stable and settles yet')
     """
     share = f"{100 * abs(excess):.3g} %"
+    if excess >= UNSETTLED_EXCESS:
+        return "none is stable and settles yet"
     return f"the closest is {share} beyond them" if excess > 0 else f"the best stays {share} below them"

@@ -140,6 +140,17 @@ def test_the_record_tells_the_least_value_of_one_limit_among_points_that_keep_th
         assert limits.candidates(limit, most=1.0)[0][0] == pytest.approx(Kp, abs=1e-3)
 
 
+def test_where_the_best_end_never_settles_another_end_of_the_search_is_certified() -> None:
+    """With Kp 1 and Ki 18 the response is in its band at the horizon, and overshoots by half the step later."""
+    search = search_for(Step(1.0, horizon=0.165), SettlingTime(0.2))
+    late, calm = np.array([1.0, 18.0]), np.array([2.0, 10.0])
+    found = search.restate(SearchResult(late, Status(Code.CONVERGED), ()))
+    assert not search._certify_ends(found, 0.0).status.converged
+    held = search._certify_ends(replace(found, others=(late, calm)), 0.0)
+    assert held.status.converged
+    assert [held.parameters.value(n) for n in search.space.names] == pytest.approx(calm, rel=1e-2)
+
+
 def search_for(step: Step, minimise: Requirement, *limits: Requirement) -> Search:
     loop, given = problem()
     return prepare_search(prepare_task(loop, step, given, specify(minimise, limits)), SMALL)
