@@ -477,11 +477,12 @@ def search_result(task: TuningTask, simulator: Simulator, spec: Specification, p
 
 
 class _Phase(NamedTuple):
-    """A part of a search: what it reads, on which samples, and how many trials it may take."""
+    """A part of a search: what it reads, on which samples, how many trials it may take, and which merit is enough."""
 
     name: str
     simulator: Simulator
     trials: int
+    enough: float = -np.inf
 
 
 class _RacingSearch:
@@ -514,7 +515,7 @@ class _RacingSearch:
         while len(bests) < most and self.agreeing < 2:
             self._planned = round((min(2, most) + FINE_SHARE) * trials) if len(bests) < 2 else self.count + trials
             population = self._next_population(method)
-            population, merits = self._search(population, method, trials, LAGGING * min(bests, default=np.inf))
+            population, merits = self._search(population, method, trials, min(bests, default=-np.inf))
             self._ends.append(population)
             bests = sorted([*bests, float(merits[0])])
             self.starts, self.agreeing = len(bests), sum(b <= bests[0] * (1 + SAME_OBJECTIVE) for b in bests)
@@ -564,11 +565,12 @@ class _RacingSearch:
         merits, _ = Race(self._coarse, self._spec, self._scale).merits(self._space.from_unit(points))
         return np.asarray(points[np.argmin(merits)])
 
-    def _search(self, population: Array, method: Racing, trials: int, most: float) -> tuple[Array, Array]:
+    def _search(self, population: Array, method: Racing, trials: int, best: float) -> tuple[Array, Array]:
         """Search from one start on coarse samples: over wide bands first, then in the band asked for, by gradients.
 
-        It ends after the wide bands where it lags behind the first start there, and without gradients where its best
-        merit is above `most`; there are no bands without a settling time.
+        It ends after the wide bands where it lags behind the first start there, on coarse samples where it comes as
+        near to the `best` merit of the starts before as two have to agree, and without gradients where it lags behind
+        that; there are no bands without a settling time.
         """
         simulator, spec = self._simulator, self._spec
         widest = max(band_share(spec.band, grid.reference) for grid in simulator.grids)
@@ -582,9 +584,10 @@ class _RacingSearch:
                 return self._best_first(population, simulator)
             self._wide = self._wide if self._ends else float(merits[0])
         left = round((1 - sum(BAND_SHARES[: len(stages)])) * trials)
-        population, merits = self.evolve(population, _Phase("coarse samples", simulator.coarse(spec), left))
+        phase = _Phase("coarse samples", simulator.coarse(spec), left, best * (1 + SAME_OBJECTIVE))
+        population, merits = self.evolve(population, phase)
         self._bests.append(population[0])
-        if merits[0] <= most:
+        if not self._ends or merits[0] <= LAGGING * best:
             population, merits = self._polish(*self._best_first(population, simulator), simulator, method.polish)
             self._polished.append(population[: self._points])
         return population, merits
@@ -631,7 +634,7 @@ class _RacingSearch:
                 self._cut(race)
             stand.append((best, float(np.median(history.merits))))
             self._report(f"{phase.name}, generation {number + 1}")
-            if is_stalled(stand, history.merits):
+            if best <= phase.enough or is_stalled(stand, history.merits):
                 break
         order = np.argsort(history.merits, kind="stable")
         return history.population[order], history.merits[order]
