@@ -41,6 +41,7 @@ from pneuopt.evaluation.metric import (
     without_slopes,
 )
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
+from pneuopt.evaluation.tolerances import NO_OVERSHOOT
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.units import ANR_DENSITY
 
@@ -278,9 +279,14 @@ _share_of_step = partial(
 
 @final
 class Overshoot(AtMost):
-    """Distance of the response beyond the reference, as a fraction of the step."""
+    """Distance of the response beyond the reference, as a fraction of the step; a `max` of 0 stands for 0.01 %."""
 
     metric = _share_of_step("Overshoot", advice="5 % is 0.05", slope=overshoot_rows)
+
+    def __post_init__(self) -> None:
+        if self.max == 0:
+            object.__setattr__(self, "max", NO_OVERSHOOT)
+        super().__post_init__()
 
 
 @final

@@ -25,6 +25,7 @@ TAIL_SHARE = 0.05  # of a record that is its end, where ripple is read and a set
 RIPPLE_ALLOWANCE = 2.0  # amplitudes of the ripple by which the signal moves towards its mean: 1 leaves a growing ripple
 EDGE_ROUNDING = 1e-9  # share of a band's half width by which rounding may put what lies on its edge outside
 MIN_EXIT = 1e-3  # of a band's half width: an exit by less refutes no settling, for readings are no more exact
+NO_OVERSHOOT = 1e-4  # overshoot [step] that counts as none: ten times what readings and rounded gains tell apart
 MIN_STAY_RATIO = 2.0  # of the last stay in the band to the longest before, from which a late response has settled
 
 # Limit cycles

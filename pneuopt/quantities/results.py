@@ -57,6 +57,10 @@ class Shown(ABC):
 class Result(Shown):
     """What a search or a certificate hands out: it prints, and it can be saved."""
 
+    def row(self) -> dict[str, float | str]:
+        """What a study's table shows of it, numbers and text by name; an `InputError` where it has no row."""
+        raise InputError(f"a {type(self).__name__} has no row in a study; return numbers or text of it, by name")
+
     def save(self, path: str | Path) -> None:
         """Write all of it to a file of JSON text, whole or not at all; `load_result` reads it.
 

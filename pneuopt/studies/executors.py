@@ -35,6 +35,7 @@ from typing import TYPE_CHECKING, Any
 
 from pneuopt.quantities.errors import InputError, PneuoptError, require
 from pneuopt.quantities.parameters import ParameterSet, check_number
+from pneuopt.quantities.results import Result
 from pneuopt.studies.tolerances import (
     CONNECT_SECONDS,
     LIMIT_SHARE,
@@ -104,6 +105,8 @@ def _plain_results(result: Any) -> dict[str, Any]:
     """A result as plain numbers and text, by name."""
     import pandas as pd
 
+    if isinstance(result, Result):
+        result = result.row()
     if isinstance(result, pd.DataFrame):
         if len(result) == 1:
             result = {column: result[column].iloc[0] for column in result}  # each of its own type

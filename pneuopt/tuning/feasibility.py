@@ -136,6 +136,23 @@ def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, valu
     return find_rest(acting, set_sliding_direction(acting, own, value), value, start)
 
 
+def plant_integrates(loop: ClosedLoop, case: TuningCase, space: Space) -> bool:
+    """Whether the plant, linearised where the reference ends, has a pole at 0 that the measured signal shows.
+
+    As in `_check_stability`, a motion is none that changes by less than `LEAST_GROWTH` over the horizon.
+    """
+    try:
+        x, command = _find_operating_point(loop, case, space, case.reference.final)
+        own = case.case_parameters(space.parameters).select(loop.plant.parameters)
+        model = loop.plant.linearise(x, {loop.command.name: command}, own)
+    except (ConvergenceError, InputError, ModelError):
+        return False
+    scale = np.array([q.nominal for q in loop.plant.states])
+    _, sizes, rows = np.linalg.svd(model.A * scale / scale[:, None] * case.reference.horizon)
+    shown = rows @ (model.C[model.outputs.index(loop.feedback.name)] * scale) / loop.feedback.nominal
+    return bool((np.abs(shown[sizes < LEAST_GROWTH]) > LEAST_GROWTH).any())
+
+
 def _find_obstacle(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification, value: float) -> str:
     """The reason why a value cannot be held, or the command that holds it is not allowed; empty where it can."""
     try:

@@ -44,6 +44,7 @@ class SearchResult:
     """The point (n,) that a method found, before rounding, with the limits and bounds that are active there.
 
     `optimum` is the objective there, NaN where the method has none; `is_complete`: no Ctrl-C has ended the search.
+    `others` (n,) are points apart in which it ended as well, the best first.
     """
 
     point: Array
@@ -55,6 +56,7 @@ class SearchResult:
     agreement: "Agreement | None" = None
     is_complete: bool = True
     uses_simulator: bool = False
+    others: tuple[Array, ...] = ()
 
     @property
     def figures(self) -> dict[str, float]:
@@ -140,10 +142,10 @@ class Agreement:
     """How many starts end in the best optimum, and what their ends tell of optima that were missed.
 
     `converged` and `optima`, the starts that end in an optimum and the different ones among them, are None where the
-    method does not tell them apart; `spread` is the relative excess of the worst. `unseen` is the chance that one start
-    more ends in another optimum: of w optima from n independent starts ``w (w + 1)/(n (n - 1))`` (C. G. E. Boender and
-    A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods, Math. Program. 37 (1987)
-    59-80); fewer than three tell nothing, NaN.
+    method does not tell them apart; `spread` is the relative excess of the worst, or then of the second best. `unseen`
+    is the chance that one start more ends in another optimum: of w optima from n independent starts
+    ``w (w + 1)/(n (n - 1))`` (C. G. E. Boender and A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global
+    optimization methods, Math. Program. 37 (1987) 59-80); fewer than three tell nothing, NaN.
     """
 
     starts: int
@@ -158,7 +160,7 @@ class Agreement:
         """The figures as a result's `stats` names them: "starts", "starts_agreeing" and so on."""
         found = {"starts": float(self.starts), "starts_agreeing": float(self.agreeing)}
         if self.converged is None or self.optima is None:
-            return found
+            return found | ({"starts_spread": self.spread} if isfinite(self.spread) else {})
         found |= {"starts_converged": float(self.converged), "starts_optima": float(self.optima)}
         return found | {"starts_spread": self.spread, "starts_unseen": self.unseen}
 
@@ -183,7 +185,9 @@ def describe_agreement(found: Agreement | None) -> tuple[str, str]:
     if found is None or not found.starts:
         return "", ""
     words = f"{found.agreeing} of {found.starts} starts agree"
-    if found.agreeing == found.converged or not found.spread > 0:
+    if found.converged is None and found.agreeing < 2 and found.spread > 0:  # the spread is that of the two best
+        return f"{words}, the next ends {100 * found.spread:.2g} % worse", ""
+    if found.converged in (None, found.agreeing) or not found.spread > 0:
         return words, ""
     worse = f"others end up to {100 * found.spread:.2g} % worse"
     chance = f"one start more would find another optimum with a chance of {100 * found.unseen:.0f} %"

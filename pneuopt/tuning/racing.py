@@ -14,14 +14,17 @@ R. Tanabe, A. Fukunaga, Success-history based parameter adaptation for different
 Evolutionary Computation 2013, 71-78. It knows no merit function, so that a race may answer with a bound.
 """
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import timedelta
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.race import RACE_VALUES, RaceCourse, RaceField, RaceMerit, race
-from pneuopt.evaluation.metric import Band, band_number, band_share, band_unit
+from pneuopt.evaluation.metric import Band, Requirement, band_number, band_share, band_unit
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     ROBUSTNESS_REQUIREMENTS,
@@ -32,6 +35,7 @@ from pneuopt.evaluation.requirements import (
     describe_value,
     metric_name,
     upper_limit,
+    user_value,
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.evaluation.tolerances import EDGE_ROUNDING, STABILITY_SENSITIVITY
@@ -39,6 +43,7 @@ from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import check_argument, check_number
 from pneuopt.quantities.status import Code, ProgressCallback, Status
+from pneuopt.tuning.feasibility import plant_integrates
 from pneuopt.tuning.gradients import Polish
 from pneuopt.tuning.method import Agreement, SearchResult, TuningTask, check_method_options
 from pneuopt.tuning.simulator import Responses, Simulator, to_records
@@ -50,6 +55,7 @@ from pneuopt.tuning.tolerances import (
     CUT_SETTLING_TIMES,
     FEW_BEST,
     FINE_MEMBERS,
+    FINE_SHARE,
     KEPT_STATES,
     LAGGING,
     LEAST_CUT,
@@ -61,15 +67,16 @@ from pneuopt.tuning.tolerances import (
     MEMORY_OF_KILLS,
     MEMORY_SIZE,
     MIN_DISTANCE,
+    MOST_STARTS,
     NEARBY,
     NO_DITHER,
     POLISHED,
     POLISHED_NEARBY,
+    REPORT_SECONDS,
     RUNAWAY_LEVEL,
     SAME_OBJECTIVE,
     SHORT_MEMBERS,
     STALLED_GENERATIONS,
-    START_SHARES,
     VIOLATION_PENALTY,
     WORST_MERIT,
 )
@@ -84,8 +91,8 @@ class Racing:
     members : int
         Candidates in the population.
     trials : int
-        Trials for each free gain, at most: a search ends sooner where it no longer advances. On the corners of the
-        drive in problems/shared/t32.py two seeds that ended at 0.185 s with 600 came to 0.154 s with 1200.
+        Trials of a start for each free gain, at most: it ends sooner where it no longer advances. There are starts
+        until two end within 1 % of each other, three at most.
     bands : tuple of float
         Settling bands over which the first phase takes the mean settling time, as multiples of the one asked for.
     polish : int
@@ -153,9 +160,10 @@ class Racing:
         return replace(
             result,
             simulations=best.count,
-            agreement=Agreement(best.starts, best.agreeing),
+            agreement=Agreement(best.starts, best.agreeing, spread=best.spread),
             is_complete=best.is_complete,
             uses_simulator=True,
+            others=tuple(best.others),
         )
 
     def shorten(self, margin: float) -> "Racing":
@@ -170,13 +178,18 @@ class Racing:
 
 @dataclass(frozen=True, eq=False)
 class RacingResult:
-    """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best."""
+    """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best.
+
+    `spread` is the relative excess of the second best start, `others` (k, n) are ends that lie apart.
+    """
 
     point: Array
     count: int
     is_complete: bool
     starts: int
     agreeing: int
+    spread: float
+    others: Array
 
 
 def run_racing(
@@ -192,14 +205,17 @@ def run_racing(
     `start` (n,) is a member of the first population; a method without `bands` searches about it.
     """
     rng, space = np.random.default_rng(method.seed), simulator.space
-    search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress)
+    search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress, task.spec)
     search.most = LAGGING * task.to_beat
     try:
         search.run(method)
     except KeyboardInterrupt:
         best = space.from_unit(search.best_so_far())
-        return RacingResult(best, search.count, False, search.starts, search.agreeing)
-    return RacingResult(space.from_unit(search.best), search.count, True, search.starts, search.agreeing)
+        return RacingResult(
+            best, search.count, False, search.starts, search.agreeing, search.spread, np.empty((0, len(best)))
+        )
+    point, others = space.from_unit(search.best), space.from_unit(search.other_ends())
+    return RacingResult(point, search.count, True, search.starts, search.agreeing, search.spread, others)
 
 
 # What may be asked for where responses are cut short: nothing of it grows after the response has settled.
@@ -398,6 +414,21 @@ def first_population(members: int, start: Array, rng: np.random.Generator) -> Ar
     return found
 
 
+def add_structure(population: Array, simulator: Simulator, share: float = 0.5) -> Array:
+    """Put designs of each kind into a population (m, n): without integral or dither, filters at both ends.
+
+    Each kind takes the place of two members, one of which has the first member's other gains. Where the plant
+    integrates a share of all members is without integral: any may be too much there.
+    """
+    found, space, members = population.copy(), simulator.space, len(population)
+    for k, (gain, at) in enumerate(space.structure[: (members - 1) // 2]):
+        found[1 + k] = found[0]
+        found[[1 + k, -1 - k], gain] = at
+        if space.names[gain] == "pid.Ki" and plant_integrates(simulator.loop, simulator.cases[0], space):
+            found[members - round(share * members) :, gain] = at
+    return found
+
+
 WIDEN_BOUNDS = "widen the gains' bounds, or lower their lower ends"  # the remedy where no stable loop is found
 
 
@@ -449,11 +480,12 @@ def search_result(task: TuningTask, simulator: Simulator, spec: Specification, p
 
 
 class _Phase(NamedTuple):
-    """A part of a search: what it reads, on which samples, and how many trials it may take."""
+    """A part of a search: what it reads, on which samples, how many trials it may take, and which merit is enough."""
 
     name: str
     simulator: Simulator
     trials: int
+    enough: float = -np.inf
 
 
 class _RacingSearch:
@@ -467,54 +499,76 @@ class _RacingSearch:
         start: Array,
         rng: np.random.Generator,
         progress: ProgressCallback,
+        asked: Specification | None = None,
     ) -> None:
         self._simulator, self._space, self._spec, self._scale = simulator, simulator.space, spec, scale
-        self._rng, self._progress, self._coarse = rng, progress, simulator.coarse(spec)
+        self._rng, self._progress, self._coarse, self._asked = rng, progress, simulator.coarse(spec), asked or spec
+        self._begun, self._planned, self._figures, self._figures_at = time.perf_counter(), 0, "", -np.inf
         self._polisher = Polish(simulator, spec)
         self.best, self.count, self.starts, self.agreeing = np.clip(start, 0.0, 1.0), 0, 0, 0
-        self._ends, self._polished, self._points = list[Array](), list[Array](), POLISHED
+        self.spread, self._wide = np.nan, np.inf
+        self._ends, self._polished, self._bests = list[Array](), list[Array](), list[Array]()
+        self._points = POLISHED
         self.most = np.inf  # merit above which it is given up
 
     def run(self, method: Racing) -> None:
-        """Search from each start on coarse samples; from the best of all on fine ones, by gradients and by trials."""
+        """Search from starts on coarse samples until two agree, at most `MOST_STARTS`; from the ends on fine ones."""
         names, given = self._space.names, self.best
-        population = first_population(method.members, given, self._rng)
-        if not method.bands:
-            others = population[1:]  # every other one lies close to the start
-            others[::2] = np.clip(given + NEARBY * self._rng.standard_normal(others.shape), 0.0, 1.0)[::2]
-            self._points = POLISHED_NEARBY
+        trials, most = method.trials * len(names), MOST_STARTS if method.bands else 1
         bests = list[float]()
-        for share in START_SHARES:
-            population, merits = self._search(population, method, share, LAGGING * min(bests, default=np.inf))
+        while len(bests) < most and self.agreeing < 2:
+            self._planned = round((min(2, most) + FINE_SHARE) * trials) if len(bests) < 2 else self.count + trials
+            population = self._next_population(method)
+            population, merits = self._search(population, method, trials, min(bests, default=-np.inf))
             self._ends.append(population)
-            bests.append(float(merits[0]))
-            self.starts, self.agreeing = len(bests), sum(b <= min(bests) * (1 + SAME_OBJECTIVE) for b in bests)
-            if "dither.amplitude" not in names:
-                population = first_population(method.members, self._rng.random(len(names)), self._rng)
-                continue
-            # another kind of start: the gains of the best points, hardly any dither, and an offset that is drawn anew
-            method = replace(method, bands=tuple(sorted(method.bands)[:1]))
-            population = population[np.arange(method.members) % min(FEW_BEST, len(population))]
-            population = np.clip(population + NEARBY * self._rng.standard_normal(population.shape), 0.0, 1.0)
-            population[:, names.index("dither.amplitude")] = NO_DITHER * self._rng.random(method.members)
-            if "dither.offset" in names:
-                population[:, names.index("dither.offset")] = self._rng.random(method.members)
-        if self._is_beaten(min(bests)):
-            self.best = self._ends[int(np.argmin(bests))][0].copy()
+            bests = sorted([*bests, float(merits[0])])
+            self.starts, self.agreeing = len(bests), sum(b <= bests[0] * (1 + SAME_OBJECTIVE) for b in bests)
+        if self._is_beaten(bests[0]):
+            self.best = self._best_first(np.array([end[0] for end in self._ends]), self._coarse)[0][0]
             return
-        trials = (1 - sum(START_SHARES)) * method.trials * len(names)
-        fine = _Phase("fine samples", self._simulator, round(trials))
+        if len(bests) > 1 and bests[0] > 0 and bests[1] < WORST_MERIT:
+            self.spread = bests[1] / bests[0] - 1
+        fine = _Phase("fine samples", self._simulator, round(FINE_SHARE * trials))
         population = self._best_first(np.vstack([*self._ends, given]), self._coarse)[0][:FINE_MEMBERS]
-        ranked = self._best_first(np.vstack([population, *self._polished]), fine.simulator)
-        population, merits = self._polish(*ranked, fine.simulator, method.polish)
+        population, merits = self._best_first(np.vstack([population, *self._polished]), fine.simulator)
         best = merits[0] * (1 - LEAST_IMPROVEMENT)
         population, merits = self.evolve(population[:FINE_MEMBERS], fine)
-        if merits[0] < best:
+        if merits[0] < best or not self._polished:
             self._polish(population, merits, fine.simulator, method.polish)
 
     def _is_beaten(self, merit: float) -> bool:
         """Whether a merit lags too far behind what is to be beaten; one that breaks limits may still keep them."""
         return self.most < merit < WORST_MERIT
+
+    def _next_population(self, method: Racing) -> Array:
+        """The population of the next start: the given gains among designs of each kind; then others.
+
+        The second start of a loop with dither has hardly any; the first of a plant that integrates has no integral.
+        """
+        names, members, number, given = self._space.names, method.members, len(self._ends), self.best
+        if number == 1 and "dither.amplitude" in names:
+            return self._hardly_dithered(self._ends[0])
+        drawn = first_population(members, self._rng.random(len(names)) if number else given, self._rng)
+        if not method.bands:
+            others = drawn[1:]  # every other one lies close to the start
+            others[::2] = np.clip(given + NEARBY * self._rng.standard_normal(others.shape), 0.0, 1.0)[::2]
+            self._points = POLISHED_NEARBY
+        return add_structure(drawn, self._simulator, 0.5 if number or not method.bands else 1.0)
+
+    def other_ends(self) -> Array:
+        """The best points of the starts, before gradients and after, that keep all limits and lie apart; best first."""
+        found, merits = self._best_first(np.array([*self._bests, *(end[0] for end in self._ends)]), self._coarse)
+        kept = np.vstack([self.best, found[merits < WORST_MERIT]])
+        return kept[distinct_points(kept, MIN_DISTANCE)[1:]]
+
+    def _hardly_dithered(self, end: Array) -> Array:
+        """A start of another kind: the gains of an end's best points, hardly any dither, an offset drawn anew."""
+        found = end[np.arange(len(end)) % min(FEW_BEST, len(end))]
+        found = np.clip(found + NEARBY * self._rng.standard_normal(found.shape), 0.0, 1.0)
+        for name, most in (("dither.amplitude", NO_DITHER), ("dither.offset", 1.0)):
+            if name in self._space.names:
+                found[:, self._space.names.index(name)] = most * self._rng.random(len(found))
+        return found
 
     def best_so_far(self) -> Array:
         """The best of the present phase, which may ask for another band, and of the starts that have ended."""
@@ -522,26 +576,36 @@ class _RacingSearch:
         merits, _ = Race(self._coarse, self._spec, self._scale).merits(self._space.from_unit(points))
         return np.asarray(points[np.argmin(merits)])
 
-    def _search(self, population: Array, method: Racing, share: float, most: float) -> tuple[Array, Array]:
-        """Search from one start on coarse samples: over wide bands first, by gradients, and in the band asked for.
+    def _search(self, population: Array, method: Racing, trials: int, best: float) -> tuple[Array, Array]:
+        """Search from one start on coarse samples: over wide bands first, then in the band asked for, by gradients.
 
-        It ends after the wide bands where the best merit is above `most`; there are none without a settling time.
+        It ends after the wide bands where it lags behind the first start there, on coarse samples where it comes as
+        near to the `best` merit of the starts before as two have to agree, and without gradients where it lags behind
+        that; there are no bands without a settling time.
         """
-        simulator, spec, trials = self._simulator, self._spec, share * method.trials * len(self._space.names)
+        simulator, spec = self._simulator, self._spec
         widest = max(band_share(spec.band, grid.reference) for grid in simulator.grids)
         wider = [spec.band * b for b in sorted(method.bands) if widest * b < 1] if spec.concerns(SettlingTime) else []
         stages = [bands for bands in (wider, wider[:1]) if bands]
         for bands, part in zip(stages, BAND_SHARES, strict=False):
             phase = _Phase("wide bands", simulator.coarse(spec, bands), round(part * trials))
-            population, _ = self.evolve(population, phase)
+            population, merits = self.evolve(population, phase)
         if stages:
-            population, merits = self._best_first(population, self._simulator)
-            if merits[0] > most or self._is_beaten(merits[0]):
-                return population, merits
-            population = self._polish(population, merits, self._simulator, method.polish)[0]
-            self._polished.append(population[: self._points])
+            if self._ends and merits[0] > LAGGING * self._wide:
+                return self._best_first(population, simulator)
+            self._wide = self._wide if self._ends else float(merits[0])
+            if self.most < np.inf:
+                population, merits = self._best_first(population, simulator)
+                if self._is_beaten(merits[0]):
+                    return population, merits
         left = round((1 - sum(BAND_SHARES[: len(stages)])) * trials)
-        return self.evolve(population, _Phase("coarse samples", simulator.coarse(spec), left))
+        phase = _Phase("coarse samples", simulator.coarse(spec), left, best * (1 + SAME_OBJECTIVE))
+        population, merits = self.evolve(population, phase)
+        self._bests.append(population[0])
+        if not self._ends or merits[0] <= LAGGING * best:
+            population, merits = self._polish(*self._best_first(population, simulator), simulator, method.polish)
+            self._polished.append(population[: self._points])
+        return population, merits
 
     def _best_first(self, population: Array, simulator: Simulator) -> tuple[Array, Array]:
         """A population in the order of its merits on whole responses, and these."""
@@ -562,7 +626,7 @@ class _RacingSearch:
         population[chosen[better]], merits[chosen[better]] = unit[better], found[better]
         order = np.argsort(merits, kind="stable")
         self.best = population[order[0]].copy()
-        self._progress(f"gradients from {len(chosen)} points: best {merits[order[0]]:.4g}")
+        self._report(f"gradients from {len(chosen)} points")
         return population[order], merits[order]
 
     def evolve(self, population: Array, phase: _Phase) -> tuple[Array, Array]:
@@ -584,11 +648,20 @@ class _RacingSearch:
                 best, self.best = float(history.merits.min()), history.population[np.argmin(history.merits)].copy()
                 self._cut(race)
             stand.append((best, float(np.median(history.merits))))
-            self._progress(f"{phase.name}, generation {number + 1}: best {best:.4g}")
-            if _is_done(stand, history.merits):
+            self._report(f"{phase.name}, generation {number + 1}")
+            if best <= phase.enough or is_stalled(stand, history.merits):
                 break
         order = np.argsort(history.merits, kind="stable")
         return history.population[order], history.merits[order]
+
+    def _report(self, doing: str) -> None:
+        """Report what is done, the best so far in the user's figures, a second old at most, and the time left."""
+        now = time.perf_counter()
+        if now - self._figures_at >= REPORT_SECONDS:
+            values = to_records(self._coarse.values(self._space.from_unit(self.best[None]), self._spec))[0]
+            self._figures, self._figures_at = describe_candidate(values, self._asked, self._simulator.loop), now
+        left = (now - self._begun) * max(0, self._planned - self.count) / max(1, self.count)
+        self._progress(f"{doing}: {self._figures}, about {timedelta(seconds=round(left))} left")
 
     def _cut(self, race: Race) -> None:
         """Cut a race's responses at a multiple of the best settling time, where later samples change no merit."""
@@ -599,16 +672,38 @@ class _RacingSearch:
         race.cut(max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf)
 
 
-def distinct_points(unit: Array, distance: float) -> Indices:
-    """Indices of points in their order; one that lies within a distance of one before it is left out."""
+def describe_candidate(values: Mapping[str, float], asked: Specification, loop: ClosedLoop) -> str:
+    """The objective of a candidate that keeps all limits, or the limit that it breaks most, as the user writes them."""
+
+    def show(q: Requirement, value: float) -> str:
+        return f"{q.metric.factor * user_value(q, value):.4g}"
+
+    def tell(q: Requirement, limit: str = "") -> str:
+        unit = q.metric.shown_unit(loop.command.unit, loop.feedback.unit)
+        return f"{metric_name(q)} {show(q, values[metric_name(q)])}{limit} {unit}".strip()
+
+    broken = {q: share for q, share in asked.excess(values).items() if not share <= LIMIT_TOLERANCE}
+    lacking = [q for q in (*broken, *asked.weights) if not np.isfinite(values[metric_name(q)])]
+    if lacking:
+        return f"closest: no {metric_name(lacking[0])} yet"
+    if broken:
+        q = max(broken, key=lambda q: float(broken[q]))
+        return f"closest: {tell(q, f' of {show(q, upper_limit(q))}')}"
+    return f"best: {' and '.join(tell(q) for q in asked.weights)}"
+
+
+def distinct_points(unit: Array, distance: float, most: int | None = None) -> Indices:
+    """Indices of points in their order, at most so many; one within a distance of one before it is left out."""
     found = list[int]()
     for k in range(len(unit)):
+        if len(found) == most:
+            break
         if all(np.max(np.abs(unit[k] - unit[other])) > distance for other in found):
             found.append(k)
     return np.array(found, dtype=np.intp)
 
 
-def _is_done(stand: Sequence[tuple[float, float]], merits: Array) -> bool:
+def is_stalled(stand: Sequence[tuple[float, float]], merits: Array) -> bool:
     """Whether a population no longer advances: its best and its median stand still, or all its members are alike."""
     stands = len(stand) > STALLED_GENERATIONS and all(
         now > before * (1 - LEAST_IMPROVEMENT)

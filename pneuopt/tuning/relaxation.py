@@ -1,39 +1,123 @@
-"""Relaxation of limits that no design found keeps: by how much each alone, or all together, must give way.
+"""What is left where no design found keeps all limits: how close one comes, and by how much limits have to give way.
 
-For one limit alone the answer is a tuning of its own, which minimises that requirement under the other limits. For all
-together it is the least share by which every limit has to widen: a minimax over the simulator's values, from the points
-that those tunings found.
+`LimitSearch` is one search, success-history differential evolution on the largest relative excess over a limit, that
+keeps every point it simulates. It shares its merit with no other search: a sum of excesses can have a local minimum
+where a design far away keeps every limit. From its record come the closest point, the least common share by which
+limits widen, for each limit alone the least value among points that keep the others, and designs that keep all limits
+and lie apart.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from math import ceil, floor, inf, isfinite, log10, nan
-from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
 from pneuopt.control.reference import Reference
 from pneuopt.evaluation.metric import Requirement, Sense
-from pneuopt.evaluation.requirements import SettlingTime, upper_limit, user_limit, with_user_limit
+from pneuopt.evaluation.requirements import SettlingTime, user_limit
 from pneuopt.evaluation.specification import Specification
 from pneuopt.evaluation.tolerances import TAIL_SHARE
 from pneuopt.quantities.arrays import Array
+from pneuopt.tuning.racing import (
+    SuccessHistory,
+    add_structure,
+    distinct_points,
+    first_population,
+    is_stalled,
+)
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import MAX_LOCAL_SIMULATIONS, UNSETTLED_EXCESS
+from pneuopt.tuning.tolerances import (
+    LEAST_LIMIT_MEMBERS,
+    LOCAL_TRIALS_A_GAIN,
+    MAX_CANDIDATES,
+    MEMBERS_A_GAIN,
+    NEARBY,
+    SAME_OBJECTIVE,
+    TRIALS_A_GAIN,
+    UNSETTLED_EXCESS,
+    WORST_MERIT,
+)
 
 
-def relaxation_specification(
-    spec: Specification, requirement: Requirement, references: Sequence[Reference]
-) -> Specification:
-    """The tuning that makes a limited requirement as small as the other limits allow; the response still settles.
+class LimitSearch:
+    """The minimax search over a simulator's space, and its record of points in the unit cube with their excesses.
 
-    The objective is scaled to the size of the horizon, as the searches' penalties are.
+    `read` gives the shares (m, k) by which points (m, n) exceed k limits, `report` gets the least largest one.
     """
-    limits, horizon = limits_with_settling(spec, references), min(r.horizon - r.at for r in references)
-    weights = {with_user_limit(requirement, None): horizon / upper_limit(requirement)}
-    return replace(spec, weights=weights, limits=tuple(q for q in limits if q is not requirement))
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        read: Callable[[Array], Array],
+        starts: Sequence[Array],
+        report: Callable[[float], None],
+    ) -> None:
+        self._simulator, self._space, self._read, self._report = simulator, simulator.space, read, report
+        self._starts, self._rng = [self._space.to_unit(point) for point in starts], np.random.default_rng(0)
+        n = len(self._space.names)
+        self._members, self._trials = max(LEAST_LIMIT_MEMBERS, MEMBERS_A_GAIN * n), TRIALS_A_GAIN * n
+        self.unit, self.excess = np.empty((0, n)), np.empty((0, 0))
+
+    @property
+    def count(self) -> int:
+        """How many points were simulated."""
+        return len(self.unit)
+
+    def minimise(self, room: float = inf) -> float:
+        """Minimise the largest excess until a point has so much room to all limits; the least excess that was found.
+
+        Populations follow each other until two end alike, or the trials are used up.
+        """
+        ends = list[float]()
+        while self.count < self._trials and not (ends and ends[0] <= -room):
+            given = self._rng.random(self.unit.shape[1]) if ends else self._starts[0]
+            drawn = add_structure(first_population(self._members, given, self._rng), self._simulator)
+            if not ends:
+                drawn[-len(self._starts) :] = np.clip(self._starts, 0.0, 1.0)
+            ends = sorted([*ends, self._evolve(drawn, self._trials - self.count, None, 0.0, room)])
+            if len(ends) > 1 and ends[1] - ends[0] <= SAME_OBJECTIVE * max(1.0, abs(ends[0])):
+                break
+        return ends[0]
+
+    def relax(self, limit: int, margin: float) -> None:
+        """Minimise one limit's excess among points that keep the others with a margin, from the best ones recorded."""
+        order = np.argsort(self.merits(limit, margin), kind="stable")
+        trials = LOCAL_TRIALS_A_GAIN * self.unit.shape[1]
+        self._evolve(self.unit[order[: self._members]], trials, limit, margin, inf)
+
+    def merits(self, limit: int | None = None, margin: float = 0.0, rows: slice = slice(None)) -> Array:
+        """The largest excess of recorded points; that of one limit alone where the others are kept with a margin."""
+        if limit is None:
+            return np.asarray(self.excess[rows].max(axis=1))
+        others = np.delete(self.excess[rows], limit, axis=1).max(axis=1, initial=-inf) + margin
+        return np.where(others <= 0, self.excess[rows, limit], WORST_MERIT * (1 + np.maximum(others, 0.0)))
+
+    def candidates(self, limit: int | None = None, margin: float = 0.0, most: float = 0.0) -> list[Array]:
+        """Points (n,) that lie apart, those with the least merit first, of those with a merit of at most `most`."""
+        merits = self.merits(limit, margin)
+        order = np.argsort(merits, kind="stable")
+        good = self.unit[order[merits[order] <= most]]
+        return list(self._space.from_unit(good[distinct_points(good, NEARBY, MAX_CANDIDATES)]))
+
+    def _evolve(self, population: Array, trials: int, limit: int | None, margin: float, room: float) -> float:
+        """Evolve a population until it stalls, its trials are used up, or it has room; its least merit."""
+        history = SuccessHistory(population, self._record(population, limit, margin), self._rng)
+        stand = list[tuple[float, float]]()
+        for _ in range(max(1, trials // len(population))):
+            stand.append((float(history.merits.min()), float(np.median(history.merits))))
+            self._report(float(self.merits(limit, margin).min()))
+            if stand[-1][0] <= -room or is_stalled(stand, history.merits):
+                break
+            points = history.propose()
+            history.select(points, self._record(points, limit, margin))
+        return float(history.merits.min())
+
+    def _record(self, unit: Array, limit: int | None, margin: float) -> Array:
+        """Simulate points and keep them; their merits."""
+        excess = self._read(self._space.from_unit(unit))
+        self.unit = np.vstack([self.unit, unit])
+        self.excess = np.vstack([self.excess.reshape(-1, excess.shape[1]), excess])
+        return self.merits(limit, margin, slice(len(self.unit) - len(unit), None))
 
 
 def limits_with_settling(
@@ -49,39 +133,10 @@ def limits_with_settling(
     return (*spec.limits, spec.settling(spec.band, max=(1 - TAIL_SHARE) * horizon))
 
 
-def relax_all(simulator: Simulator, space: Space, spec: Specification, points: Sequence[Array]) -> Array:
-    """The point (n,) for which limits widen by the least common share, by Nelder-Mead from the best of the points."""
-
-    def share(unit: Array) -> Array:
-        return limit_excess(simulator.values(space.from_unit(np.clip(unit, 0.0, 1.0)), spec), spec)
-
-    starts = np.array([space.to_unit(point) for point in points])
-    best = starts[np.argmin(share(starts))]
-    steps = np.where(best < 0.5, 0.02, -0.02) * np.eye(len(best))
-    options = {
-        "maxfev": MAX_LOCAL_SIMULATIONS,
-        "initial_simplex": np.vstack([best, best + steps]),
-        "xatol": 1e-5,
-        "fatol": 1e-5,
-    }
-    settings: Any = {"method": "Nelder-Mead", "bounds": [(0.0, 1.0)] * len(best), "options": options}
-
-    def cost(unit: Array) -> float:
-        return float(share(unit[None])[0])
-
-    found = minimize(cost, best, **settings)
-    return space.from_unit(np.clip(found.x, 0.0, 1.0))
-
-
-def limit_excess(values: Mapping[str, Array], spec: Specification) -> Array:
-    """The share by which every limit has to widen for a point to keep them, shape (m,); graded where none settles."""
+def limit_excesses(values: Mapping[str, Array], spec: Specification) -> Array:
+    """The share by which each limit has to widen for points to keep it, shape (m, k); graded where none settles."""
     unsettled = UNSETTLED_EXCESS + np.minimum(values["Excess"], UNSETTLED_EXCESS)
-    worst = np.full_like(unsettled, -np.inf)
-    if spec.concerns(SettlingTime):
-        worst = np.where(np.isfinite(values[spec.settling.metric.name]), worst, unsettled)
-    for share in spec.excess(values).values():
-        worst = np.maximum(worst, np.where(np.isfinite(share), share, unsettled))
-    return worst
+    return np.column_stack([np.where(np.isfinite(share), share, unsettled) for share in spec.excess(values).values()])
 
 
 def relaxation_row(

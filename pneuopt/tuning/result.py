@@ -15,6 +15,7 @@ from pneuopt.evaluation.evaluate import report_metrics
 from pneuopt.evaluation.limit_cycle import RestCheck
 from pneuopt.evaluation.metric import Sense
 from pneuopt.evaluation.requirements import (
+    larger_is_better,
     metric_name,
     percent_factor,
     requirement_values,
@@ -170,6 +171,14 @@ class TuningResult(Result):
         stands = self.parameters.with_values({n: given.value(n) for n in own})
         return replace(self, parameters=stands, status=status, best=best)
 
+    def row(self) -> dict[str, float | str]:
+        """A study's row (`sweep`): how the tuning ended, the gains, and the certified metrics, the worst of each."""
+        rows = ((str(n), values.to_numpy(dtype=float)) for n, values in self.certified.iterrows())
+        worst = {n: float((np.min if larger_is_better(n) else np.max)(values)) for n, values in rows}
+        gains = self.candidate
+        tuned = {} if gains is None else {n: gains.value(n) for n in self.given}
+        return {"status": self.status.code.value, **tuned, **worst}
+
     def summary(self) -> Report:
         """How the tuning ended, gains, certified metrics beside their limits, margins, and how other plants behave."""
         return report_tuning(self)
@@ -202,15 +211,15 @@ def requirement_table(
     return frame
 
 
-def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]], confirmation: str) -> TuningResult:
+def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]], simulations: int) -> TuningResult:
     """The result of the design that comes closest to the limits, with the relaxations that would make them feasible."""
     import pandas as pd
 
     broken = result.requirements[~(result.requirements["room"] >= 0) & result.requirements["allowed"].notna()]
-    closest = [f"{n} {row.certified:.6g} ({row.allowed:.6g} asked)" for n, row in broken.iterrows()]
+    closest = [f"{n} {row.certified:.4g} of {row.allowed:.6g}" for n, row in broken.iterrows()]
     unknown = [str(n) for n, row in result.requirements.iterrows() if np.isnan(row.certified) and np.isnan(row.allowed)]
     shortfall = ", ".join([*closest, *(f"no {n}" for n in unknown)])
-    lead = f"no design found keeps all limits, nor does {confirmation} find one; the closest has {shortfall}"
+    lead = f"not found in {simulations} simulations; closest: {shortfall}"
     would_do = any(isfinite(value) for row in rows.values() for value in (row["needed"], row["share"]))
     sentences = (lead, describe_relaxations(rows), f"{'or ' if would_do else ''}widen the gains' bounds")
     relaxations = pd.DataFrame.from_dict(rows, orient="index")

@@ -1,25 +1,24 @@
 """`Search`: one tuning from its start to a certified answer, its gains rounded before they are certified.
 
 `Certifier` holds a search's claim against the certificate. `relax` finds by how much limits would have to give way, and
-`confirm_refusal` looks for another design where the certificate refuses the first: for both a second search shares
-neither method nor merit with the first, SciPy's differential evolution on the largest excess over a limit. A sum of
-excesses can have a local minimum where a design far away keeps every limit, and designs that are worse by the objective
-may hold where the best one hunts, creeps, or breaks a limit after its horizon.
+`confirm_refusal` looks for another design where the certificate refuses the first, both by a `LimitSearch`, which does
+not share the first search's merit: designs that are worse by the objective may hold where the best one hunts, creeps,
+or breaks a limit after its horizon.
 """
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import inf
-from typing import TYPE_CHECKING, Any
+from math import inf, isfinite, nan
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import OptimizeResult, differential_evolution
 
 from pneuopt.control.averaging import is_affine
 from pneuopt.evaluation.certificate import Certificate, Defect, judge_evaluations
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
+from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import (
     METRICS,
     REQUIREMENT_KINDS,
@@ -32,6 +31,7 @@ from pneuopt.evaluation.requirements import (
     requirement_values,
     upper_limit,
     user_value,
+    with_user_limit,
 )
 from pneuopt.evaluation.response import cases
 from pneuopt.evaluation.specification import Specification
@@ -41,13 +41,12 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback, Status, provenance
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, SearchResult, TuningTask, describe_agreement
-from pneuopt.tuning.racing import compute_merits, distinct_points
+from pneuopt.tuning.racing import compute_merits
 from pneuopt.tuning.relaxation import (
-    limit_excess,
+    LimitSearch,
+    limit_excesses,
     limits_with_settling,
-    relax_all,
     relaxation_row,
-    relaxation_specification,
 )
 from pneuopt.tuning.result import (
     RELAXATION_COLUMNS,
@@ -62,16 +61,14 @@ from pneuopt.tuning.space import Space
 from pneuopt.tuning.tolerances import (
     HORIZON_FACTORS,
     MARGINS_TO_TRY,
-    MAX_CANDIDATES,
     MAX_CERTIFIED_POINTS,
     MAX_REFINED_SEARCHES,
     MAX_ROUNDINGS,
-    MEMBERS_A_GAIN,
-    NEARBY,
     RELAXATION_MARGIN,
     SAME_OBJECTIVE,
     SAMPLING_TOLERANCE,
-    TRIALS_A_GAIN,
+    UNSETTLED_EXCESS,
+    WORST_MERIT,
 )
 
 if TYPE_CHECKING:
@@ -324,7 +321,7 @@ class Search:
             if not found.is_complete:
                 return self._result_so_far(simulator, found)
             if found.status.converged:
-                result, start = self.certify_roundings(found, margin), found.point
+                result, start = self._certify_ends(found, margin), found.point
                 if result.status.converged or (self.rests and result.refusal is Refusal.END_STOP):
                     return result
                 if not self.rests and _ends_elsewhere(result):
@@ -419,11 +416,20 @@ class Search:
         assert result is not None
         return result
 
-    def certify_point(self, point: Array) -> TuningResult:
-        """Round a point and certify it."""
+    def _certify_ends(self, found: SearchResult, margin: float) -> TuningResult:
+        """Certify the point found; where it ends elsewhere or late, the search's other ends as well."""
+        result = self.certify_roundings(found, margin)
+        others = found.others if _ends_elsewhere(result) or _fails_late(result) else ()
+        tried = (self.certify_roundings(self.restate(replace(found, point=point)), margin) for point in others)
+        return next((other for other in tried if other.status.converged), result)
+
+    def certify_point(self, point: Array, margin: float = nan) -> TuningResult:
+        """Round a point and certify it; with the margin of a search its neighbours as well, until one holds."""
+        found = SearchResult(point, Status(Code.CONVERGED), ())
+        if isfinite(margin):
+            return self.certify_roundings(self.restate(found), margin)
         rounded = self._round(point)
-        found = self.restate(SearchResult(rounded, Status(Code.CONVERGED), ()))
-        return self.certifier.certify(self.simulator, found, rounded)
+        return self.certifier.certify(self.simulator, self.restate(replace(found, point=rounded)), rounded)
 
     def _round(self, point: Array) -> Array:
         """The nearest point with as many digits as the method prints."""
@@ -523,48 +529,62 @@ def _interruption_result(point: Array) -> SearchResult:
 
 
 def relax(search: Search, result: TuningResult) -> TuningResult:
-    """Confirm that no design keeps all limits, and find by how much they have to give way, each alone and together.
+    """Search once more for a design that keeps all limits, and for how far they have to give way, alone and together.
 
     A search can miss a design that keeps all limits; where one turns up here, it is the answer.
     """
-    spec, rows = search.spec, dict[str, dict[str, float]]()
+    spec, rows, points = search.spec, dict[str, dict[str, float]](), list[Array]()
+    lasting = replace(spec, limits=limits_with_settling(spec, search.task.references)).with_stability()
+    lasting = lasting.with_band(spec.band * (1 - RELAXATION_MARGIN))  # what grazes the band survives no rounding
+    quick = search.simulator.coarse(lasting)
+    limits = LimitSearch(
+        search.simulator,
+        lambda points: limit_excesses(quick.values(points, lasting), lasting),
+        [search.space.start, end_point(result, search.space)],
+        lambda excess: search.progress(f"{doing}: {_describe_closest(excess)}"),
+    )
     try:
-        second = confirm_infeasible(search.simulator, spec, search.method.margin, search.progress)
+        doing = "searching for any design that keeps all limits"
+        share = limits.minimise(search.method.margin)
+        if share <= 0:
+            found = _continue_from_feasible(search, limits.candidates()[0])
+            if found.status.converged or found.status.code is Code.INTERRUPTED:
+                return found
+        for k, q in enumerate(spec.limits):
+            doing = f"finding how far {metric_name(q)} alone has to give way"
+            row, point = _relax_alone(search, limits, k, q)
+            rows[metric_name(q)], points = row, [*points, point]
+            if row["share"] <= 0:
+                return _continue_from_feasible(search, point)
+        points += limits.candidates(most=inf)[:MARGINS_TO_TRY]
+        closest = min((search.certify_point(point) for point in points), key=relaxation_share)
     except KeyboardInterrupt:
         return _interrupt(result)
-    if second.share <= 0:
-        found = _continue_from_feasible(search, second.point)
-        if found.status.converged or found.status.code is Code.INTERRUPTED:
-            return found
-    method, stable = search.method.shorten(RELAXATION_MARGIN), spec.with_stability()
-    points = [end_point(result, search.space), second.point]
-    excess = limit_excess(search.simulator.values(np.array(points), stable), stable)
-    points = [points[k] for k in np.argsort(excess, kind="stable").tolist()]  # the one closest to the limits first
-    for q in spec.limits:
-        search.progress(f"finding how far {metric_name(q)} alone has to give way")
-        found = search.with_specification(relaxation_specification(spec, q, search.task.references), method).run(
-            points[0]
-        )
-        if found.status.code is Code.INTERRUPTED:
-            return _interrupt(result)
-        points.append(end_point(found, search.space))
-        value = float(found.requirements["certified"][metric_name(q)]) if found.status.converged else np.nan
-        rows[metric_name(q)] = relaxation_row(q, value, points[-1], search.space.names)
-        if rows[metric_name(q)]["share"] <= 0:
-            return _continue_from_feasible(search, points[-1])
-    search.progress("finding how far all limits together have to give way")
-    inside = spec.with_band(spec.band * (1 - search.method.margin)).with_stability()
-    shared = relax_all(search.simulator, search.space, inside, points)
-    closest = min((search.certify_point(point) for point in (shared, *points)), key=relaxation_share)
     if closest.status.converged:
         return _continue_from_feasible(search, end_point(closest, search.space))
     if len(rows) > 1:
-        rows["all"] = relaxation_row(
-            None, relaxation_share(closest), end_point(closest, search.space), search.space.names
-        )
-    counts = {"confirmation.simulations": float(second.simulations), "confirmation.share": second.share}
-    closest = replace(closest, stats={**result.stats, **closest.stats, **counts})
-    return with_relaxations(closest, rows, describe_confirmation(second.simulations))
+        point = end_point(closest, search.space)
+        rows["all"] = relaxation_row(None, relaxation_share(closest), point, search.space.names)
+    counts = {"confirmation.simulations": float(limits.count), "confirmation.share": share}
+    total = result.stats.get("simulations", 0.0) + limits.count
+    return with_relaxations(replace(closest, stats={**result.stats, **closest.stats, **counts}), rows, round(total))
+
+
+def _relax_alone(
+    search: Search, limits: LimitSearch, k: int, requirement: Requirement
+) -> tuple[dict[str, float], Array]:
+    """The row of one limit alone, of the first of the best designs for it that the certificate confirms, and that."""
+    asked, margin = search.spec, RELAXATION_MARGIN if len(search.spec.limits) > 1 else 0.0
+    if margin:
+        limits.relax(k, margin)
+    weights, others = {with_user_limit(requirement, None): 1.0}, tuple(q for q in asked.limits if q is not requirement)
+    alone = search.with_specification(replace(asked, weights=weights, limits=others), search.method)
+    for point in limits.candidates(k, margin, WORST_MERIT)[:MARGINS_TO_TRY]:
+        held = alone.certify_point(point, RELAXATION_MARGIN)
+        if held.status.converged:
+            value, gains = held.requirements["certified"][metric_name(requirement)], end_point(held, search.space)
+            return relaxation_row(requirement, float(value), gains, search.space.names), gains
+    return relaxation_row(requirement, nan, search.space.start, search.space.names), search.space.start
 
 
 def _interrupt(result: TuningResult) -> TuningResult:
@@ -591,8 +611,15 @@ def confirm_refusal(search: Search, refused: TuningResult) -> tuple[TuningResult
     """
     resting = search.among_resting()
     longer = resting.lengthen(rests=True)
+    limits = LimitSearch(
+        search.simulator,
+        lambda points: _excess(resting, longer, points)[:, None],
+        [search.space.start, end_point(refused, search.space)],
+        lambda excess: search.progress(f"searching for other designs: {_describe_closest(excess)}"),
+    )
     try:
-        points, count = find_candidates(lambda at: _excess(resting, longer, at), search.space, search.progress)
+        limits.minimise()
+        points = limits.candidates()
         for k, point in enumerate(points):
             search.progress(f"certifying candidate {k + 1} of {len(points)} of the second search")
             held = search.certify_point(point)
@@ -603,8 +630,8 @@ def confirm_refusal(search: Search, refused: TuningResult) -> tuple[TuningResult
     except KeyboardInterrupt:
         return _interrupt(refused), False
     failed = f"of {len(points)} designs that it finds none is certified" if points else "finds none that comes to rest"
-    words = f"{describe_confirmation(count)}, {failed}, either"
-    stats = {**refused.stats, "confirmation.simulations": float(count)}
+    words = f"a second search over {limits.count} simulations, {failed}, either"
+    stats = {**refused.stats, "confirmation.simulations": float(limits.count)}
     return replace(refused, status=refused.status.with_details(words), stats=stats), False
 
 
@@ -620,7 +647,7 @@ def _excess(resting: Search, longer: Search, points: Array) -> Array:
 def _excess_within(search: Search, points: Array) -> Array:
     """The largest relative excess over a limit within a search's horizon, in which the response has to settle."""
     spec = search.tighten(0.0)
-    return limit_excess(search.simulator.coarse(spec).values(points, spec), spec)
+    return limit_excesses(search.simulator.coarse(spec).values(points, spec), spec).max(axis=1)
 
 
 def _improve(search: Search, longer: Search, held: TuningResult) -> tuple[TuningResult, bool]:
@@ -637,99 +664,15 @@ def _improve(search: Search, longer: Search, held: TuningResult) -> tuple[Tuning
     return (better if better.status.converged and after < before else held), False
 
 
-@dataclass(frozen=True, eq=False)
-class Confirmation:
-    """The gains (n,) closest to the limits, their largest relative excess, at most 0 where all are kept, and trials."""
-
-    point: Array
-    share: float
-    simulations: int
-
-
-def confirm_infeasible(
-    simulator: Simulator, spec: Specification, room: float, progress: ProgressCallback
-) -> Confirmation:
-    """Search for gains that leave a share `room` of every limit, until they are found or the trials are used up."""
-    quick, stable = simulator.coarse(spec), spec.with_stability()
-    found, count = _minimise_excess(
-        lambda points: limit_excess(quick.values(points, stable), stable),
-        simulator.space,
-        lambda excess: excess <= -room,
-        lambda excess: progress(f"confirming that no design keeps all limits: {_describe_closest(excess)}"),
-    )
-    share = float(limit_excess(simulator.values(found[None], stable), stable)[0])
-    return Confirmation(found, share, count)
-
-
-def find_candidates(
-    excess: Callable[[Array], Array], space: Space, progress: ProgressCallback
-) -> tuple[list[Array], int]:
-    """Designs (n,) that keep all limits, most room first, then others that lie apart; and candidates simulated.
-
-    `excess` gives the largest relative excess of points (m, n) over a limit, at most 0 where all are kept.
-    """
-    kept, rooms = list[Array](), list[float]()
-
-    def record(points: Array) -> Array:
-        values = excess(points)
-        kept.extend(points[values <= 0])
-        rooms.extend(values[values <= 0].tolist())
-        return values
-
-    _, count = _minimise_excess(
-        record,
-        space,
-        lambda _: False,
-        lambda excess: progress(f"searching for other designs that keep all limits: {_describe_closest(excess)}"),
-    )
-    best = np.reshape(kept, (-1, len(space.names)))[np.argsort(rooms, kind="stable")]
-    unit = np.reshape([space.to_unit(point) for point in best], best.shape)
-    return list(best[distinct_points(unit, NEARBY)][:MAX_CANDIDATES]), count
-
-
-def _minimise_excess(
-    excess: Callable[[Array], Array], space: Space, is_enough: Callable[[float], bool], report: Callable[[float], None]
-) -> tuple[Array, int]:
-    """The point with the least excess that SciPy's differential evolution finds, shape (n,), and how many it tried."""
-    count = 0
-
-    def cost(unit: Array) -> Any:
-        nonlocal count
-        count += unit.shape[1]
-        return excess(space.from_unit(np.clip(unit.T, 0.0, 1.0)))
-
-    def is_found(intermediate_result: OptimizeResult) -> bool:
-        report(float(intermediate_result.fun))
-        return is_enough(float(intermediate_result.fun))
-
-    settings: Any = {
-        "bounds": [(0.0, 1.0)] * len(space.names),
-        "popsize": MEMBERS_A_GAIN,
-        "maxiter": TRIALS_A_GAIN // MEMBERS_A_GAIN,
-        "x0": space.to_unit(space.start),
-        "init": "sobol",
-        "polish": False,
-        "vectorized": True,
-        "updating": "deferred",
-        "seed": 0,  # so that an answer repeats
-        "callback": is_found,
-    }
-    found: Any = differential_evolution(cost, **settings)
-    return space.from_unit(np.clip(found.x, 0.0, 1.0)), count
-
-
 def _describe_closest(excess: float) -> str:
     """How far the best candidate so far lies beyond its limits, or within them, in words.
 
     Examples
     --------
-    >>> _describe_closest(0.123), _describe_closest(-0.61)
-    ('the closest is 12.3 % beyond them', 'the best stays 61 % below them')
+    >>> _describe_closest(0.123), _describe_closest(-0.61), _describe_closest(10.2)
+    ('the closest is 12.3 % beyond them', 'the best stays 61 % below them', 'none is stable and settles yet')
     """
     share = f"{100 * abs(excess):.3g} %"
+    if excess >= UNSETTLED_EXCESS:
+        return "none is stable and settles yet"
     return f"the closest is {share} beyond them" if excess > 0 else f"the best stays {share} below them"
-
-
-def describe_confirmation(simulations: int) -> str:
-    """Say in words by what an infeasible answer, or a refusal, is confirmed."""
-    return f"a second search, SciPy's differential evolution over {simulations} simulations"

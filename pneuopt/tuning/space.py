@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import inf
 from typing import Any
 
 import casadi as ca
@@ -67,6 +68,21 @@ class Space:
     def start(self) -> Array:
         """The given values, shape (n,)."""
         return np.array([self.parameters.value(n) for n in self.names])
+
+    @cached_property
+    def structure(self) -> list[tuple[int, float]]:
+        """Gains, and where they lie in the unit cube, of controllers of another kind: no integral, no dither and so on.
+
+        A search by small steps reaches none of them.
+        """
+        off = {"pid.Ki": (0.0,), "dither.amplitude": (0.0, inf), "pid.Tf": (-inf, inf), "pid.N": (-inf, inf)}
+        found = list[tuple[int, float]]()
+        for k, n in enumerate(self.names):
+            for value in off.get(n, ()):
+                point = self.start.copy()
+                point[k] = np.clip(value, *self.bounds[k])
+                found.append((k, float(self.to_unit(point)[k])))
+        return found
 
     def parameters_at(self, point: Array) -> ParameterSet:
         """The loop's parameters with the free ones at `point`."""

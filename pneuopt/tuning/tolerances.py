@@ -32,13 +32,14 @@ HORIZON_FACTORS = (4.0, 2.8, 2.0, 1.4)  # horizons after which hunting and creep
 MAX_REFINED_SEARCHES = 3  # searches on closer samples or with shorter steps, until figures are resolved
 SAMPLING_TOLERANCE = 5e-3  # change of a requirement on closer samples, of value and limit, that repeats a search
 SEARCH_TOLERANCE = 5.0  # multiple of the tolerances of a certificate's readings that a search's samples keep
-MEMBERS_A_GAIN, TRIALS_A_GAIN = 15, 900  # population and trials a free gain of the confirming second search
+MEMBERS_A_GAIN, TRIALS_A_GAIN = 8, 900  # population and trials a free gain of the search on the limits' excess
+LEAST_LIMIT_MEMBERS = 10  # of its population
 MAX_CANDIDATES = 8  # its designs that are certified
 
 # Relaxation
 
 RELAXATION_MARGIN = 0.002  # margin of the search for the least relaxation of a limit, a fraction
-MAX_LOCAL_SIMULATIONS = 200  # simulations of the local search for the relaxation of all limits together
+LOCAL_TRIALS_A_GAIN = 300  # trials a free gain for the least value of one limit, at most
 
 # Front
 
@@ -67,13 +68,15 @@ DIFFERENCE_STEP = 1e-4  # step of the difference quotients of margins and rest, 
 MEMORY_OF_KILLS = 0.95  # share of its weight that a case's victory keeps from race to race, which orders the cases
 MEMORY_SIZE = 6  # entries of the memory of successful step lengths and crossover rates
 BEST_SHARE = 0.15  # share of the population towards whose points trials move
-START_SHARES = (0.5, 0.35)  # shares of the trials that the starts get on coarse samples; the rest is for fine ones
-BAND_SHARES = (0.4, 0.25)  # shares of a start's trials over all bands, and over the nearest wider one
+MOST_STARTS = 3  # of a search, the third only where no two agree to within `SAME_OBJECTIVE`: more cost more than found
+BAND_SHARES = (0.2, 0.125)  # shares of a start's trials over all bands, and over the nearest wider one
+FINE_SHARE = 0.15  # trials on fine samples, over those of a start
 STALLED_GENERATIONS = 25  # generations without `LEAST_IMPROVEMENT` of the best and the median merit that end a phase
 LEAST_SPREAD = 1e-4  # spread of all merits, a share of the best, that ends a phase
 FINE_MEMBERS = 20  # members of the phase on fine samples, which rank points anew
 FEW_BEST, NO_DITHER = 6, 0.02  # best points that begin the second start, and its dither's amplitude [of its range]
 POLISHED, POLISHED_NEARBY = 2, 4  # points that gradients improve at a time; of a search near its start
+REPORT_SECONDS = 1.0  # between two readings of the figures that a search reports [s]: each is a simulation
 MIN_DISTANCE = 0.03  # how far apart they lie, a share of a gain's range
 LAGGING = 1.3  # merit over the best from which on a start is given up, and gradients leave a point
 CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15  # settling times, or share of the horizon, of a response that a race sees

@@ -1,17 +1,18 @@
-"""Ten random tuning problems of each of seven kinds: is each design that `tune` hands out what it claims?
+"""Ten random tuning problems of each of nine kinds: is each design that `tune` hands out what it claims?
 
-    python problems/tune/random_kinds.py [--count N] [--jobs J] [--resume] [--json FILE] [--out DIR]
+    python problems/tune/random_kinds.py [--count N] [--first SEED] [--jobs J] [--resume] [--json FILE] [--out DIR]
 
 Beside the drives and lags of random_tuning.py: "dead_time" (a lag with dead time), "integrator" (with dead time),
 "light_damping" (a second-order plant with damping 0.05 to 0.3), "load" (a volt at the input of a lag with dead time),
 "sampled_delay" (a second-order plant, its controller sampled and a sample late), "position" (a position loop on a drive
-with friction) and "dither" (a speed loop with friction and dither). The settling time, the IAE or the ITAE is least,
-with a limit on overshoot, or the load's peak, and on Ms.
+with friction), "dither" (a speed loop with friction and dither), "unstable" (a plant with a pole on the right, behind a
+lag) and "crawl" (a mass with friction at 5 to 30 mm/s, where friction falls with speed). The settling time, the IAE or
+the ITAE is least, with a limit on overshoot, or the load's peak, and on Ms.
 
 Each design is simulated over five horizons by code that shares no line with pneuopt: linear loops by the matrix
 exponential (plain_linear.py), drives by plain C (plain_loop.c). Rows *.violations: the designs that break a limit,
 grow, or leave the settling band after their certified settling time. Rows *.refused_wrongly: the refusals for which a
-brute-force search finds a design. The whole study is --count 70.
+brute-force search finds a design. The whole study is --count 90.
 """
 
 import sys
@@ -30,14 +31,14 @@ from pneuopt.evaluation.specification import Specification, specify
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, finish, frame
 from problems.shared.plain_linear import PlainPlant, respond_plainly
-from problems.shared.random_problems import Plant, friction_lag
+from problems.shared.random_problems import Plant, force_drive, friction_lag
 from problems.shared.rows import row_arguments, study_rows
 from problems.tune.random_designs import check_design, draw_plant, draw_steps, is_feasible
 
 if TYPE_CHECKING:
     import pandas as pd
 
-COUNT = 7
+COUNT = 9
 HORIZONS = 5
 BAND, SLACK, LATE = 0.02, 2e-3, 4e-3  # the band; what samples blur of a step, and of the horizon
 OVERSHOOT, SENSITIVITY, PEAK = 0.2, 2.0, 0.9  # limits; a load's peak is a fraction of what it does without a controller
@@ -89,7 +90,7 @@ def row_of(seed: int) -> dict[str, Any]:
 
 def plain_name(given: Problem) -> str:
     """The plain C's name of a drive's kind."""
-    return "force_drive_position" if given.kind == "position" else "friction_lag"
+    return {"position": "force_drive_position", "crawl": "force_drive"}.get(given.kind, "friction_lag")
 
 
 def check_linear(given: Problem, plain: PlainPlant, found: po.TuningResult) -> dict[str, Any]:
@@ -163,6 +164,30 @@ def dither(rng: np.random.Generator) -> Problem:
     return Problem("dither", plant, draw_steps(plant, rng), _specification(rng))
 
 
+def crawl(rng: np.random.Generator) -> Problem:
+    plant = force_drive(rng)
+    return Problem("crawl", plant, [po.Step(_log(rng, 5e-3, 0.03), horizon=plant.horizon)], _specification(rng))
+
+
+def unstable(rng: np.random.Generator) -> Problem:
+    gain, rate, share = _log(rng, 0.05, 20.0), _log(rng, 2.0, 30.0), rng.uniform(0.02, 0.1)
+    speed, drive, command = po.Quantity("speed", "m/s"), po.Quantity("drive", "V"), po.Quantity("valve_voltage", "V")
+
+    def rhs(_: Any, x: Any, u: Any, __: Any) -> Any:
+        slopes = {"speed": rate * (x["speed"] + gain * x["drive"])}
+        slopes["drive"] = rate / share * (u["valve_voltage"] - x["drive"])
+        return slopes, {"speed": x["speed"]}
+
+    loop = po.ClosedLoop(po.define([speed, drive], [command], [speed], po.ParameterSet(), rhs), po.PID(limits=False))
+    ranges = {"pid.Kp": (1.1 / gain, 40 / gain), "pid.Ki": (0.0, 20 * rate / gain), "pid.Kd": (0.0, 1 / (gain * rate))}
+    ranges |= {"pid.Tf": (0.005 / rate, 0.1 / rate), "pid.b": (0.0, 1.0)}
+    given = {"pid.Kp": 5 / gain, "pid.Ki": 2 * rate / gain, "pid.Tf": 0.02 / rate, "pid.b": 0.5}
+    parameters = loop.parameters.fixed("*").with_values(given).with_bounds(ranges).freed(*ranges)
+    plain = PlainPlant((gain,), (share / rate**2, (1 - share) / rate, -1.0))
+    step = po.Step(float(rng.uniform(0.1, 1.0)) * gain, horizon=10 / rate)
+    return Problem("unstable", Plant(loop, parameters, gain, 10 / rate), [step], _specification(rng), plain)
+
+
 KINDS: dict[str, Callable[[np.random.Generator], Problem]] = {
     "dead_time": dead_time,
     "integrator": integrator,
@@ -171,6 +196,8 @@ KINDS: dict[str, Callable[[np.random.Generator], Problem]] = {
     "position": position,
     "sampled_delay": sampled_delay,
     "dither": dither,
+    "unstable": unstable,
+    "crawl": crawl,
 }
 
 
@@ -216,6 +243,8 @@ def _log(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 if __name__ == "__main__":
-    options = row_arguments(__doc__, COUNT).parse_args()
-    rows = study_rows(row_of, range(options.count), options, "random_kinds")
+    parser = row_arguments(__doc__, COUNT)
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="seed of the first problem")
+    options = parser.parse_args()
+    rows = study_rows(row_of, range(options.first, options.first + options.count), options, "random_kinds")
     sys.exit(finish(main(rows), options))

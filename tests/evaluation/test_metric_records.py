@@ -189,7 +189,9 @@ horizon = "1 s"
 def test_the_certificate_has_it_and_the_screen_shows_it_with_its_unit(kind: type[Requirement]) -> None:
     name = kind.metric.name
     assert name in certified().index
-    own = kind.metric.unit == "{measured}" or kind is SettlingTimeRaw  # on the screen with a dither, or a position, only
+    own = (
+        kind.metric.unit == "{measured}" or kind is SettlingTimeRaw
+    )  # on the screen with a dither, or a position, only
     if own or kind.metric.positions:
         return
     text = report_metrics(certified(), relevant_units(AXIS)).to_text(200)

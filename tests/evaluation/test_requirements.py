@@ -22,6 +22,7 @@ from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     AirUse,
     GainMargin,
+    Overshoot,
     PhaseMargin,
     Requirement,
     SettlingTime,
@@ -45,6 +46,13 @@ from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ANR_DENSITY
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import loop_pieces, search_space
+
+
+def test_an_overshoot_of_zero_is_a_hundredth_of_a_percent() -> None:
+    assert Overshoot(0) == Overshoot(1e-4)
+    spec = specify(SettlingTime(), [Overshoot(0.0)])
+    assert not spec.violations({"Overshoot": 9e-5})
+    assert [type(q) for q in spec.violations({"Overshoot": 1.1e-4})] == [Overshoot]
 
 
 def test_metrics_in_percent_become_fractions() -> None:

@@ -7,7 +7,7 @@ import pneuopt as po
 from problems.shared.plain_linear import respond_plainly
 from problems.tune.random_kinds import HORIZONS, KINDS, find_faults, main
 
-LINEAR = ("dead_time", "integrator", "light_damping", "load", "sampled_delay")
+LINEAR = ("dead_time", "integrator", "light_damping", "load", "sampled_delay", "unstable")
 
 
 @pytest.mark.parametrize("kind", LINEAR)

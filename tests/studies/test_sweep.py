@@ -25,6 +25,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System, discretise
 from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import PeakControl, SettlingTime
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
@@ -33,6 +34,7 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Progress
 from pneuopt.studies.executors import INTERRUPTED_CASE
 from pneuopt.studies.sweep import grid, read_cases, sweep
+from pneuopt.tuning.tune import tune
 
 RIG = ParameterSet(
     {
@@ -368,3 +370,20 @@ def test_rows_without_a_name_are_counted_and_plain_columns_are_si() -> None:
         "row 1": {"load.mass": 4.0},
         "row 2": {"load.mass": 5.0},
     }
+
+
+def test_a_study_of_tunings_has_a_row_a_case() -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    given = loop.parameters.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
+    tuned = partial(tune, loop, Step(1.0), minimise=SettlingTime(), subject_to=[PeakControl(4.0)], plants={})
+    times = {"quick": {"plant.time_constant": 0.1}, "slow": {"plant.time_constant": 0.5}}
+    with ThreadPoolExecutor(1) as threads:
+        table = sweep(tuned, given, times, executor=threads)
+    assert table["error"].tolist() == ["", ""]
+    assert table["status"].tolist() == ["converged", "converged"]
+    assert (table["PeakControl"] <= 4.0).all()
+    assert table["SettlingTime"].tolist() == sorted(table["SettlingTime"])
+    for row in table.to_dict(orient="records"):
+        gains = {n: float(row[n]) for n in ("plant.time_constant", "pid.Kp", "pid.Ki")}
+        own = evaluate(loop, Step(1.0), given.with_values(gains))["0 to 1"]
+        assert row["SettlingTime"] == pytest.approx(own["SettlingTime"], rel=1e-6)
