@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from math import inf, isfinite, isnan, nan
 from typing import Protocol
 
+import numpy as np
+
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.evaluation.certificate import Defect
@@ -43,6 +45,7 @@ class SearchResult:
     """The point (n,) that a method found, before rounding, with the limits and bounds that are active there.
 
     `optimum` is the objective there, NaN where the method has none; `is_complete`: no Ctrl-C has ended the search.
+    `finalists` (k, n) lie apart from each other and are hardly worse.
     """
 
     point: Array
@@ -54,6 +57,7 @@ class SearchResult:
     agreement: "Agreement | None" = None
     is_complete: bool = True
     uses_simulator: bool = False
+    finalists: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def figures(self) -> dict[str, float]:

@@ -49,6 +49,7 @@ from pneuopt.tuning.tolerances import (
     BEST_SHARE,
     CUT_SETTLING_TIMES,
     FEW_BEST,
+    FINALIST_SHARE,
     FINE_MEMBERS,
     KEPT_STATES,
     LAGGING,
@@ -58,6 +59,7 @@ from pneuopt.tuning.tolerances import (
     LEAST_SHORT_TRIALS,
     LEAST_SPREAD,
     LIMIT_TOLERANCE,
+    MAX_FINALISTS,
     MEMORY_OF_KILLS,
     MEMORY_SIZE,
     MIN_DISTANCE,
@@ -155,6 +157,7 @@ class Racing:
             agreement=Agreement(best.starts, best.agreeing),
             is_complete=best.is_complete,
             uses_simulator=True,
+            finalists=best.finalists,
         )
 
     def shorten(self, margin: float) -> "Racing":
@@ -169,13 +172,17 @@ class Racing:
 
 @dataclass(frozen=True, eq=False)
 class RacingResult:
-    """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best."""
+    """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best.
+
+    `finalists` (k, n): gains apart from each other that are hardly worse.
+    """
 
     point: Array
     count: int
     is_complete: bool
     starts: int
     agreeing: int
+    finalists: Array
 
 
 def run_racing(
@@ -196,8 +203,9 @@ def run_racing(
         search.run(method)
     except KeyboardInterrupt:
         best = space.from_unit(search.best_so_far())
-        return RacingResult(best, search.count, False, search.starts, search.agreeing)
-    return RacingResult(space.from_unit(search.best), search.count, True, search.starts, search.agreeing)
+        return RacingResult(best, search.count, False, search.starts, search.agreeing, best[None])
+    finalists = space.from_unit(search.finalists())
+    return RacingResult(space.from_unit(search.best), search.count, True, search.starts, search.agreeing, finalists)
 
 
 # What may be asked for where responses are cut short: nothing of it grows after the response has settled.
@@ -503,13 +511,20 @@ class _RacingSearch:
         best = merits[0] * (1 - LEAST_IMPROVEMENT)
         population, merits = self.evolve(population[:FINE_MEMBERS], fine)
         if merits[0] < best:
-            self._polish(population, merits, fine.simulator, method.polish)
+            population = self._polish(population, merits, fine.simulator, method.polish)[0]
+        self._ends.append(population)
 
     def best_so_far(self) -> Array:
         """The best of the present phase, which may ask for another band, and of the starts that have ended."""
         points = np.array([self.best, *(end[0] for end in self._ends)])
         merits, _ = Race(self._coarse, self._spec, self._scale).merits(self._space.from_unit(points))
         return np.asarray(points[np.argmin(merits)])
+
+    def finalists(self) -> Array:
+        """Points of all phases that lie apart from each other, hardly worse than the best."""
+        population, merits = self._best_first(np.vstack([self.best, *self._ends, *self._polished]), self._simulator)
+        near = population[merits <= (1 + FINALIST_SHARE) * merits[0]]
+        return near[distinct_points(near, NEARBY)][:MAX_FINALISTS]
 
     def _search(self, population: Array, method: Racing, share: float, most: float) -> tuple[Array, Array]:
         """Search from one start on coarse samples: over wide bands first, by gradients, and in the band asked for.

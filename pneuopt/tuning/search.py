@@ -38,7 +38,7 @@ from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarni
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback, Status, provenance
 from pneuopt.tuning.feasibility import check_feasibility
-from pneuopt.tuning.method import Method, SearchResult, TuningTask, describe_agreement
+from pneuopt.tuning.method import Agreement, Method, SearchResult, TuningTask, describe_agreement
 from pneuopt.tuning.racing import compute_merits, distinct_points
 from pneuopt.tuning.relaxation import (
     limit_excess,
@@ -156,6 +156,7 @@ class Certifier:
             proof,
             agreement=agreement,
             refusal=Refusal.END_STOP if contacts else Refusal.LATE if fails_late else None,
+            finalists=np.empty((0, 0)) if found is None else found.finalists,
         )
 
     def _evaluate(self, parameters: ParameterSet) -> tuple[tuple[CaseEvaluation, ...], list[str]]:
@@ -416,10 +417,10 @@ class Search:
         assert result is not None
         return result
 
-    def certify_point(self, point: Array) -> TuningResult:
-        """Round a point and certify it."""
+    def certify_point(self, point: Array, agreement: Agreement | None = None) -> TuningResult:
+        """Round a point and certify it; `agreement` is that of the search that led to it."""
         rounded = self._round(point)
-        found = self.restate(SearchResult(rounded, Status(Code.CONVERGED), ()))
+        found = self.restate(SearchResult(rounded, Status(Code.CONVERGED), (), agreement=agreement))
         return self.certifier.certify(self.simulator, found, rounded)
 
     def _round(self, point: Array) -> Array:

@@ -33,6 +33,14 @@ SEARCH_TOLERANCE = 5.0  # multiple of the tolerances of a certificate's readings
 MEMBERS_A_GAIN, TRIALS_A_GAIN = 15, 900  # population and trials a free gain of the confirming second search
 MAX_CANDIDATES = 8  # its designs that are certified
 
+# Robust designs
+
+FINALIST_SHARE, MAX_FINALISTS = 0.05, 8  # objective above the best from which on a point is no finalist; how many
+HIGH_SHARE = (
+    0.95  # of plants: what they reach of the objective is promised, and fewer on which a design holds are a doubt
+)
+ENOUGH_HELD = 0.97  # of the plants by which designs are chosen, so that 0.95 of others hold with a chance of 9 in 10
+
 # Relaxation
 
 RELAXATION_MARGIN = 0.002  # margin of the search for the least relaxation of a limit, a fraction
