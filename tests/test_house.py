@@ -29,6 +29,7 @@ LONE_FILES: Mapping[str, str] = {
     "pneuopt/files/first_files.py": "the text of files belongs to files; cli.init says what was written",
     "pneuopt/identification/explanations.py": "a subject of its own, what a model lacks: a row each",
     "pneuopt/models/pneumatic/logs.py": "what a drive's logs show, where it starts in them and what is wrong with them",
+    "pneuopt/tuning/robust.py": "a subject of its own, a design for other plants: a row a way to find one",
     "pneuopt/tuning/gradients.py": "a solver of its own: minimax SQP along responses",
 }
 """Files without a public name that one other file imports alone, each with the reason why it is no part of that one."""

@@ -127,8 +127,8 @@ class Method(Protocol):
         `attempt` counts the certificates that have failed; from 1 on `start` is the point found with less margin.
         """
 
-    def shorten(self, margin: float) -> "Method":
-        """The method for a short search from a point that is close."""
+    def shorten(self, margin: float, share: float = 1.0) -> "Method":
+        """The method for a short search from a point that is close; of one that is closer still a share will do."""
 
     def limit_path(self, task: TuningTask, spec: Specification) -> LimitPath | None:
         """The problem prepared for moving limits, `spec` the first, tightened; None where each needs a new search."""

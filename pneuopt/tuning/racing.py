@@ -160,11 +160,11 @@ class Racing:
             finalists=best.finalists,
         )
 
-    def shorten(self, margin: float) -> "Racing":
-        """The method for a short search from a point that is close."""
-        trials = min(self.trials, max(LEAST_SHORT_TRIALS, self.trials // 6))
-        members = max(LEAST_MEMBERS, round(SHORT_MEMBERS * self.members))
-        return replace(self, members=members, trials=trials, bands=(), margin=margin)
+    def shorten(self, margin: float, share: float = 1.0) -> "Racing":
+        """The method for a short search from a point that is close; see `Method.shorten`."""
+        trials = max(1, round(share * min(self.trials, max(LEAST_SHORT_TRIALS, self.trials // 6))))
+        members, polish = max(LEAST_MEMBERS, round(SHORT_MEMBERS * self.members)), round(share * self.polish)
+        return replace(self, members=members, trials=trials, bands=(), polish=polish, margin=margin)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
         """No path: each set of limits needs a new search."""

@@ -1,7 +1,7 @@
 """`harden`: a design that holds on other plants, in place of the one that is best on the model alone.
 
-A row of `WAYS` is a way to find designs. Each of them is tried on plants that were drawn for it (`PlantTrial`); the
-best that is certified on the model stands, and the first that holds on enough plants ends the search.
+A row of `ROBUST_WAYS` is a way to find designs. Each of them is tried on plants that were drawn for it (`PlantTrial`);
+the best that is certified on the model stands, and the first that holds on enough plants ends the search.
 
 The worst plants: those on which the last design breaks a limit most, or has the largest objective, become cases of a
 short search, and so do those on which its answer is the worst. This exchange solves a problem with a limit for each
@@ -25,7 +25,7 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, certified_objective, end_point
-from pneuopt.tuning.tolerances import ENOUGH_HELD, HIGH_SHARE, MAX_CERTIFIED_POINTS
+from pneuopt.tuning.tolerances import ENOUGH_HELD, EXCHANGE_SHARE, HIGH_SHARE, MAX_CERTIFIED_POINTS
 from pneuopt.tuning.validation import LANE_DEFECTS, PlantTrial, worst_figures
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ class Hardening:
         self._cases = {**self._cases, **worst}
         search = self.search
         method = search.method.successor or search.method  # the first may know one plant only
-        method = method.shorten(method.margin)
+        method = method.shorten(method.margin, EXCHANGE_SHARE)
         task = replace(search.task, scenarios={**search.task.scenarios, **self._cases})
         rests = any(Defect.NEVER_SETTLES.value in words for words in self.last.broken.values())
         found = Search(task, method, search.progress, search.rests or rests).find(method.margin, self.last.point, 0)
@@ -139,7 +139,7 @@ class Way:
 
 
 _EXCHANGE = "searching with the worst of them as cases"
-WAYS = (
+ROBUST_WAYS = (
     Way("finalists", "trying the designs that are hardly worse", lambda state: state.nominal.finalists, False),
     Way("worst plants", _EXCHANGE, Hardening.exchange),
     Way("worst plants, again", _EXCHANGE, Hardening.exchange),
@@ -163,7 +163,7 @@ def harden(search: Search, nominal: TuningResult, plants: Scenarios) -> TuningRe
         rows.append({"way": way, "held": last.held, "high": last.high, "best": state.best.held, "seconds": spent})
 
     note("nominal")
-    for way in WAYS:
+    for way in ROBUST_WAYS:
         if state.is_enough and way.is_rescue:
             break
         search.progress(f"a design holds on {state.best.held} of {len(plants)} plants; {way.doing}")
@@ -171,6 +171,8 @@ def harden(search: Search, nominal: TuningResult, plants: Scenarios) -> TuningRe
         if len(points):
             state.improve(points)
             note(way.name)
+        elif way.is_rescue:
+            break
     stats = {**nominal.stats, **state.result.stats}
     stats["simulations"] = stats.get("simulations", 0.0) + state.simulations
     result = replace(state.result, stats=stats, trail=pd.DataFrame(rows))
