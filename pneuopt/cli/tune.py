@@ -174,6 +174,7 @@ class _Job:
         if result.status.converged:  # also the certificate's notes and the plants that the design was tried on
             document |= {} if result.certificate is None else {"notes": list(result.certificate.notes)}
             document |= {} if result.validation is None else {"validation": records(result.validation.figures)}
+            document |= {} if result.trail is None else {"trail": records(result.trail)}
         status = finish(
             self.outputs,
             {},

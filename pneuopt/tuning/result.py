@@ -128,7 +128,7 @@ class TuningResult(Result):
     agreement : Agreement, optional
         How far the starts of the search agree.
     trail : DataFrame, optional
-        How a design was sought that holds on other plants, a row a "way": on how many plants its best design has
+        How a design was sought that holds on other plants, a row a way: on how many plants its best design has
         "held", what 95 of 100 of them reach of the objective, "high", the number for the "best" so far, which stands in
         the end, and CPU "seconds" since the nominal design.
     refusal : Refusal, optional

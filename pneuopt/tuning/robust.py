@@ -175,7 +175,7 @@ def harden(search: Search, nominal: TuningResult, plants: Scenarios) -> TuningRe
             break
     stats = {**nominal.stats, **state.result.stats}
     stats["simulations"] = stats.get("simulations", 0.0) + state.simulations
-    result = replace(state.result, stats=stats, trail=pd.DataFrame(rows))
+    result = replace(state.result, stats=stats, trail=pd.DataFrame(rows).set_index("way"))
     if state.best is first:
         return result
     parameters, space = result.parameters, search.space

@@ -113,7 +113,7 @@ def test_finalists_that_hold_on_more_plants_make_a_search_needless() -> None:
     asked = {"minimise": SettlingTime(), "subject_to": [Overshoot(0.05), PeakControl(4.0)]}
     best = tune(loop, Step(1.0), given, method=Racing(trials=100), **asked)  # type: ignore[arg-type]
     assert best.trail is not None
-    assert list(best.trail["way"][:2]) == ["nominal", "finalists"]
+    assert list(best.trail.index[:2]) == ["nominal", "finalists"]
     assert (np.diff(best.trail["best"]) >= 0).all()
     assert best.validation is not None
     assert best.validation.is_robust
