@@ -524,7 +524,7 @@ class _RacingSearch:
         """Points of all phases that lie apart from each other, hardly worse than the best."""
         population, merits = self._best_first(np.vstack([self.best, *self._ends, *self._polished]), self._simulator)
         near = population[merits <= (1 + FINALIST_SHARE) * merits[0]]
-        return near[distinct_points(near, NEARBY)][:MAX_FINALISTS]
+        return np.asarray(near[distinct_points(near, NEARBY)][:MAX_FINALISTS])
 
     def _search(self, population: Array, method: Racing, share: float, most: float) -> tuple[Array, Array]:
         """Search from one start on coarse samples: over wide bands first, by gradients, and in the band asked for.

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -103,7 +103,7 @@ class Hardening:
         broken = [share for share in (*failures, *excess) if share.max() > 0]
         return {str(names[int(np.argmax(share))]) for share in (self._objective(metrics), *broken)}
 
-    def _excess(self, values: Mapping[str, Array]) -> list[Array]:
+    def _excess(self, values: Mapping[str, Any]) -> list[Array]:
         return list(self.search.spec.excess(requirement_values(values)).values())
 
     def exchange(self) -> Sequence[Array]:
@@ -124,7 +124,7 @@ class Hardening:
         return [found.point, *found.finalists]
 
 
-def _by_metric(metrics: "pd.DataFrame") -> dict[str, Array]:
+def _by_metric(metrics: "pd.DataFrame") -> dict[str, Any]:
     return {str(n): row.to_numpy(dtype=float) for n, row in metrics.iterrows()}
 
 
@@ -140,7 +140,7 @@ class Way:
 
 _EXCHANGE = "searching with the worst of them as cases"
 ROBUST_WAYS = (
-    Way("finalists", "trying the designs that are hardly worse", lambda state: state.nominal.finalists, False),
+    Way("finalists", "trying the designs that are hardly worse", lambda state: list(state.nominal.finalists), False),
     Way("worst plants", _EXCHANGE, Hardening.exchange),
     Way("worst plants, again", _EXCHANGE, Hardening.exchange),
     Way("worst plants, a third time", _EXCHANGE, Hardening.exchange),
@@ -173,13 +173,18 @@ def harden(search: Search, nominal: TuningResult, plants: Scenarios) -> TuningRe
             note(way.name)
         elif way.is_rescue:
             break
-    stats = {**nominal.stats, **state.result.stats}
-    stats["simulations"] = stats.get("simulations", 0.0) + state.simulations
-    result = replace(state.result, stats=stats, trail=pd.DataFrame(rows).set_index("way"))
-    if state.best is first:
-        return result
-    parameters, space = result.parameters, search.space
-    bounds = [n for n in space.names if parameters.value(n) in (parameters[n].lower, parameters[n].upper)]
+    stats, trail, names = (
+        {**nominal.stats, **state.result.stats},
+        pd.DataFrame(rows).set_index("way"),
+        search.space.names,
+    )
+    if state.simulations:
+        stats["simulations"] = stats.get("simulations", 0.0) + state.simulations
+    result = replace(state.result, stats=stats, trail=trail)
+    parameters = result.parameters
+    if all(parameters.value(n) == nominal.parameters.value(n) for n in names):
+        return replace(nominal, stats=stats, trail=trail)
+    bounds = [n for n in names if parameters.value(n) in (parameters[n].lower, parameters[n].upper)]
     active = (*(str(n) for n, row in result.requirements.iterrows() if row["active"]), *bounds)
     price = describe_price(search.spec, nominal, result)
     words = f"{price}, which holds on {first.held} of {len(plants)} plants"

@@ -444,6 +444,12 @@ def test_a_band_may_be_in_the_measured_unit(tmp_path: Path, text: str, band: flo
     assert read_tuning(written_tuning(tmp_path, given), ForceDrive(Coulomb()).system()).specification.band == band
 
 
+@pytest.mark.parametrize(("text", "robust"), [("", True), ("robust = true\n", True), ("robust = false\n", False)])
+def test_a_design_for_other_plants_is_sought_unless_the_file_says_no(tmp_path: Path, text: str, robust: bool) -> None:
+    tuning = read_tuning(written_tuning(tmp_path, f"{text}{MOVE}"), ForceDrive(Coulomb()).system())
+    assert tuning.robust is robust
+
+
 def test_a_reference_may_be_several_moves(tmp_path: Path) -> None:
     drive = ForceDrive(Coulomb()).system()
     several = MOVE.replace('move = "-200 mm"', 'moves = ["200 mm", "-100 mm"]')

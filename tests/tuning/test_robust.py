@@ -11,13 +11,17 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.plants import ExpectedPlants, expected_plants
 from pneuopt.evaluation.requirements import IAE, Overshoot, PeakControl, SettlingTime
 from pneuopt.evaluation.scenarios import apply_scenario
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.robust import Hardening
-from pneuopt.tuning.tune import tune
+from pneuopt.tuning.search import certified_objective
+from pneuopt.tuning.simulator import to_records
+from pneuopt.tuning.tolerances import NEARBY
+from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
 STEP, MOST = Step(1.0, horizon=2.0), 10.0  # a command of Kp V at the step: half of the gains off by 1 % exceed MOST
 
@@ -40,7 +44,7 @@ def test_the_design_backs_off_by_what_the_plants_add_and_says_the_price() -> Non
     assert best.validation is not None
     assert best.validation.held >= 99
     assert best.parameters.value("pid.Kp") == pytest.approx(MOST / 1.01, rel=5e-3)  # of which the search leaves 0.3 %
-    time, high = math.log(50) / best.parameters.value("pid.Kp"), best.validation.figures.loc["SettlingTime", "p95"]
+    time, high = math.log(50) / best.parameters.value("pid.Kp"), float(best.validation.figures["p95"]["SettlingTime"])
     assert best.status.verdict == (
         f"settles in {time:.3g} s, {high:.3g} s on 95 of 100 plants; keeps all limits on {best.validation.held}"
     )
@@ -117,6 +121,23 @@ def test_finalists_that_hold_on_more_plants_make_a_search_needless() -> None:
     assert (np.diff(best.trail["best"]) >= 0).all()
     assert best.validation is not None
     assert best.validation.is_robust
+
+
+def test_finalists_are_hardly_worse_than_the_best_and_lie_apart() -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    ranges = {"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}
+    given = loop.parameters.with_bounds(ranges).freed(*ranges)
+    task = prepare_task(loop, Step(1.0), given, specify(IAE(), [Overshoot(0.05), PeakControl(4.0)]))
+    search = prepare_search(task, Racing(trials=100))
+    found = search.run()
+    values = search.simulator.values(found.finalists, search.spec)
+    best = certified_objective(search.spec, found)
+    assert len(found.finalists) > 1
+    assert (values["IAE"] <= 1.06 * best).all()
+    assert all(not search.spec.violations(row) for row in to_records(values))
+    unit = np.array([search.space.to_unit(point) for point in found.finalists])
+    apart = np.abs(unit[:, None] - unit).max(axis=2)
+    assert apart[~np.eye(len(unit), dtype=bool)].min() > NEARBY
 
 
 def test_ctrl_c_in_the_search_for_a_robust_design_leaves_the_nominal_one_as_the_best(
