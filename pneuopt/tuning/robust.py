@@ -98,13 +98,12 @@ class Hardening:
         """The plants on which the last design has the largest objective, fails, or breaks one of the limits most."""
         metrics, names = self.last.metrics, list(self.last.metrics.columns)
         values = _by_metric(metrics)
-        failures = [np.where(np.isfinite(values[n]), 0.0, np.inf) for n in LANE_DEFECTS]
-        excess = [np.where(np.isnan(share), np.inf, share) for share in self._excess(values)]
+        refused = [n for n, defect in LANE_DEFECTS.items() if defect not in self.search.task.accept]
+        failures = [np.where(np.isfinite(values[n]), 0.0, np.inf) for n in refused]
+        shares = self.search.spec.excess(requirement_values(values)).values()
+        excess = [np.where(np.isnan(share), np.inf, share) for share in shares]
         broken = [share for share in (*failures, *excess) if share.max() > 0]
         return {str(names[int(np.argmax(share))]) for share in (self._objective(metrics), *broken)}
-
-    def _excess(self, values: Mapping[str, Any]) -> list[Array]:
-        return list(self.search.spec.excess(requirement_values(values)).values())
 
     def exchange(self) -> Sequence[Array]:
         """Points of a short search that has the worst plants as cases; none where it had all of them before."""

@@ -37,7 +37,7 @@ MAX_CANDIDATES = 8  # its designs that are certified
 
 FINALIST_SHARE, MAX_FINALISTS = 0.05, 8  # objective above the best from which on a point is no finalist; how many
 HIGH_SHARE = 0.95  # of plants: what these reach is promised; a design that holds on fewer is doubtful, and that is said
-EXCHANGE_SHARE = 0.4  # of a short search's trials: with all of them it takes twice the time and finds 1 % less at best
+EXCHANGE_SHARE = 0.4  # of a short search: all of it takes twice the time for an objective that is up to 3 % smaller
 ENOUGH_HELD = 0.97  # of the plants by which designs are chosen, so that 0.95 of others hold with a chance of 9 in 10
 
 # Relaxation
