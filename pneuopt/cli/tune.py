@@ -57,7 +57,13 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     require(len(task.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
     with progress("tuning", quiet=quiet) as report_progress:
         result = tune(
-            task.loop, task.references, parameters, method=task.method, progress=report_progress, **job.proof_options()
+            task.loop,
+            task.references,
+            parameters,
+            method=task.method,
+            robust=task.robust,
+            progress=report_progress,
+            **job.proof_options(),
         )
     saved = job.save(result)  # before the search without dither, which takes as long
     was = None
@@ -169,6 +175,7 @@ class _Job:
         if result.status.converged:  # also the certificate's notes and the plants that the design was tried on
             document |= {} if result.certificate is None else {"notes": list(result.certificate.notes)}
             document |= {} if result.validation is None else {"validation": records(result.validation.figures)}
+            document |= {} if result.trail is None else {"trail": records(result.trail)}
         status = finish(
             self.outputs,
             {},

@@ -8,7 +8,7 @@ tolerance of such hardware, and each tuned gain by `GAIN_TOLERANCE`.
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -197,12 +197,16 @@ class ExpectedPlants(Shown):
         Parameters that are drawn from a fit's covariance, or within its bounds of the bias.
     known : tuple of str
         Parameters that vary as the tuning's own scenarios have them.
+    vetting : mapping of str to mapping
+        As many others of the same kind, drawn from a stream of their own: by them `tune` chooses among designs, so that
+        `scenarios` can judge the one that is chosen. Empty: no choice.
     """
 
     scenarios: Scenarios
     axes: tuple[CorrelatedParameters, ...]
     from_fit: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
+    vetting: Scenarios = field(default_factory=dict)
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -247,7 +251,8 @@ def expected_plants(
         and a parameter without an interval is drawn from as far as its `bias` reaches.
     scenarios : mapping of str to mapping, optional
         Plants that the design is meant for, the search's own or others from the same boxes: plant k differs from the
-        model as the k-th of them does, over and above what else varies; after the last one comes the first.
+        model as the k-th of them does, over and above what else varies, and those for vetting as the next `count` do;
+        after the last one comes the first.
     count : int
     seed : int or tuple
         No search has seen these plants, whatever seed its own were drawn with.
@@ -271,13 +276,17 @@ def expected_plants(
     ranges = select_ranges(parameters, estimates, others)
     from_fit = (*(map(str, estimated.index) if estimated is not None else ()), *ranges)
     shares = _usual_tolerances(parameters, {*known, *from_fit})
-    seed = further(seed, "expected_plants")
-    varied = tolerances(parameters, shares, count, seed=seed) if shares else {}
-    drawn = {} if estimated is None else draws(parameters, estimated, count, seed=seed, dof=dof)
     own = list(scenarios.values()) or [{}]
-    parts = zip(*((list(part.values()) or [{}] * count) for part in (varied, drawn)), strict=True)
-    wide = draw_in_ranges(parameters, ranges, count, seed)
-    plants = {f"plant {k + 1}": {**a, **b, **wide[k], **own[k % len(own)]} for k, (a, b) in enumerate(parts)}
+
+    def draw(name: str, seed: Seed, first: int) -> Scenarios:
+        varied = tolerances(parameters, shares, count, seed=seed) if shares else {}
+        drawn = {} if estimated is None else draws(parameters, estimated, count, seed=seed, dof=dof)
+        parts = zip(*((list(part.values()) or [{}] * count) for part in (varied, drawn)), strict=True)
+        wide = draw_in_ranges(parameters, ranges, count, seed)
+        others = (own[(first + k) % len(own)] for k in range(count))
+        rows = enumerate(zip(parts, wide, others, strict=True), 1)
+        return {f"{name} {k}": {**a, **b, **c, **d} for k, ((a, b), c, d) in rows}
+
     axes = list[CorrelatedParameters]()
     for names, share in shares.items():
         low, high = ({n: Factor(1 + side * share) for n in names} for side in (-1, 1))
@@ -294,7 +303,11 @@ def expected_plants(
     for n, (least, most) in ranges.items():
         value = abs(parameters.value(n))
         axes.append(CorrelatedParameters((n,), (most - least) / 2 / value if value else 0.0, {n: least}, {n: most}))
-    return ExpectedPlants(plants if axes or known else {}, tuple(axes), from_fit, tuple(sorted(known)))
+    if not axes and not known:
+        return ExpectedPlants({}, ())
+    plants = draw("plant", further(seed, "expected_plants"), 0)
+    vetting = draw("vetting plant", further(seed, "vetting"), count)
+    return ExpectedPlants(plants, tuple(axes), from_fit, tuple(sorted(known)), vetting)
 
 
 def _usual_tolerances(parameters: ParameterSet, others: Collection[str]) -> dict[AxisNames, float]:

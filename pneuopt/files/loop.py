@@ -310,6 +310,8 @@ def read_method(entries: Mapping[str, Any], where: str) -> Method | None:
 
 ACCEPT_KEY = "accept"
 """Top-level key of the defects with which a design is certified all the same."""
+ROBUST_KEY = "robust"
+"""Top-level key that asks for a design which also holds on other plants."""
 
 
 def _words(kind: type[Enum]) -> dict[str, Enum]:
@@ -487,6 +489,7 @@ TUNING_KEYS: Mapping[str, Key] = {
         example='["hunts"]',
         named="defect",
     ),
+    ROBUST_KEY: flag("whether a design is sought that also holds on other plants; false: the best on the model", True),
     **{n: table(LOOP_MEANINGS[n], keys, required=n == "pid") for n, keys in LOOP_KEYS.items()},
     "reference": table("a step or a move to follow; one or more", REFERENCE_KEYS, takes=Takes.TABLES, required=True),
     "minimise": table("what shall be small, weighted", {n: objective_key(n) for n in REQUIREMENTS_BY_KEY}),

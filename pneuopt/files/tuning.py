@@ -27,6 +27,7 @@ from pneuopt.files.loop import (
     PATH_KEYS,
     REFERENCE_KEYS,
     REQUIREMENTS_BY_KEY,
+    ROBUST_KEY,
     SCENARIO_KEYS,
     STEP_KEYS,
     TUNING_KEYS,
@@ -69,6 +70,7 @@ class Tuning:
     method: Method | None = None  # None: the first that suits the loop
     max_steps: float = MAX_STEPS  # steps of the simulations that are refused as too many
     accept: tuple[Defect, ...] = ()  # defects with which a design is certified all the same
+    robust: bool = True  # whether a design is sought that also holds on other plants
     centre: float = 0.0  # what is on the wire to the valve while the loop's command is zero [the command's unit]
 
     @property
@@ -132,7 +134,8 @@ def read_tuning_table(
     references = read_references(table.get("reference", []), loop, path)
     max_steps = read_table(BUDGET_KEYS, table.get("budget", {}), f"{path}: [budget]")["steps"]
     accept = read_entry(TUNING_KEYS[ACCEPT_KEY], table.get(ACCEPT_KEY, []), f"{path}: {ACCEPT_KEY}")
-    return Tuning(loop, references, own, spec, scenarios, validation, method, max_steps, accept, centre)
+    robust = read_entry(TUNING_KEYS[ROBUST_KEY], table.get(ROBUST_KEY, True), f"{path}: {ROBUST_KEY}")
+    return Tuning(loop, references, own, spec, scenarios, validation, method, max_steps, accept, robust, centre)
 
 
 def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
@@ -141,24 +144,30 @@ def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSe
 
 
 def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
-    """Draw plants from the boxes of [scenarios], others than `read_scenarios` gives, each with all that it varies."""
-    kinds = [list(part.values()) for part in _read_kinds(table, where, parameters, PLANT_COUNT)]
-    return {
-        f"new {k}": {n: value for part in own for n, value in part.items()}
-        for k, own in enumerate(zip(*kinds, strict=True), 1)
-    }
+    """Draw plants from the boxes of [scenarios], others than `read_scenarios` gives, each with all that it varies.
+
+    The second half, as many as the first, is independent of it: for vetting.
+    """
+    halves = [
+        zip(*(list(part.values()) for part in _read_kinds(table, where, parameters, stream)), strict=True)
+        for stream in ("validation", "vetting")
+    ]
+    rows = enumerate((own for half in halves for own in half), 1)
+    return {f"new {k}": {n: value for part in own for n, value in part.items()} for k, own in rows}
 
 
 def _read_kinds(
-    table: Mapping[str, Any], where: str, parameters: ParameterSet, new_count: int | None
+    table: Mapping[str, Any], where: str, parameters: ParameterSet, stream: str | None
 ) -> Iterator[Scenarios]:
+    """The scenarios of each kind, as stated; those of a `stream` are `PLANT_COUNT` draws instead."""
+    new_count = None if stream is None else PLANT_COUNT
     check_names("kind", table, SCENARIO_KEYS, f"{where}: [scenarios]")
     for kind, given in table.items():
         spot = f"{where}: [scenarios.{kind}]"
         require(isinstance(given, dict), f'{spot} must be a section, with "load.mass" = "30 %" in it')
         entries = dict(given)
         draw = read_draw({key: entries.pop(key) for key in SCENARIO_KEYS[kind].keys if key in entries}, spot)
-        seed = draw.seed if new_count is None else further(draw.seed, "validation", kind)
+        seed = draw.seed if stream is None else further(draw.seed, stream, kind)
         try:
             if kind == "samples":
                 own = read_sample_spreads(entries, spot, parameters)

@@ -36,7 +36,6 @@ from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet, as_tuple
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.results import Shown
-from pneuopt.quantities.status import report_status
 from pneuopt.report.fit_page import PageHead, fit_page
 from pneuopt.report.page import (
     Page,
@@ -53,8 +52,8 @@ from pneuopt.report.page import (
     write_page,
 )
 from pneuopt.studies.sensitivity import Sensitivity
-from pneuopt.tuning.result import TuningResult, report_active, report_certificate_status, report_gains, report_refusal
-from pneuopt.tuning.validation import report_validation, report_validation_verdict
+from pneuopt.tuning.result import TuningResult, report_active, report_gains, report_outcome, report_refusal
+from pneuopt.tuning.validation import report_validation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -211,9 +210,7 @@ def tuning_page(
 ) -> Page:
     """The page of a tuning: of a design, or of the gains that stand; of certified given ones `stands` is empty."""
     found, certificate, tried = result.status.converged, result.certificate, result.validation
-    verdict = report_status(result.status) if stands else report_certificate_status(result.status)
-    if found and tried is not None:
-        verdict += report_validation_verdict(tried)
+    verdict = report_outcome(result, is_sought=bool(stands))
     if dither:
         verdict += Report(tuple(p for p in dither.parts[:1] if isinstance(p, Line) and p.tone in DOUBTS))
     steps, bode = view.pictures() if view is not None else (None, None)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from math import inf, isfinite, isnan, nan
 from typing import Protocol
 
+import numpy as np
+
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.evaluation.certificate import Defect
@@ -44,7 +46,8 @@ class SearchResult:
     """The point (n,) that a method found, before rounding, with the limits and bounds that are active there.
 
     `optimum` is the objective there, NaN where the method has none; `is_complete`: no Ctrl-C has ended the search.
-    `others` (n,) are points apart in which it ended as well, the best first.
+    `others` (n,) are points apart in which it ended as well, the best first; `finalists` (k, n) lie apart from each
+    other and are hardly worse.
     """
 
     point: Array
@@ -57,6 +60,7 @@ class SearchResult:
     is_complete: bool = True
     uses_simulator: bool = False
     others: tuple[Array, ...] = ()
+    finalists: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def figures(self) -> dict[str, float]:
@@ -130,8 +134,8 @@ class Method(Protocol):
         `attempt` counts the certificates that have failed; from 1 on `start` is the point found with less margin.
         """
 
-    def shorten(self, margin: float) -> "Method":
-        """The method for a short search from a point that is close."""
+    def shorten(self, margin: float, share: float = 1.0) -> "Method":
+        """The method for a short search from a point that is close; of one that is closer still a share will do."""
 
     def limit_path(self, task: TuningTask, spec: Specification) -> LimitPath | None:
         """The problem prepared for moving limits, `spec` the first, tightened; None where each needs a new search."""

@@ -54,6 +54,7 @@ from pneuopt.tuning.tolerances import (
     BEST_SHARE,
     CUT_SETTLING_TIMES,
     FEW_BEST,
+    FINALIST_SHARE,
     FINE_MEMBERS,
     FINE_SHARE,
     KEPT_STATES,
@@ -64,6 +65,7 @@ from pneuopt.tuning.tolerances import (
     LEAST_SHORT_TRIALS,
     LEAST_SPREAD,
     LIMIT_TOLERANCE,
+    MAX_FINALISTS,
     MEMORY_OF_KILLS,
     MEMORY_SIZE,
     MIN_DISTANCE,
@@ -164,13 +166,14 @@ class Racing:
             is_complete=best.is_complete,
             uses_simulator=True,
             others=tuple(best.others),
+            finalists=best.finalists,
         )
 
-    def shorten(self, margin: float) -> "Racing":
-        """The method for a short search from a point that is close."""
-        trials = min(self.trials, max(LEAST_SHORT_TRIALS, self.trials // 6))
-        members = max(LEAST_MEMBERS, round(SHORT_MEMBERS * self.members))
-        return replace(self, members=members, trials=trials, bands=(), margin=margin)
+    def shorten(self, margin: float, share: float = 1.0) -> "Racing":
+        """The method for a short search from a point that is close; see `Method.shorten`."""
+        trials = max(1, round(share * min(self.trials, max(LEAST_SHORT_TRIALS, self.trials // 6))))
+        members, polish = max(LEAST_MEMBERS, round(SHORT_MEMBERS * self.members)), round(share * self.polish)
+        return replace(self, members=members, trials=trials, bands=(), polish=polish, margin=margin)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
         """No path: each set of limits needs a new search."""
@@ -180,7 +183,8 @@ class Racing:
 class RacingResult:
     """The gains (n,) of least merit, candidates simulated, and how many starts ended within 1 % of the best.
 
-    `spread` is the relative excess of the second best start, `others` (k, n) are ends that lie apart.
+    `spread` is the relative excess of the second best start, `others` (k, n) are ends apart, `finalists` (k, n)
+    gains apart from each other that are hardly worse.
     """
 
     point: Array
@@ -190,6 +194,7 @@ class RacingResult:
     agreeing: int
     spread: float
     others: Array
+    finalists: Array
 
 
 def run_racing(
@@ -211,11 +216,12 @@ def run_racing(
         search.run(method)
     except KeyboardInterrupt:
         best = space.from_unit(search.best_so_far())
+        nothing = np.empty((0, len(best)))
         return RacingResult(
-            best, search.count, False, search.starts, search.agreeing, search.spread, np.empty((0, len(best)))
+            best, search.count, False, search.starts, search.agreeing, search.spread, nothing, best[None]
         )
-    point, others = space.from_unit(search.best), space.from_unit(search.other_ends())
-    return RacingResult(point, search.count, True, search.starts, search.agreeing, search.spread, others)
+    point, others, near = (space.from_unit(p) for p in (search.best, search.other_ends(), search.finalists()))
+    return RacingResult(point, search.count, True, search.starts, search.agreeing, search.spread, others, near)
 
 
 # What may be asked for where responses are cut short: nothing of it grows after the response has settled.
@@ -534,7 +540,8 @@ class _RacingSearch:
         best = merits[0] * (1 - LEAST_IMPROVEMENT)
         population, merits = self.evolve(population[:FINE_MEMBERS], fine)
         if merits[0] < best or not self._polished:
-            self._polish(population, merits, fine.simulator, method.polish)
+            population = self._polish(population, merits, fine.simulator, method.polish)[0]
+        self._ends.append(population)
 
     def _is_beaten(self, merit: float) -> bool:
         """Whether a merit lags too far behind what is to be beaten; one that breaks limits may still keep them."""
@@ -575,6 +582,12 @@ class _RacingSearch:
         points = np.array([self.best, *(end[0] for end in self._ends)])
         merits, _ = Race(self._coarse, self._spec, self._scale).merits(self._space.from_unit(points))
         return np.asarray(points[np.argmin(merits)])
+
+    def finalists(self) -> Array:
+        """Points of all phases that lie apart from each other, hardly worse than the best."""
+        population, merits = self._best_first(np.vstack([self.best, *self._ends, *self._polished]), self._simulator)
+        near = population[merits <= (1 + FINALIST_SHARE) * merits[0]]
+        return np.asarray(near[distinct_points(near, NEARBY)][:MAX_FINALISTS])
 
     def _search(self, population: Array, method: Racing, trials: int, best: float) -> tuple[Array, Array]:
         """Search from one start on coarse samples: over wide bands first, then in the band asked for, by gradients.

@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from math import isfinite, isnan, nan
+from math import ceil, isfinite, isnan, nan
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
+from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.evaluation.certificate import Certificate, report_margins, report_notes
 from pneuopt.evaluation.dither import DitherVerdict
@@ -15,6 +16,7 @@ from pneuopt.evaluation.evaluate import report_metrics
 from pneuopt.evaluation.limit_cycle import RestCheck
 from pneuopt.evaluation.metric import Sense
 from pneuopt.evaluation.requirements import (
+    SettlingTime,
     larger_is_better,
     metric_name,
     percent_factor,
@@ -24,15 +26,25 @@ from pneuopt.evaluation.requirements import (
     user_value,
 )
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
+from pneuopt.quantities.report import (
+    Line,
+    Report,
+    Table,
+    Tone,
+    format_number,
+    number_columns,
+    report_verdict,
+    text_columns,
+)
 from pneuopt.quantities.results import NOT_SAVED, Result
-from pneuopt.quantities.status import Code, Status, report_status
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
 from pneuopt.tuning.method import Agreement
 from pneuopt.tuning.relaxation import describe_relaxations
-from pneuopt.tuning.tolerances import ACTIVE_ROOM, MIN_DERIVATIVE_RATIO
-from pneuopt.tuning.validation import DesignValidation, report_validation, report_validation_verdict
+from pneuopt.tuning.tolerances import ACTIVE_ROOM, HIGH_SHARE, MIN_DERIVATIVE_RATIO
+from pneuopt.tuning.validation import DesignValidation, report_validation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -122,8 +134,14 @@ class TuningResult(Result):
         With that verdict the other design's tuned parameters: without dither, or with the one that is left out.
     agreement : Agreement, optional
         How far the starts of the search agree.
+    trail : DataFrame, optional
+        How a design was sought that holds on other plants, a row a way: on how many plants its best design has
+        "held", what 95 of 100 of them reach of the objective, "high", the number for the "best" so far, which stands in
+        the end, and CPU "seconds" since the nominal design.
     refusal : Refusal, optional
         What the search goes on by where the certificate has refused the design.
+    finalists : array
+        Points (k, n) apart from each other that the search found hardly worse than the best.
     """
 
     parameters: ParameterSet
@@ -145,8 +163,10 @@ class TuningResult(Result):
     best: Mapping[str, float] = field(default_factory=dict)
     dither: DitherVerdict | None = None
     rival: Mapping[str, float] = field(default_factory=dict)
+    trail: "pd.DataFrame | None" = None
     agreement: Agreement | None = field(default=None, metadata=NOT_SAVED)
     refusal: Refusal | None = field(default=None, metadata=NOT_SAVED)
+    finalists: Array = field(default_factory=lambda: np.empty((0, 0)), metadata=NOT_SAVED)
 
     @property
     def candidate(self) -> ParameterSet | None:
@@ -241,12 +261,11 @@ def report_tuning(
 
     `was` are the metrics with the gains before, `source` names the gains that stand; empty where nothing was sought.
     """
-    found = report_status(result.status) if source else report_certificate_status(result.status)
+    found = report_outcome(result, is_sought=bool(source))
     if not result.status.converged:
         return found + report_refusal(result, source)
     tried, certificate = result.validation, result.certificate
     beside = ("was", was) if result.on_rig is None else ("on rig", result.on_rig)
-    found += report_validation_verdict(tried) if tried else Report()
     found += report_gains(result.given, result.parameters)
     found += report_metrics(result.certified, result.units, beside=beside, limits=result.limits)
     found += report_active(result.requirements, result.active, result.parameters)
@@ -255,12 +274,40 @@ def report_tuning(
     return found + report_validation(tried) if tried else found
 
 
-def report_certificate_status(status: Status) -> Report:
-    """Whether gains are certified that nobody has sought, then why not, a line each."""
-    good = status.converged
-    lead = f"{'certified' if good else 'NOT CERTIFIED'}: {status.verdict}"
-    details = (Line(text, indent=2) for text in status.sentences[1:])
-    return Report((Line(lead, Tone.GOOD if good else Tone.BAD), *details))
+def report_outcome(result: TuningResult, *, is_sought: bool) -> Report:
+    """How a tuning ended, or whether gains are certified that nobody has sought; then details, a line each."""
+    status, tried = result.status, result.validation
+    word = "certified" if status.converged else "NOT CERTIFIED"
+    text = str(status) if is_sought else "\n".join((f"{word}: {status.verdict}", *status.sentences[1:]))
+    good = Tone.DOUBTFUL if tried is not None and not tried.is_robust else Tone.GOOD
+    return report_verdict(text, good if status.converged else Tone.BAD)
+
+
+def state_promise(result: TuningResult, spec: Specification, loop: ClosedLoop) -> TuningResult:
+    """The certified result whose verdict begins with its promise: the objective's figures, here and on other plants.
+
+    Where the design does not hold on nearly all of them, the verdict begins with that.
+    """
+    tried, terms, doubt = result.validation, list[str](), ""
+    nearly_all = "" if tried is None else f"on {ceil(HIGH_SHARE * tried.count)} of {tried.count} plants"
+    for q in spec.weights:
+        n, unit = metric_name(q), q.metric.shown_unit(loop.command.unit, loop.feedback.unit)
+        value = f"{q.metric.factor * result.requirements['certified'][n]:.3g} {unit}".strip()
+        text = f"settles in {value}" if isinstance(q, SettlingTime) else f"{n} {value}"
+        if tried is not None:
+            high, known = tried.figures["p95"][n], int(tried.plants[n].notna().sum())
+            some = f", on {known} of {tried.count} plants at all"
+            text += some if isnan(high) else f", {f'{high:.3g} {unit}'.strip()} {nearly_all}"
+        terms.append(text)
+    if terms and (tried is not None or spec.limits):
+        limits = "keeps all limits" if spec.limits else "holds"
+        terms.append(limits if tried is None else f"{limits} on {tried.held}")
+    if tried is not None and not tried.is_robust:
+        least = ceil(HIGH_SHARE * tried.count)
+        sought = result.trail is not None and result.trail["best"].max() < least
+        doubt = f"{tried.sentence}; no design found holds on {least}" if sought else tried.sentence
+    sentences = (doubt, "; ".join(terms), *result.status.sentences)
+    return replace(result, status=replace(result.status, sentences=tuple(filter(None, sentences))))
 
 
 def report_refusal(result: TuningResult, source: str) -> Report:

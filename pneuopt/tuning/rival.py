@@ -4,10 +4,11 @@ A dither is handed out only where `judge_dither` finds it useful on the signal w
 tuned without one; it costs air, and the valve's life.
 """
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
-from pneuopt.evaluation.dither import CRITERIA, Usefulness, judge_dither
+from pneuopt.evaluation.dither import CRITERIA, DitherVerdict, Usefulness, judge_dither
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import ConvergenceError, InputError
@@ -18,42 +19,56 @@ from pneuopt.tuning.search import Search, certified_objective, end_point
 from pneuopt.tuning.space import Space
 
 
-def weigh_dither(search: Search, result: TuningResult, asked: Specification) -> TuningResult:
+@dataclass(frozen=True, eq=False)
+class DitherChoice:
+    """The design that is handed out and the search that found it, with the verdict on its dither and what is said.
+
+    `rival` are the other design's tuned parameters.
+    """
+
+    search: Search
+    result: TuningResult
+    verdict: DitherVerdict | None = None
+    rival: Mapping[str, float] = field(default_factory=dict)
+    words: str = ""
+
+
+def weigh_dither(search: Search, result: TuningResult, asked: Specification) -> DitherChoice:
     """The certified design with the verdict on its dither, or the one without, where the dither is not useful.
 
-    `asked` is what the rival has to keep, whose signal is its own mean. A result without a certificate, without a
-    dither that may be left out, or where the mean was asked for by name, is returned as it is.
+    `asked` is what the rival has to keep, whose signal is its own mean. Nothing is weighed without a certificate,
+    without a dither that may be left out, or where the mean was asked for by name. Ctrl-C raises.
     """
-    design, space = result.parameters, search.space
+    design, space, task = result.parameters, search.space, search.task
     may_go = DITHER_AMPLITUDE in space.names and space.parameters[DITHER_AMPLITUDE].lower == 0
     by_name = search.spec.concerns(SettlingTime) and search.spec.settling is SettlingTime
     if not (result.status.converged and may_go and design.value(DITHER_AMPLITUDE) > 0) or by_name:
-        return result
-    rival = find_rival(search, result, asked)
+        return DitherChoice(search, result)
+    other = rival_search(search, result, asked)
+    rival, refused = None, "no gain is free beside the dither"
+    if other is not None:
+        try:
+            rival = other.run()
+            refused = rival.status.verdict
+        except InputError as error:  # an encoder's counts may hide the band from a loop without dither
+            refused = str(error)
     if rival is not None and rival.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
-    held = rival is not None and rival.status.converged
-    task = search.task
-    without = rival.parameters if held and rival is not None else None
+    without = rival.parameters if rival is not None and rival.status.converged else None
     try:
         verdict = judge_dither(task.loop, task.references, design, without=without, band=task.spec.band)
     except ConvergenceError as error:
-        return replace(result, status=result.status.with_details(f"no verdict on the dither: {error}"))
-    refused = "no gain is free beside the dither" if rival is None else rival.status.verdict
-    if without is None:
-        words = f"no gains were certified without dither: {refused}"
-        return replace(result, dither=verdict, status=result.status.with_details(words))
-    gains = {n: without.value(n) for n in search.space.names}
-    if verdict.usefulness is Usefulness.USEFUL or rival is None:
-        return replace(result, dither=verdict, rival=gains)
-    left_out = {n: design.value(n) for n in search.space.names}
-    words = f"left out: {str(verdict).splitlines()[0]}"
-    given = search.space.parameters.with_values(gains)
-    return replace(rival, parameters=given, dither=verdict, rival=left_out, status=rival.status.with_details(words))
+        return DitherChoice(search, result, words=f"no verdict on the dither: {error}")
+    if other is None or rival is None or without is None:
+        return DitherChoice(search, result, verdict, words=f"no gains were certified without dither: {refused}")
+    if verdict.usefulness is Usefulness.USEFUL:
+        return DitherChoice(search, result, verdict, {n: without.value(n) for n in space.names})
+    left_out = {n: design.value(n) for n in space.names}
+    return DitherChoice(other, rival, verdict, left_out, f"left out: {str(verdict).splitlines()[0]}")
 
 
-def find_rival(search: Search, result: TuningResult, asked: Specification) -> TuningResult | None:
-    """The tuning without dither, which begins at the dithered gains; None where no gain beside the dither is free.
+def rival_search(search: Search, result: TuningResult, asked: Specification) -> Search | None:
+    """The search without dither, which begins at the dithered gains; None where no gain beside the dither is free.
 
     It is given up where it lags so far behind that no verdict could prefer it.
     """
@@ -66,10 +81,7 @@ def find_rival(search: Search, result: TuningResult, asked: Specification) -> Tu
     )
     to_beat = certified_objective(search.spec, result) * (1 + CRITERIA["SettlingTimeRaw"].relative)
     task = replace(search.task, space=Space(plain, names), spec=asked, to_beat=to_beat)
-    try:
-        return Search(task, search.method, search.progress).run()
-    except InputError:  # an encoder's counts may hide the band from a loop without dither
-        return None
+    return Search(task, search.method, search.progress)
 
 
 def undithered(parameters: ParameterSet) -> ParameterSet:

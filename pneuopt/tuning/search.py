@@ -40,7 +40,7 @@ from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarni
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback, Status, provenance
 from pneuopt.tuning.feasibility import check_feasibility
-from pneuopt.tuning.method import Method, SearchResult, TuningTask, describe_agreement
+from pneuopt.tuning.method import Agreement, Method, SearchResult, TuningTask, describe_agreement
 from pneuopt.tuning.racing import compute_merits
 from pneuopt.tuning.relaxation import (
     LimitSearch,
@@ -156,6 +156,7 @@ class Certifier:
             proof,
             agreement=agreement,
             refusal=Refusal.END_STOP if contacts else Refusal.LATE if fails_late else None,
+            finalists=np.empty((0, 0)) if found is None else found.finalists,
         )
 
     def _evaluate(self, parameters: ParameterSet) -> tuple[tuple[CaseEvaluation, ...], list[str]]:
@@ -423,9 +424,12 @@ class Search:
         tried = (self.certify_roundings(self.restate(replace(found, point=point)), margin) for point in others)
         return next((other for other in tried if other.status.converged), result)
 
-    def certify_point(self, point: Array, margin: float = nan) -> TuningResult:
-        """Round a point and certify it; with the margin of a search its neighbours as well, until one holds."""
-        found = SearchResult(point, Status(Code.CONVERGED), ())
+    def certify_point(self, point: Array, margin: float = nan, agreement: Agreement | None = None) -> TuningResult:
+        """Round a point and certify it; with the margin of a search its neighbours as well, until one holds.
+
+        `agreement` is that of the search that led to it.
+        """
+        found = SearchResult(point, Status(Code.CONVERGED), (), agreement=agreement)
         if isfinite(margin):
             return self.certify_roundings(self.restate(found), margin)
         rounded = self._round(point)

@@ -36,6 +36,13 @@ MEMBERS_A_GAIN, TRIALS_A_GAIN = 8, 900  # population and trials a free gain of t
 LEAST_LIMIT_MEMBERS = 10  # of its population
 MAX_CANDIDATES = 8  # its designs that are certified
 
+# Robust designs
+
+FINALIST_SHARE, MAX_FINALISTS = 0.05, 8  # objective above the best from which on a point is no finalist; how many
+HIGH_SHARE = 0.95  # of plants: what these reach is promised; a design that holds on fewer is doubtful, and that is said
+EXCHANGE_SHARE = 0.4  # of a short search: all of it takes twice the time for an objective that is up to 3 % smaller
+ENOUGH_HELD = 0.97  # of the plants by which designs are chosen, so that 0.95 of others hold with a chance of 9 in 10
+
 # Relaxation
 
 RELAXATION_MARGIN = 0.002  # margin of the search for the least relaxation of a limit, a fraction

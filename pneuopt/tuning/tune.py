@@ -40,15 +40,16 @@ from pneuopt.evaluation.response import cases, check_steps
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify, specify_limits
-from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet, as_tuple, check_parameters
 from pneuopt.quantities.status import Code, Progress, ProgressCallback, ProgressReporter, Status
 from pneuopt.quantities.units import write_value
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.racing import Racing
-from pneuopt.tuning.result import TuningResult
-from pneuopt.tuning.rival import undithered, weigh_dither
+from pneuopt.tuning.result import TuningResult, state_promise
+from pneuopt.tuning.rival import DitherChoice, undithered, weigh_dither
+from pneuopt.tuning.robust import harden
 from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
 from pneuopt.tuning.tolerances import SEARCHED_PADE_ORDER
@@ -74,6 +75,7 @@ def tune(
     scenarios: Scenarios = NO_SCENARIOS,
     accept: Defect | Sequence[Defect] = (),
     plants: ExpectedPlants | Scenarios | None = None,
+    robust: bool = True,
     rig: Rig | None = None,
     max_steps: float = MAX_STEPS,
     method: Method | None = None,
@@ -81,6 +83,9 @@ def tune(
     progress: Callable[[Progress], None] | None = None,
 ) -> TuningResult:
     """Find the free gains, and dither, with the least objective on the references within the limits.
+
+    The design holds on plants like the model, too, where one is found that does: it is chosen on plants that are drawn
+    for that, at a price in the objective that the status states, and its `validation` is on others.
 
     Parameters
     ----------
@@ -104,6 +109,9 @@ def tune(
         Plants that no search sees, on which the certified design is tried: the result's `validation` says on how many
         it holds. By default those of `expected_plants`, with usual tolerances; after a fit give
         ``expected_plants(parameters, fit.covariance, estimates=fit.estimates)``. ``{}``: none.
+    robust : bool
+        Seek a design that holds on plants like these, by `ExpectedPlants.vetting`, of which a plain mapping has none;
+        otherwise the best one on the model is the answer.
     rig : Rig, optional
         The event-accurate model of the rig that the design is for, with its own friction, sensors and actuator: what
         breaks a limit there is not certified. The result's `on_rig` has its figures.
@@ -161,11 +169,16 @@ def tune(
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     if result.status.code is Code.NOT_CERTIFIED:
         result, is_stopped = confirm_refusal(search, result)
-    if not is_stopped:
+    stopped, choice = "a second search was interrupted" if is_stopped else "", DitherChoice(search, result)
+    if not stopped:
         try:
-            result = weigh_dither(search, result, task.spec)
+            choice = weigh_dither(search, result, task.spec)
         except KeyboardInterrupt:
-            result = _interrupt(task, result, "the search without dither was interrupted")
+            stopped = "the search without dither was interrupted"
+    result = choice.result
+    plants = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
+    if robust and not stopped and result.status.converged and isinstance(plants, ExpectedPlants) and plants.vetting:
+        result, stopped = _harden(choice.search, result, plants.vetting)
     tuned = search.space.names
     shakes = task.loop.dither_period(result.parameters) is not None
     spec = search.spec if shakes else task.spec  # without a dither the signal is its own mean
@@ -175,12 +188,13 @@ def tune(
     result = replace(
         result,
         parameters=parameters.with_values(found),
-        status=result.status.with_remedies(note),
+        status=result.status.with_details(choice.words).with_remedies(note),
+        dither=choice.verdict,
+        rival=choice.rival,
         given={n: parameters.value(n) for n in parameters.free_names},
         limits=metric_limits(spec.limits),
     )
-    if is_stopped:
-        result = _interrupt(task, result, "a second search was interrupted")
+    result = _interrupt(task, result, stopped) if stopped else result
     result = _prove_further(replace(task, spec=spec), result, rig, plants, search.progress, begun)
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status.with_remedies('the given gains stand')}", result)
@@ -255,6 +269,7 @@ def certify(
     reporter = ProgressReporter(progress, "certify")
     reporter("simulating the loop independently")
     result = replace(Certifier(task).certify_given(), parameters=parameters, limits=metric_limits(spec.limits))
+    plants = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
     result = _prove_further(task, result, rig, plants, reporter, begun)
     if throw and not result.status.converged:
         raise ConvergenceError(f"the gains are {result.status}", result)
@@ -265,7 +280,7 @@ def _prove_further(
     task: TuningTask,
     result: TuningResult,
     rig: Rig | None,
-    plants: ExpectedPlants | Scenarios | None,
+    plants: ExpectedPlants | Scenarios,
     progress: ProgressCallback,
     begun: float,
 ) -> TuningResult:
@@ -278,19 +293,29 @@ def _prove_further(
         except KeyboardInterrupt:
             result = _interrupt(task, result, "the simulation of the rig was interrupted")
     if result.status.converged:
-        chosen = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
-        count = len(chosen.scenarios if isinstance(chosen, ExpectedPlants) else chosen)
+        count = len(plants.scenarios if isinstance(plants, ExpectedPlants) else plants)
         try:
             if count:
                 progress(f"trying the design on {count} plants")
                 given = task.loop, task.references, result.parameters
-                found = validate_design(*given, minimise=task.spec, scenarios=chosen, accept=task.accept)
+                found = validate_design(*given, minimise=task.spec, scenarios=plants, accept=task.accept)
                 result = replace(result, validation=found)
+            result = state_promise(result, task.spec, task.loop)
         except KeyboardInterrupt:
             result = _interrupt(task, result, "the trial on other plants was interrupted")
         except ConvergenceError as error:
             result = replace(result, status=result.status.with_details(f"not tried on other plants: {error}"))
     return replace(result, stats={**result.stats, "seconds": time.perf_counter() - begun})
+
+
+def _harden(search: Search, result: TuningResult, plants: Scenarios) -> tuple[TuningResult, str]:
+    """The design that holds on most of the plants, or the one given, and in words by what the search was cut short."""
+    try:
+        return harden(search, result, plants), ""
+    except KeyboardInterrupt:
+        return result, "the search for a design that also holds on other plants was interrupted"
+    except (ConvergenceError, InputError):  # the loop rests on none of them: so the validation will say
+        return result, ""
 
 
 def _interrupt(task: TuningTask, result: TuningResult, reason: str) -> TuningResult:

@@ -163,7 +163,7 @@ class TwoPhase:
         active = tuple(best.multipliers)
         return SearchResult(point, best.status, active, stats, optimum=cost, agreement=optima.agreement)
 
-    def shorten(self, margin: float) -> "TwoPhase":
+    def shorten(self, margin: float, share: float = 1.0) -> "TwoPhase":  # noqa: ARG002
         """The method for a short search from a point that is close."""
         solver = replace(self.solver, max_iterations=min(150, self.solver.max_iterations))
         return replace(self, starts=min(2, self.starts), margin=margin, solver=solver)

@@ -1,4 +1,7 @@
-"""`validate_design`: a design on plants that no search has used: on how many it holds, what breaks, what would help."""
+"""`validate_design`: a design on plants that no search has used: on how many it holds, what breaks, what would help.
+
+`PlantTrial` simulates designs on plants, for this and for `harden`, which chooses among designs on others.
+"""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -13,7 +16,7 @@ from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.certificate import Defect, certificate
 from pneuopt.evaluation.evaluate import metric_cell, metric_units
 from pneuopt.evaluation.metric import Requirement, Sense
-from pneuopt.evaluation.plants import CorrelatedParameters, ExpectedPlants
+from pneuopt.evaluation.plants import ExpectedPlants
 from pneuopt.evaluation.requirements import METRICS, metric_name, requirement_values, user_limit
 from pneuopt.evaluation.response import TuningCase
 from pneuopt.evaluation.scenarios import Scenarios, apply_scenario
@@ -26,6 +29,7 @@ from pneuopt.quantities.results import Result
 from pneuopt.tuning.relaxation import round_outwards
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
+from pneuopt.tuning.tolerances import HIGH_SHARE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,9 +56,7 @@ class DesignValidation(Result):
     varied : tuple of str
         What the plants differ by.
     advice : tuple of str
-        What would help, a sentence each; computed from these plants.
-    suggested : tuple of CorrelatedParameters
-        What of it to tune over.
+        Limits with which the same gains hold, a sentence each; computed from these plants.
     units : mapping of str to str
         The metrics' units.
     """
@@ -65,7 +67,6 @@ class DesignValidation(Result):
     broken: Mapping[str, tuple[str, ...]]
     varied: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
-    suggested: tuple[CorrelatedParameters, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -79,12 +80,23 @@ class DesignValidation(Result):
         return self.count - len(self.broken)
 
     @property
+    def is_robust(self) -> bool:
+        """Whether it holds on 95 of 100 plants."""
+        return self.held >= HIGH_SHARE * self.count
+
+    @property
     def verdict(self) -> str:
         """On how many plants it holds, in a sentence."""
         found = f"holds on {self.held} of {self.count} plants"
         if self.broken or not self.count:
             return found
         return f"{found}: with 95 % confidence on at least {100 * 0.05 ** (1 / self.count):.3g} % of all such plants"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict, and what breaks on the other plants."""
+        breaks = (f"{w} breaks on {n}" if w in METRICS else f"it {w} on {n}" for w, n in self.breaks.items())
+        return f"{self.verdict}: {', '.join(breaks)}" if self.broken else self.verdict
 
     @property
     def breaks(self) -> Mapping[str, int]:
@@ -94,7 +106,7 @@ class DesignValidation(Result):
 
     def summary(self) -> Report:
         """On how many plants the design holds, the figures on them, and what would help."""
-        return report_validation_verdict(self) + report_validation(self)
+        return report_validation(self)
 
 
 def validate_design(
@@ -117,7 +129,7 @@ def validate_design(
         The design's, a `TuningResult.parameters` for example.
     scenarios : mapping of str to mapping, or ExpectedPlants
         The plants, or tolerances of the gains: of `samples` or `draws` with another seed than the search had,
-        `tolerances` with a count, or `expected_plants`, with which the advice says what to tune over.
+        `tolerances` with a count, or `expected_plants`.
     accept : collection of Defect
         Defects that do not count.
 
@@ -157,45 +169,29 @@ def validate_design(
     steps = as_references(references)
     loop = add_disturbances(loop, steps)
     full = loop.complete(parameters).select(loop.parameters)
-    ends = {f"{a.label} {side}": v for a in expected.axes for side, v in (("low", a.low), ("high", a.high))}
-    by_case, restless = _simulate_plants(loop, steps, full, spec, {**expected.scenarios, **ends})
-    restless = [n for n in restless if n in expected.scenarios]
+    trial = PlantTrial(loop, steps, Space(full, ()), expected.scenarios, spec, accept)
+    by_case = trial.by_case(np.zeros(0))
     shown = [name for name in METRICS if name in spec.metric_names]
-    values, worst = _worst_figures(by_case, [n for n in expected.scenarios if n not in restless], steps, shown)
-    by_plant = {str(n): {str(m): float(v) for m, v in row.items()} for n, row in values.to_dict().items()}
-    breaks = {n: find_breaks(row, spec, accept) for n, row in by_plant.items()} | dict.fromkeys(restless, (NO_REST,))
+    values, worst = worst_figures(by_case, trial.plants, steps, shown)
+    breaks = trial.find_breaks(values)
     certified, findings = _certify(loop, full, spec, expected.scenarios, steps, list(dict.fromkeys(worst.values())))
     for plant, words in findings:
         own = [w for w in words if Defect(w) not in accept and w not in breaks[plant]]
         breaks[plant] = (*own, *breaks[plant])
     broken = {n: found for n, found in breaks.items() if found}
-    sides = {a: [f"[{a.label} {side}]" for side in ("low", "high")] for a in expected.axes}
-    axes = {a: by_case[[c for c in by_case if str(c).endswith(tuple(ends))]] for a, ends in sides.items()}
-    advice, suggested = advise(loop, spec, values.T, broken, certified, axes)
     return DesignValidation(
         _figures(values.loc[shown], worst, certified, spec),
         values.loc[shown].T,
         certified.loc[shown],
         broken,
         expected.sentences,
-        advice,
-        suggested,
+        advise(loop, spec, values.T, broken, certified),
         metric_units(loop),
     )
 
 
-def report_validation_verdict(found: DesignValidation) -> Report:
-    """On how many plants a design holds, and what breaks on the others."""
-    breaks = ", ".join(
-        f"{word} breaks on {count}" if word in METRICS else f"it {word} on {count}"
-        for word, count in found.breaks.items()
-    )
-    text = f"{found.verdict}: {breaks}" if breaks else found.verdict
-    return Report((Line(text, Tone.DOUBTFUL if found.broken else Tone.GOOD),))
-
-
 def report_validation(found: DesignValidation) -> Report:
-    """What the plants differ by, the figures on them, and what would help."""
+    """On how many plants a design holds, what these differ by, the figures on them, and what would help."""
     rows = []
     for row in found.figures.reset_index(names="metric").to_dict(orient="records"):
         metric = str(row["metric"])
@@ -204,39 +200,56 @@ def report_validation(found: DesignValidation) -> Report:
         rows.append((metric, *figures, limit, str(row["violations"]), found.units.get(metric, "")))
     figures_heads = number_columns("median", "95 %", "worst", "limit", "broken by")
     table = Table((*text_columns("new plants"), *figures_heads, *text_columns("unit")), tuple(rows))
+    verdict = Line(found.sentence, Tone.DOUBTFUL if found.broken else Tone.GOOD)
     lead = Line(f"tried on {found.count} plants that no search has seen, each off by")
-    lines = list[str]()  # [scenarios.corners] "load.mass" = "5 %"
-    for kind, is_gain in (("corners", False), ("tolerances", True)):
-        keys = [f'"{n}" = "{100 * a.share:.2g} %"' for a in found.suggested if a.is_gain is is_gain for n in a.names]
-        lines += [f"[scenarios.{kind}] {', '.join(keys)}"] if keys else []
-    suggestion = f"to do so, add to the tuning's file: {'; '.join(lines)}"
-    advice = (*found.advice, *([suggestion] if found.suggested else []))
-    return Report((lead, *(Line(text, indent=2) for text in found.varied), table, *map(Line, advice)))
+    return Report((verdict, lead, *(Line(text, indent=2) for text in found.varied), table, *map(Line, found.advice)))
 
 
-def _simulate_plants(
-    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, spec: Specification, scenarios: Scenarios
-) -> tuple["pd.DataFrame", list[str]]:
-    """The metrics of each case by compiled simulation, a column a case, and the plants that have no rest."""
-    import pandas as pd
+class PlantTrial:
+    """Simulate designs on plants, compiled; those on which the loop has no rest stand apart.
 
-    space, restless = Space(parameters, ()), list[str]()
-    try:
-        simulator = Simulator(loop, steps, space, scenarios, spec)
-    except (ConvergenceError, InputError):
-        for n, values in scenarios.items():
-            try:
-                for step in steps:
-                    TuningCase(step, n, values).initial(loop, parameters)
-            except (ConvergenceError, InputError):
-                restless.append(n)
-        left = {n: values for n, values in scenarios.items() if n not in restless}
-        if not restless or not left:
-            raise
-        simulator = Simulator(loop, steps, space, left, spec)
-    rows = simulator.table(np.zeros(0), spec)
-    found = pd.DataFrame({case.label: row for case, row in zip(simulator.cases, rows, strict=True)})
-    return found.loc[[n for n in METRICS if n in (*spec.metric_names, *LANE_DEFECTS)]], restless
+    The point (n,) of a design are the gains of a space.
+    """
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        steps: Sequence[Reference],
+        space: Space,
+        scenarios: Scenarios,
+        spec: Specification,
+        accept: Collection[Defect] = (),
+    ) -> None:
+        self.steps, self.spec, self.accept = steps, spec, accept
+        self.restless = list[str]()
+        try:
+            self.simulator = Simulator(loop, steps, space, scenarios, spec)
+        except (ConvergenceError, InputError):
+            for n, values in scenarios.items():
+                try:
+                    for step in steps:
+                        TuningCase(step, n, values).initial(loop, space.parameters)
+                except (ConvergenceError, InputError):
+                    self.restless.append(n)
+            left = {n: values for n, values in scenarios.items() if n not in self.restless}
+            if not self.restless or not left:
+                raise
+            self.simulator = Simulator(loop, steps, space, left, spec)
+        self.plants = [n for n in scenarios if n not in self.restless]
+
+    def by_case(self, point: Array) -> "pd.DataFrame":
+        """The metrics of each case, a column a case."""
+        import pandas as pd
+
+        rows = self.simulator.table(point, self.spec)
+        found = pd.DataFrame({case.label: row for case, row in zip(self.simulator.cases, rows, strict=True)})
+        return found.loc[[n for n in METRICS if n in (*self.spec.metric_names, *LANE_DEFECTS)]]
+
+    def find_breaks(self, values: "pd.DataFrame") -> dict[str, tuple[str, ...]]:
+        """What breaks on each plant, by its metrics, a column a plant."""
+        by_plant = {str(n): {str(m): float(v) for m, v in row.items()} for n, row in values.to_dict().items()}
+        found = {n: find_breaks(row, self.spec, self.accept) for n, row in by_plant.items()}
+        return found | dict.fromkeys(self.restless, (NO_REST,))
 
 
 def _certify(
@@ -261,7 +274,7 @@ def _certify(
     return pd.DataFrame(metrics), defects
 
 
-def _worst_figures(
+def worst_figures(
     by_case: "pd.DataFrame", plants: Sequence[str], steps: Sequence[Reference], shown: Sequence[str]
 ) -> tuple["pd.DataFrame", dict[str, str]]:
     """The worst of each plant's metrics over its references, a column a plant, and the worst case of those shown.
@@ -304,8 +317,8 @@ def _figures(
         given = given_rows[metric]
         order = _rank_order(given, metric)
         rows[metric] = {
-            "median": _quantile(given, metric, 50.0),
-            "p95": _quantile(given, metric, 95.0),
+            "median": _quantile(given, metric, 0.5),
+            "p95": _quantile(given, metric, HIGH_SHARE),
             "worst": float(given[order[-1]]),
             "worst_plant": str(values.columns[order[-1]]),
             "certified": float(certified[case].to_dict()[metric]),
@@ -315,9 +328,9 @@ def _figures(
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def _quantile(values: Array, metric: str, percent: float) -> float:
-    """The value of a metric that so many percent of the plants are as good as or better than."""
-    return float(values[_rank_order(values, metric)[math.ceil(len(values) * percent / 100) - 1]])
+def _quantile(values: Array, metric: str, share: float) -> float:
+    """The value of a metric that such a share of the plants is as good as or better than."""
+    return float(values[_rank_order(values, metric)[math.ceil(len(values) * share) - 1]])
 
 
 # Defects that the lanes of a simulation show, by the metric that has no finite figure then.
@@ -340,15 +353,8 @@ def advise(
     plants: "pd.DataFrame",
     broken: Mapping[str, tuple[str, ...]],
     certified: "pd.DataFrame",
-    axes: Mapping[CorrelatedParameters, "pd.DataFrame"],
-    most: int = 3,
-) -> tuple[tuple[str, ...], tuple[CorrelatedParameters, ...]]:
-    """Advice where a design breaks on plants: limits that hold with the same gains, and what to tune over.
-
-    `axes` are the metrics with one thing that varies alone at its low and its high end, a column each.
-    """
-    if not broken:
-        return (), ()
+) -> tuple[str, ...]:
+    """With which limits the same gains hold on the plants that work, and on how many no limit helps."""
     lost = [n for n, found in broken.items() if DEFECT_WORDS & set(found)]
     sound = plants.loc[[n for n in plants.index if n not in lost]]
     own, texts = [str(c) for c in certified if not str(c).endswith(tuple(f"[{n}]" for n in lost))], list[str]()
@@ -360,17 +366,4 @@ def advise(
         texts.append(f"{metric.name} {'>=' if least else '<='} {value:g} {unit}".strip() + f" (now {asked:.4g})")
     sentences = [f"with {' and '.join(texts)} these gains hold on {len(sound)} of {len(plants)}"] if texts else []
     count = f"{len(lost)} plant{'s' if len(lost) > 1 else ''}"
-    sentences += [f"no relaxed limit helps on {count}, where the loop fails"] if lost else []
-    worst = dict[CorrelatedParameters, float]()
-    for a, found in axes.items():
-        ends = [{str(n): v for n, v in row.items()} for row in found.to_dict().values()]
-        works = ends and all(math.isfinite(row[n]) for row in ends for n in LANE_DEFECTS)  # it rests and settles
-        shares = [share for row in ends for share in spec.excess(requirement_values(row)).values()] if works else []
-        worst[a] = max(shares, default=-math.inf) if works else math.inf
-    order = sorted(worst, key=lambda a: -worst[a])
-    alone = [a for a in order if worst[a] > 0]
-    reason = "what breaks it most, each alone" if alone else "nothing breaks it alone, most is done by"
-    suggested = tuple((alone or order)[:most])
-    names = " and ".join(a.label for a in suggested)
-    remedy = f"{reason}: {names}; tune over that too" if names else "tune over such plants: add them to the scenarios"
-    return (*sentences, remedy), suggested
+    return (*sentences, *([f"no relaxed limit helps on {count}, where the loop fails"] if lost else []))

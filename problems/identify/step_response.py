@@ -60,7 +60,7 @@ def tuned(plant: po.System, fitted: po.ParameterSet) -> "tuple[tuple[po.Paramete
     own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     given = (fitted.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
     limits = (po.Overshoot(0.02), po.MaxSensitivity(1.6))
-    best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=limits)
+    best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=limits, plants={})
     return (given, po.evaluate(loop, STEPS, given)), best
 
 

@@ -240,6 +240,7 @@ def _tuned(sensitivity: float) -> po.TuningResult:
         minimise=po.SettlingTime(band=0.001),
         subject_to=[po.Overshoot(2e-4), po.PeakControl(1.225), po.MaxSensitivity(sensitivity)],
         method=po.TwoPhase(starts=20),
+        plants={},
     )
 
 

@@ -70,7 +70,7 @@ def run() -> Job:
     own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     nominal = {"supply.pressure": 6e5 + ATMOSPHERE, "load.mass": 5.0, "cylinder.start": 0.1}
     given = (rig.fixed("*") | own).with_values(nominal | HAND).with_bounds(RANGES).freed(*RANGES)
-    best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS)
+    best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS, plants={})
     began = time.perf_counter()
     cases = po.grid(best.parameters, {"supply.pressure": PRESSURES, "load.mass": MASSES})
     study = po.sweep(partial(po.evaluate, loop, STEPS), best.parameters, cases)

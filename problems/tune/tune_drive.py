@@ -68,11 +68,11 @@ def run() -> Job:
     alone, seeing = given.fixed("dither.amplitude"), replace(loop, sensor=None)
     for name, free in (("pid_only", alone), ("tuned", given)):
         begin = time.perf_counter()
-        best = po.tune(loop, STEPS, free, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS)
+        best = po.tune(loop, STEPS, free, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS, plants={})
         designs[name], smooth[name], seconds[name] = best.parameters, best.certified, time.perf_counter() - begin
     smooth["hand"] = po.evaluate(loop, STEPS, given)
     fast = alone.select(n for n in alone if n in seeing.parameters)
-    blind = po.tune(seeing, STEPS, fast, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS)
+    blind = po.tune(seeing, STEPS, fast, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS, plants={})
     shown = designs | {"blind": given | blind.parameters}
     return Job(loop, rig, designs, smooth, {n: po.evaluate(rig, STEPS, p) for n, p in shown.items()}, seconds)
 

@@ -90,15 +90,15 @@ def test_edited_gains_that_hold_get_a_certificate_of_their_own(place: Path) -> N
     edit(place / "tuned.toml", '"8 V*s/m"', '"9 V*s/m"')
     result = run("certify fit.toml tuned.toml -o again.toml -q --json again.json --report again.html")
     assert result.exit_code == 0, result.output
-    assert result.stdout.startswith("certified: the gains as they stand keep 2 limits in 1 case\nholds on ")
-    assert "of 100 plants" in result.stdout
+    assert re.match(r"certified: (holds on|settles in .* on 95 of) [0-9]+", result.stdout)
+    assert "  the gains as they stand keep 2 limits in 1 case\n" in result.stdout
     text = Path("again.toml").read_text("utf-8")
     assert '"9 V*s/m"' in text
     assert text.startswith("# axis 7")
     said = json.loads(Path("again.json").read_text("utf-8"))
     assert said["status"]["code"] == "converged"
     assert said["validation"]
-    assert "certified: the gains as they stand" in Path("again.html").read_text("utf-8")
+    assert "the gains as they stand" in Path("again.html").read_text("utf-8")
     assert run("export fit.toml again.toml --to st").exit_code == 0
     refused = run("certify fit.toml tuned.toml -o tuned.toml -q")
     assert (refused.exit_code, "is an input" in refused.stderr) == (2, True)

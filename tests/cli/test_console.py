@@ -154,8 +154,7 @@ def test_the_plants_are_told_verdict_first_and_what_would_help() -> None:
     assert repr(found).startswith(f"holds on {found.held} of 100 plants: SettlingTime breaks on {100 - found.held}\n")
     text = "\n".join(line for line, _ in found.summary().lines(None))
     assert "assumed tolerances: plant.gain +-5 %\n" in text
-    assert "these gains hold on 100 of 100\n" in text
-    assert 'add to the tuning\'s file: [scenarios.corners] "plant.gain" = "5 %"' in text
+    assert text.endswith("these gains hold on 100 of 100")
 
 
 def test_in_a_pipe_progress_is_a_line_every_few_seconds(

@@ -44,6 +44,13 @@ def in_files(kind: str, seed: int | None, sampling: Sampling | None = None) -> d
     return {kind: own}
 
 
+def in_halves(kind: str, given: dict[str, object]) -> Iterator[tuple[str, Plants]]:
+    """The plants that judge a design, and those by which it is chosen, from a file's boxes."""
+    rows = list(read_validation_scenarios(given, "t", RIG).items())
+    yield f"validation {kind}", dict(rows[:COUNT])
+    yield f"vetting {kind}", dict(rows[COUNT:])
+
+
 def drawn(seed: int | None) -> Iterator[tuple[str, Plants]]:
     """Every kind of draw with one seed for all, None for what each has by default."""
     own: dict[str, Seed] = {} if seed is None else {"seed": seed}
@@ -52,13 +59,14 @@ def drawn(seed: int | None) -> Iterator[tuple[str, Plants]]:
         yield f"samples {way.value}", samples(RIG, spreads, COUNT, sampling=way, **own)
         yield f"monte carlo {way.value}", monte_carlo(RIG, COUNT, spreads=spreads, sampling=way, **own)  # type: ignore[arg-type]
         given = in_files("samples", seed, way)
-        yield f"validation samples {way.value}", read_validation_scenarios(given, "t", RIG)
+        yield from in_halves(f"samples {way.value}", given)
     yield "tolerances", tolerances(RIG, dict.fromkeys(GAINS, 0.01), COUNT, **own)
     yield "draws", draws(RIG, COVARIANCE, COUNT, **own)  # type: ignore[arg-type]
     yield "fit", monte_carlo(RIG, COUNT, covariance=COVARIANCE, estimates=RANGES, **own)  # type: ignore[arg-type]
-    yield "expected of a fit", expected_plants(RIG, COVARIANCE, estimates=RANGES, **own).scenarios  # type: ignore[arg-type]
-    yield "validation corners", read_validation_scenarios(in_files("corners", seed), "t", RIG)
-    yield "validation tolerances", read_validation_scenarios(in_files("tolerances", seed), "t", RIG)
+    expected = expected_plants(RIG, COVARIANCE, estimates=RANGES, **own)  # type: ignore[arg-type]
+    yield from {"expected of a fit": expected.scenarios, "vetting of a fit": expected.vetting}.items()
+    for kind in ("corners", "tolerances"):
+        yield from in_halves(kind, in_files(kind, seed))
 
 
 def axes_of(plants: Plants) -> dict[str, Array]:

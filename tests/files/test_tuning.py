@@ -382,12 +382,13 @@ def test_new_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     said = read_toml(path).unwrap()["scenarios"]
     seen, fresh = (found(said, "tuning.toml", BOXES) for found in (read_scenarios, read_validation_scenarios))
-    assert len(fresh) == 100
+    assert len(fresh) == 200, "a half for the verdict, a half for vetting"
     masses = [v["load.mass"] for v in fresh.values()]
     factors = [v["pid.Kp"] for v in fresh.values()]
     assert all(isinstance(m, float) and 3.5 <= m <= 6.5 for m in masses)
     assert all(isinstance(f, Factor) and 0.99 <= f.share <= 1.01 for f in factors)
     assert not {v["load.mass"] for v in seen.values() if "load.mass" in v} & set(masses)
+    assert len(set(masses)) == 200, "no plant that chose is one that judges"
 
 
 def test_a_tuning_with_scenarios_is_validated_on_new_plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -441,6 +442,12 @@ settling_time = {}
 def test_a_band_may_be_in_the_measured_unit(tmp_path: Path, text: str, band: float | Tolerance) -> None:
     given = MOVE.replace("settling_time = {}", f"settling_time = {{ band = {text} }}")
     assert read_tuning(written_tuning(tmp_path, given), ForceDrive(Coulomb()).system()).specification.band == band
+
+
+@pytest.mark.parametrize(("text", "robust"), [("", True), ("robust = true\n", True), ("robust = false\n", False)])
+def test_a_design_for_other_plants_is_sought_unless_the_file_says_no(tmp_path: Path, text: str, robust: bool) -> None:
+    tuning = read_tuning(written_tuning(tmp_path, f"{text}{MOVE}"), ForceDrive(Coulomb()).system())
+    assert tuning.robust is robust
 
 
 def test_a_reference_may_be_several_moves(tmp_path: Path) -> None:

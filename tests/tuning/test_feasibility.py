@@ -275,7 +275,7 @@ def test_a_start_that_never_settles_is_reported_and_searched_from() -> None:
     run = respond(loop, Step(1.0), wild)
     assert run["speed"][-50:].std() > 0.01
     method = Racing(members=8, trials=40)
-    best = tune(loop, Step(1.0), wild, minimise=SettlingTime(), method=method, progress=lines.append)
+    best = tune(loop, Step(1.0), wild, minimise=SettlingTime(), method=method, plants={}, progress=lines.append)
     assert lines[0] == "with the given gains the loop never settles at 0 to 1, 1 of 1 cases; searching on"
     assert best.certified.loc["SettlingTime"].max() < 0.5
 

@@ -22,7 +22,7 @@ from pneuopt.evaluation.requirements import (
     requirement_values,
 )
 from pneuopt.evaluation.response import TuningCase
-from pneuopt.evaluation.scenarios import apply_scenario, corners, samples, tolerances
+from pneuopt.evaluation.scenarios import apply_scenario, samples, tolerances
 from pneuopt.evaluation.specification import specify
 from pneuopt.evaluation.tolerances import PLANT_COUNT
 from pneuopt.models.friction import Viscous
@@ -35,7 +35,7 @@ from pneuopt.tuning.racing import compute_merits
 from pneuopt.tuning.relaxation import limit_excesses
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import WORST_MERIT
+from pneuopt.tuning.tolerances import HIGH_SHARE, WORST_MERIT
 from pneuopt.tuning.tune import tune
 from pneuopt.tuning.validation import find_breaks, validate_design
 
@@ -138,8 +138,7 @@ def test_a_plant_without_rest_is_broken_and_the_others_are_tried() -> None:
     assert list(found.plants.index) == ["light"]
 
 
-def test_the_advice_is_true_the_relaxed_limit_holds_and_what_to_tune_over_is_what_breaks_it() -> None:
-    """A settling time of ln 50/(K Kp) breaks by the plant's gain of +-5 %, not by the controller's of +-1 %."""
+def test_the_advice_is_true_the_relaxed_limit_holds() -> None:
     loop, design = integrator(5.0)
     design = design.with_bounds({"pid.Kp": (0.1, 50.0)}).freed("pid.Kp")
     asked = math.log(50) / 5 * 1.02
@@ -153,27 +152,17 @@ def test_the_advice_is_true_the_relaxed_limit_holds_and_what_to_tune_over_is_wha
     again = validate_design(loop, STEPS, design, minimise=SettlingTime(max=float(relaxed[1])), scenarios=plants)
     assert again.held == 100
     assert again.advice == ()
-    assert [a.names for a in found.suggested] == [("plant.gain",)]
-    better = tune(
-        loop,
-        STEPS,
-        design,
-        minimise=IAE(),
-        subject_to=[SettlingTime(max=asked)],
-        scenarios=corners(design, {"plant.gain": 0.05}),
-    )
-    assert better.validation is not None
-    assert better.validation.held > found.held
 
 
 def test_tune_tries_a_certified_design_on_plants_and_says_on_how_many_it_holds() -> None:
     loop, given = integrator(5.0)
     given = given.with_bounds({"pid.Kp": (0.1, 20.0)}).freed("pid.Kp")
-    best = tune(loop, STEPS, given, minimise=SettlingTime(), subject_to=[PeakControl(10.0)])
+    best = tune(loop, STEPS, given, minimise=SettlingTime(), subject_to=[PeakControl(10.0)], robust=False)
     assert best.validation is not None
     assert best.validation.count == PLANT_COUNT
-    assert 0 < best.validation.held < PLANT_COUNT, "half of the gains are above 10 V/m"
-    assert best.validation.verdict in repr(best)
+    assert 0 < best.validation.held < HIGH_SHARE * PLANT_COUNT, "half of the gains are above 10 V/m"
+    assert best.status.verdict.startswith(f"holds on {best.validation.held} of 100 plants: PeakControl breaks on ")
+    assert "no design" not in best.status.verdict, "none was sought"
 
 
 def test_all_plants_hold_with_the_confidence_that_their_number_gives() -> None:
@@ -193,7 +182,7 @@ def test_ctrl_c_while_the_plants_are_tried_leaves_the_design_as_the_best_so_far(
     loop, given = integrator(5.0)
     given = given.with_bounds({"pid.Kp": (0.1, 20.0)}).freed("pid.Kp")
     assert tune(loop, STEPS, given, minimise=SettlingTime(), plants={}).validation is None, "none is tried, none stops"
-    best = tune(loop, STEPS, given, minimise=SettlingTime(), throw=False)
+    best = tune(loop, STEPS, given, minimise=SettlingTime(), robust=False, throw=False)
     assert (best.status.code, best.validation) == (Code.INTERRUPTED, None)
     assert (set(best.best), best.parameters) == ({"pid.Kp"}, given)
     assert "holds" not in str(best.status)
