@@ -74,6 +74,7 @@ from .evaluation.requirements import (
     Ripple,
     RiseTime,
     SettlingTime,
+    SettlingTimeRaw,
     SteadyStateError,
     StepEnvelope,
 )
@@ -303,6 +304,7 @@ __all__ = [
     "SensorLag",
     "SeriesForm",
     "SettlingTime",
+    "SettlingTimeRaw",
     "Severity",
     "SoftL1",
     "Spool",
