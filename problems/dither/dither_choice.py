@@ -3,8 +3,8 @@
     python problems/dither/dither_choice.py [--count N] [--first SEED] [--json FILE] [--out DIR]
 
 Half of the rigs are loads pushed by a force, the others the T32 benchmark's pneumatic drive with another load, friction
-and dead zone, with a dither of 40 to 160 Hz. Gains, the dither's amplitude and its offset are free; the settling time is
-minimised within overshoot and sensitivity. The rival is tuned by the same call with the dither's amplitude fixed at 0,
+and dead zone, with a dither of 40 to 160 Hz. Gains, the amplitude and the offset of the dither are free; the settling
+time is minimised within overshoot and sensitivity. The rival is tuned by the same call with the amplitude fixed at 0,
 and has as many trials as the whole.
 
 Rows *.settles: the settling time of the signal with its ripple, the rival's beside. Rows *.no_worse: 1 where it is not
