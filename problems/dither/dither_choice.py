@@ -63,7 +63,7 @@ def draw_rig(seed: int) -> Rig:
         scale = {n: float(hardware.value(n) * np.exp(rng.uniform(-0.6, 0.6))) for n in ("load.mass", *t32.FRICTION)}
         scale["valve.dead_zone"] = float(rng.uniform(0.01, 0.06))
         loop = po.ClosedLoop(drive.system(), po.PID(), po.Dither(frequency))
-        p = loop.parameters | hardware.select(loop.parameters)
+        p = (loop.parameters | hardware).select(loop.parameters)
         given = p.with_values({**t32.VALUES, **scale}).with_bounds(t32.RANGES).freed(*t32.RANGES)
         return Rig(loop, given, t32.STEP, (t32.OVERSHOOT, t32.SENSITIVITY))
     coulomb = float(rng.uniform(15.0, 60.0))
