@@ -143,7 +143,7 @@ def _lag_rest(p: Array, y: float, _: dict[str, float]) -> tuple[list[float], flo
 
 
 def _delay_rest(p: Array, y: float, _: dict[str, float]) -> tuple[list[float], float]:
-    return [y, y / p[0], 0.0], y / p[0]
+    return [y], y / p[0]
 
 
 def _sticking_lag_rest(p: Array, y: float, _: dict[str, float]) -> tuple[list[float], float]:
