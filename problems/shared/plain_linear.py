@@ -57,7 +57,10 @@ def respond_plainly(
     A, B, C = plant.matrices()
     horizon, count = times
     if not sampled[0] and plant.dead_time:
-        return _late(plant, gains, (reference, load), horizon / STEPS_A_HORIZON, STEPS_A_HORIZON * count)
+        longest = min(horizon / STEPS_A_HORIZON, gains["Tf"] / 10)
+        steps_late = int(np.ceil(plant.dead_time / longest))  # a whole number, so that a kick arrives at a step's end
+        h = plant.dead_time / steps_late
+        return _late(plant, gains, (reference, load), h, int(np.ceil(horizon * count / h)), steps_late)
     assert not plant.dead_time
     if not sampled[0]:
         return _continuous(A, B, C, gains, (reference, load), horizon / STEPS_A_HORIZON, STEPS_A_HORIZON * count)
@@ -85,27 +88,21 @@ def _continuous(
 
 
 def _late(
-    plant: PlainPlant, k: Mapping[str, float], given: tuple[float, float], h: float, steps: int
+    plant: PlainPlant, k: Mapping[str, float], given: tuple[float, float], h: float, steps: int, back: int
 ) -> tuple[Array, Array]:
     (A, B, C), (r, d), n = plant.matrices(), given, len(plant.denominator) - 1
     M = np.zeros((n + 2, n + 2))  # plant, its input and that one's slope
     M[:n, :n], M[:n, n], M[n, n + 1] = A, B[:, 0], 1.0
-    step, back = expm(M * h), plant.dead_time / h
-    assert back >= 1
-    decay = np.exp(-h / k["Tf"])
+    step, decay = expm(M * h), np.exp(-h / k["Tf"])
     x, integral, seen = np.zeros(n), 0.0, 0.0
     y, u = np.zeros(steps + 1), np.zeros(steps + 1)
-
-    def late(at: float) -> float:
-        i = int(np.floor(at + 1e-9))
-        return 0.0 if at < -1e-9 else float(u[i] + (at - i) * (u[min(i + 1, steps)] - u[i]))
 
     for i in range(steps + 1):
         error = k["c"] * r - y[i]
         u[i] = k["Kp"] * (k["b"] * r - y[i]) + integral + k["Kd"] / k["Tf"] * (error - seen) + d
         if i == steps:
             break
-        first, last = late(i - back), late(i + 1 - back)
+        first, last = (u[i - back], u[i + 1 - back]) if i >= back else (0.0, 0.0)
         x = step[:n, :n] @ x + step[:n, n] * first + step[:n, n + 1] * (last - first) / h
         y[i + 1] = C[0] @ x
         integral += k["Ki"] * h * (r - (y[i] + y[i + 1]) / 2)
