@@ -139,13 +139,13 @@ def _composed_loops(
     loop.check(parameters)
     at = np.array([[u.get(n, 0.0) for n in names(loop.plant.inputs)]])
     found = _composed_loop(loop)(loop.parameter_vector(parameters)[None], np.asarray(x, dtype=float)[None], at)
-    h, late = loop.pid.sample_time, loop.plant.dead_time
+    h, line = loop.pid.sample_time, loop.plant.dead_time.states if loop.plant.dead_time else ()
     # of a sampled loop the dead time stands behind the controller, not in the plant
-    plant = tuple(n for n in names(loop.plant.states) if h is None or late is None or n not in late.states)
+    plant = tuple(n for n in names(loop.plant.states) if h is None or n not in line)
     own = [f"controller.{k}" for k in range(found.loop[0].shape[-1] - len(plant))]
     A, B, C, D = (M[0] for M in found.loop)
-    ends, delay = (("error",), (loop.command.name,)), (float(found.dead_time[0]), found.pade_order, h)
-    opened = Linearisation(A, B, C, D, (*plant, *own), *ends, *delay)
+    late, order = float(found.dead_time[0]), found.pade_order
+    opened = Linearisation(A, B, C, D, (*plant, *own), ("error",), (loop.command.name,), late, order, h)
     A, B, C, D = (M[0] for M in found.noise)
     states = tuple(f"controller.{k}" for k in range(found.noise[0].shape[-1]))
     return opened, Linearisation(A, B, C, D, states, ("noise",), (loop.command.name,), sample_time=h)
@@ -173,10 +173,10 @@ class ComposedLoops:
 
     def __call__(self, p: Array, x: Array, u: Array) -> OpenLoops:
         """Linearise m loops: parameters p, and the operating points' plant states x and inputs u, (m, ...) each."""
-        loop, order = self.loop, list(self.loop.parameters)
+        loop, listed = self.loop, list(self.loop.parameters)
         plant, shown = self._plants(p, x, u)
         p = self._frozen(p.T, shown.T).full().T
-        offset = p[:, order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0
+        offset = p[:, listed.index(DITHER_OFFSET)] if DITHER_OFFSET in listed else 0.0
         command = u[:, names(loop.plant.inputs).index(loop.command.name)] - offset
         y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
         seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])

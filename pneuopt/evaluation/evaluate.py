@@ -14,7 +14,7 @@ from pneuopt.control.loop import ClosedLoop, add_disturbances
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import with_pade_order
-from pneuopt.dynamics.tolerances import MAX_STEPS
+from pneuopt.dynamics.tolerances import MAX_STEPS, SIMULATED_PADE_ORDER
 from pneuopt.evaluation.limit_cycle import find_limit_cycle
 from pneuopt.evaluation.margins import margin_rows, worst_margins
 from pneuopt.evaluation.metric import Band, Requirement
@@ -33,7 +33,6 @@ from pneuopt.evaluation.response import (
 from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.tolerances import (
-    CERTIFIED_PADE_ORDER,
     MAX_REFINEMENTS,
     MIN_RELATIVE_AMPLITUDE,
     POINTS_PER_READING,
@@ -237,7 +236,7 @@ def _loop_and_rig(model: ClosedLoop | Rig, references: Sequence[Reference]) -> t
     rig = model if isinstance(model, Rig) else None
     if model.loop is None:
         raise ModelError("this rig has no controller, so it follows no reference; make it of a ClosedLoop")
-    late = replace(model.loop, plant=with_pade_order(model.loop.plant, CERTIFIED_PADE_ORDER))
+    late = replace(model.loop, plant=with_pade_order(model.loop.plant, SIMULATED_PADE_ORDER))
     loop = add_disturbances(late, references)
     return loop, replace(rig, model=loop) if rig is not None else None
 

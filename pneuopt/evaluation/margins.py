@@ -870,7 +870,7 @@ class SensitivityReader:
             S = np.broadcast_to(1 / (1 + self.direct[:, None]), omega.shape).astype(complex)
             for p, q in zip(self.opened.T[..., None], self.closed.T[..., None], strict=True):
                 S *= (s - p) / (s - q)
-            return S, (1 / S - 1) * self.delay_factor(omega)
+            return S, np.asarray((1 / S - 1) * self.delay_factor(omega))
 
     def _size(self, metric: str, omega: Array) -> Array:
         S, L = self._responses(omega)

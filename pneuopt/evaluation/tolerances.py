@@ -2,7 +2,6 @@
 
 # Simulations and readings
 
-CERTIFIED_PADE_ORDER = 12  # of a dead time in every simulation of `evaluate`: responses are the delay's to 1e-5
 SIMULATION_TOLERANCE = 1e-8  # relative, of continuations and rest checks; the absolute one is a hundredth of it
 READINGS_A_HORIZON = 1000  # at least: with fewer, a signal leaves the band between two readings unseen
 MIN_READINGS_A_SAMPLE, MAX_READINGS_A_SAMPLE = 2, 16  # of the controller, whatever the horizon

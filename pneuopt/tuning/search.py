@@ -474,26 +474,28 @@ class Search:
         The rounded gains about the point form a lattice, of which a line through any of them and its two neighbours
         says along each gain what is worth simulating: an active limit is then missed by a hundredth of a last place.
         """
-        digits, spec = self.method.digits, self.tighten(margin / 2)
+        digits, tried = self.method.digits, list[list[float]]()
         if digits is None:
             yield found.point
             return
         nearest, most = self.space.round_point(found.point, digits), found.optimum * (1 + SAME_OBJECTIVE)
-        points = np.vstack([nearest, self.space.neighbours(nearest, digits)])
-        near = simulator.values(points, spec)
-        lattice = self.space.lattice(nearest, digits)
-        merits = compute_merits(extrapolate(points, near, lattice), spec, self.task.horizon)
-        likely = lattice[np.argsort(merits, kind="stable")[:MAX_ROUNDINGS]]
-        points = np.vstack([points, *(self.space.round_point(point, digits) for point in likely)])
-        far = simulator.values(points[-len(likely) :], spec)
-        rows = to_records({n: np.append(near[n], far[n]) for n in near})
-        costs = [np.inf if spec.violations(row) else spec.objective(row) for row in rows]
-        best = [k for k in np.argsort(costs, kind="stable").tolist() if costs[k] <= most]
-        tried = list[list[float]]()
-        for point in points[best or [0]]:
-            if len(tried) < MAX_CERTIFIED_POINTS and point.tolist() not in tried:
-                tried.append(point.tolist())
-                yield point
+        around, lattice = self.space.neighbours(nearest, digits), self.space.lattice(nearest, digits)
+        for spec in (self.tighten(margin), self.tighten(margin / 2)):  # half of the room is for rounding, where it must
+            points = np.vstack([nearest, around])
+            near = simulator.values(points, spec)
+            merits = compute_merits(extrapolate(points, near, lattice), spec, self.task.horizon)
+            likely = lattice[np.argsort(merits, kind="stable")[:MAX_ROUNDINGS]]
+            points = np.vstack([points, *(self.space.round_point(point, digits) for point in likely)])
+            far = simulator.values(points[-len(likely) :], spec)
+            rows = to_records({n: np.append(near[n], far[n]) for n in near})
+            costs = [np.inf if spec.violations(row) else spec.objective(row) for row in rows]
+            for k in np.argsort(costs, kind="stable").tolist():
+                point = points[k].tolist()
+                if costs[k] <= most and len(tried) < MAX_CERTIFIED_POINTS and point not in tried:
+                    tried.append(point)
+                    yield points[k]
+        if not tried:
+            yield nearest
 
 
 def extrapolate(points: Array, values: Mapping[str, Array], others: Array) -> dict[str, Array]:

@@ -156,8 +156,8 @@ class Space:
         [0.3998, 0.3999, 0.4, 0.4001]
         """
         places = np.array([_last_place(value, digits) for value in rounded.tolist()])
-        n = np.count_nonzero(places)
-        reach = max(1, min(reach, int((most ** (1 / max(1, n)) - 1) / 2)))
+        n = int(np.count_nonzero(places))
+        reach = max(1, min(reach, int((float(most) ** (1.0 / max(1, n)) - 1) / 2)))
         sides = np.arange(-reach, reach + 1)
         if len(sides) ** n > most:
             offsets = np.random.default_rng(0).integers(-reach, reach + 1, (most, n))

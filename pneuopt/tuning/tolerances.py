@@ -22,8 +22,6 @@ POINTS_INSIDE = 100  # points within the bounds, beside the corners, where a dit
 
 # Search and certificate
 
-SEARCHED_PADE_ORDER = 8  # of a dead time, whatever a file's: of order 2 a search claims .046 s where .12 are certified
-
 MARGINS_TO_TRY = 3  # attempts of a search, each with twice the margin before, until a design is certified
 MAX_CERTIFIED_POINTS = 5  # rounded designs certified at each margin, each an independent simulation of every case
 MAX_ROUNDINGS = 64  # rounded designs that are simulated; of 10 the best loses as much again as the limits' tolerance

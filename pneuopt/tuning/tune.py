@@ -21,7 +21,7 @@ from pneuopt.control.loop import ClosedLoop, add_disturbances, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.dynamics.system import with_pade_order
-from pneuopt.dynamics.tolerances import MAX_STEPS
+from pneuopt.dynamics.tolerances import MAX_STEPS, SIMULATED_PADE_ORDER
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.dither import describe_swing
 from pneuopt.evaluation.evaluate import evaluate, metric_limits, relevant_units
@@ -52,7 +52,6 @@ from pneuopt.tuning.rival import DitherChoice, undithered, weigh_dither
 from pneuopt.tuning.robust import harden
 from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
-from pneuopt.tuning.tolerances import SEARCHED_PADE_ORDER
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuning.validation import validate_design
 
@@ -490,7 +489,7 @@ def _make_task(
     check_parameters(parameters)
     check_smooth(loop.plant)
     steps = as_references(references)
-    loop = replace(loop, plant=with_pade_order(loop.plant, SEARCHED_PADE_ORDER))
+    loop = replace(loop, plant=with_pade_order(loop.plant, SIMULATED_PADE_ORDER))
     loop = add_disturbances(loop, steps)
     require(len(steps) > 0, "no reference to tune for; give a Step or a Move")
     check_steps(loop, steps, loop.complete(parameters), plants=1 + len(scenarios), max_steps=max_steps)

@@ -1,8 +1,7 @@
 """A linear loop by the matrix exponential, which shares no line with pneuopt: plant, dead time and PID written out.
 
-The plant is a transfer function, its dead time L the Pade approximant
-(1 - L s/2 + L^2 s^2/12)/(1 + L s/2 + L^2 s^2/12).
-The PID is continuous, or sampled with a computing delay of whole samples, and has no clip.
+The plant is a transfer function, with its dead time under a continuous PID: its input is the remembered command, on a
+line between two steps. The PID is continuous, or sampled with a computing delay of whole samples, and has no clip.
 """
 
 from collections.abc import Mapping
@@ -26,11 +25,8 @@ class PlainPlant:
     dead_time: float = 0.0
 
     def matrices(self) -> tuple[Array, Array, Array]:
-        """State space with the dead time's approximant: A, B, C."""
-        L = self.dead_time
-        parts = ((self.numerator, -1), (self.denominator, 1))
-        num, den = (np.polymul(p, (L * L / 12, sign * L / 2, 1.0)) for p, sign in parts)
-        A, B, C, _ = tf2ss(np.trim_zeros(num, "f"), np.trim_zeros(den, "f"))
+        """State space without the dead time: A, B, C."""
+        A, B, C, _ = tf2ss(self.numerator, self.denominator)
         return A, B, C
 
 
@@ -60,6 +56,12 @@ def respond_plainly(
     """
     A, B, C = plant.matrices()
     horizon, count = times
+    if not sampled[0] and plant.dead_time:
+        longest = min(horizon / STEPS_A_HORIZON, gains["Tf"] / 10)
+        steps_late = int(np.ceil(plant.dead_time / longest))  # a whole number, so that a kick arrives at a step's end
+        h = plant.dead_time / steps_late
+        return _late(plant, gains, (reference, load), h, int(np.ceil(horizon * count / h)), steps_late)
+    assert not plant.dead_time
     if not sampled[0]:
         return _continuous(A, B, C, gains, (reference, load), horizon / STEPS_A_HORIZON, STEPS_A_HORIZON * count)
     per_sample = max(1, int(np.ceil(sampled[0] * STEPS_A_HORIZON / horizon)))
@@ -82,6 +84,31 @@ def _continuous(
     for i in range(steps):
         x = step @ x
         y[i + 1] = C[0] @ x[:n]
+    return np.linspace(0.0, h * steps, steps + 1), y
+
+
+def _late(
+    plant: PlainPlant, k: Mapping[str, float], given: tuple[float, float], h: float, steps: int, back: int
+) -> tuple[Array, Array]:
+    (A, B, C), (r, d), n = plant.matrices(), given, len(plant.denominator) - 1
+    M = np.zeros((n + 2, n + 2))  # plant, its input and that one's slope
+    M[:n, :n], M[:n, n], M[n, n + 1] = A, B[:, 0], 1.0
+    step, decay = expm(M * h), np.exp(-h / k["Tf"])
+    x, integral, seen = np.zeros(n), 0.0, 0.0
+    y, u = np.zeros(steps + 1), np.zeros(steps + 1)
+
+    for i in range(steps + 1):
+        error = k["c"] * r - y[i]
+        u[i] = k["Kp"] * (k["b"] * r - y[i]) + integral + k["Kd"] / k["Tf"] * (error - seen) + d
+        if i == steps:
+            break
+        first, last = (u[i - back], u[i + 1 - back]) if i >= back else (0.0, 0.0)
+        x = step[:n, :n] @ x + step[:n, n] * first + step[:n, n + 1] * (last - first) / h
+        y[i + 1] = C[0] @ x
+        integral += k["Ki"] * h * (r - (y[i] + y[i + 1]) / 2)
+        after = k["c"] * r - y[i + 1]
+        slope = (after - error) / h  # of a line, of which the filter's answer is exact
+        seen = after - slope * k["Tf"] + (seen - error + slope * k["Tf"]) * decay
     return np.linspace(0.0, h * steps, steps + 1), y
 
 

@@ -2,13 +2,14 @@
 
    Plants (kind), their states and parameters p:
    0  y'' + 2 z w y' + w^2 y = K w^2 u                     y, y'                        K w z
-   1  T y' + y = K u(t - L), Pade of second order          y, q, q'                     K T L
+   1  T y' + y = K u(t - L), the commands remembered        y                            K T L
    2  kind 0 with friction F(y) [input's unit]             y, d                         K w z  Fc Fs vs B smoothing
    3  M v' = u - f - F(v)                                  x, v                         M f    Fc Fs vs B smoothing
    4  the same with LuGre bristles                         x, v, z                      M f    Fc Fs vs B s0 s1 vd
    5  cylinder, 5/3 valve, LuGre                           x, v, pa, pb, s, s', z       see `enum` below
    The measured signal is y; of kinds 3 to 5 the speed, or the position where `position` is 1. */
 #include <math.h>
+#include <stdlib.h>
 
 #define MAX_STATES 12
 #define TWO_PI 6.283185307179586
@@ -21,9 +22,11 @@ typedef struct {
     double Kp, Ki, Kd, Tf, b, c, Tt, low, high, sample, amplitude, offset, frequency;
     int analogue;
     double r;
+    double *past, before, h; /* of kind 1: the commands at steps of h, a ring of `size`, and the one so far */
+    long size;
 } Loop;
 
-static const int plant_states[] = {2, 3, 2, 2, 3, 7};
+static const int plant_states[] = {2, 1, 2, 2, 3, 7};
 
 static double stribeck(double v, double fc, double fs, double vs) { return fc + (fs - fc) * exp(-(v / vs) * (v / vs)); }
 
@@ -77,8 +80,7 @@ void plant_rates(int kind, const double *x, double u, const double *p, double *d
         d[0] = x[1], d[1] = p[1] * p[1] * (p[0] * u - x[0]) - 2 * p[2] * p[1] * x[1];
         break;
     case 1:
-        d[1] = x[2], d[2] = 12 / (p[2] * p[2]) * (u - x[1]) - 6 / p[2] * x[2];
-        d[0] = (p[0] * (u - p[2] * x[2]) - x[0]) / p[1];
+        d[0] = (p[0] * u - x[0]) / p[1];
         break;
     case 2:
         force = stribeck(x[0], p[3], p[4], p[5]) * tanh(x[0] / p[7]) + p[6] * x[0];
@@ -115,9 +117,18 @@ static double command(const Loop *l, double t, const double *x, double held, dou
     return u;
 }
 
+/* The command as long ago as the dead time, which is a step or more; between two steps on a line. */
+static double late(const Loop *l, double t) {
+    double at = (t - l->p[2]) / l->h + 1e-9, share;
+    long i = (long)floor(at);
+    if (at < 0) return l->before;
+    share = at - i;
+    return (1 - share) * l->past[i % l->size] + share * l->past[(i + 1) % l->size];
+}
+
 static void slope(const Loop *l, double t, const double *x, double held, double *d) {
     double u = command(l, t, x, held, d + plant_states[l->kind]);
-    plant_rates(l->kind, x, u, l->p, d);
+    plant_rates(l->kind, x, l->kind == 1 ? late(l, t) : u, l->p, d);
 }
 
 static void advance(const Loop *l, double t, double h, int n, double *x, double held) {
@@ -138,9 +149,10 @@ long run_loop(int kind, int position, const double *p, const double *c, double r
               double h, long count, long every, long per_sample, double low, double high, double *t_out, double *y_out,
               double *u_out) {
     Loop l = {kind, position, c[8] != 0, p, c[0], c[1], c[2], c[3], c[4], c[5], c[9], c[6], c[7], c[10], c[11], c[12], c[13],
-              c[14] != 0, r1};
+              c[14] != 0, r1, NULL, u0, h, kind == 1 ? (long)(p[2] / h) + 4 : 1};
     int n = plant_states[kind] + (l.sample > 0 ? 0 : 2);
     double x[MAX_STATES] = {0}, scratch[2], y;
+    l.past = calloc(l.size, sizeof(double));
     for (int i = 0; i < plant_states[kind]; i++) x[i] = x0[i];
     y = measured(&l, x);
     double transfer = l.Ki == 0 || l.sample <= 0 ? 0 : -l.Kp * l.b * (r0 - y);
@@ -164,9 +176,14 @@ long run_loop(int kind, int position, const double *p, const double *c, double r
             long i = k / every;
             y = measured(&l, x);
             t_out[i] = t, y_out[i] = y, u_out[i] = command(&l, t, x, held, scratch);
-            if (!isfinite(y) || (kind >= 3 && (x[0] < low || x[0] > high))) return i;
+            if (!isfinite(y) || (kind >= 3 && (x[0] < low || x[0] > high))) {
+                free(l.past);
+                return i;
+            }
         }
+        if (kind == 1) l.past[k % l.size] = command(&l, t, x, held, scratch);
         advance(&l, t, h, n, x, held);
     }
+    free(l.past);
     return count;
 }

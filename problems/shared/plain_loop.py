@@ -78,7 +78,7 @@ def simulate_plainly(
     position = loop.feedback.name == "position"
     x0, u0 = kind.rest(p, *((0.0, {"position": step.initial}) if position else (step.initial, dict(step.start))))
     c, sample = _controller(loop, parameters)
-    h, every, per_sample = _grid(kind, step, c, sample)
+    h, every, per_sample = _grid(kind, step, c, sample, float(p[2]) if kind.number == 1 else 0.0)
     count = int(horizons * step.horizon / (h * every)) + 1
     t, y, u = (np.empty(count) for _ in range(3))
     stroke = p[STROKE] if kind.number == 5 else inf
@@ -103,11 +103,12 @@ def simulate_plainly(
     return PlainResponse(t[:n], y[:n], u[:n], n < count)
 
 
-def _grid(kind: Kind, step: po.Step, c: Array, sample: float) -> tuple[float, int, int]:
+def _grid(kind: Kind, step: po.Step, c: Array, sample: float, late: float) -> tuple[float, int, int]:
     """Runge-Kutta step [s], steps a recorded sample and steps a sample of the controller."""
     h = NONLINEAR_STEP if kind.number >= 2 else step.horizon / LINEAR_STEPS
     if not sample:
         h = min(h, c[3] / 5)  # the derivative's filter
+        h = late / np.ceil(late / h) if late else h  # a kick arrives at a step's end
     per_sample = int(np.ceil(sample / h - 1e-9)) if sample else 1
     h = sample / per_sample if sample else h
     spacing = step.horizon / SAMPLES
@@ -143,7 +144,7 @@ def _lag_rest(p: Array, y: float, _: dict[str, float]) -> tuple[list[float], flo
 
 
 def _delay_rest(p: Array, y: float, _: dict[str, float]) -> tuple[list[float], float]:
-    return [y, y / p[0], 0.0], y / p[0]
+    return [y], y / p[0]
 
 
 def _sticking_lag_rest(p: Array, y: float, _: dict[str, float]) -> tuple[list[float], float]:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from math import factorial, pi
 
 import casadi as ca
@@ -6,15 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import command_centre
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.dynamics.system import System, add_dead_time, names, parameter_vector
+from pneuopt.evaluation.margins import frequency_response
 from pneuopt.models.friction import Coulomb, LuGre
 from pneuopt.models.linear import INPUT_OFFSET, PLANT_GAIN, FirstOrder, Integrator, Plant, SecondOrder
 from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -288,3 +292,23 @@ def test_a_loop_counts_its_command_from_the_offset() -> None:
     assert loop.plant.equilibrium({"valve_voltage": 0.0}, at) == pytest.approx([0.0])
     assert system.equilibrium({"valve_voltage": 3.0}, at) == pytest.approx([0.0])
     assert pytest.approx(system.linearise(np.zeros(1), {}, at).A) == rest.A
+
+
+def test_a_dead_time_is_added_to_any_plant_of_one_input() -> None:
+    """As the linear plants have theirs; of a plant that has one, or has two inputs, it is refused."""
+    ours, theirs = add_dead_time(FirstOrder().system(), 3), FirstOrder(pade_order=3).system()
+    values = {"plant.time_constant": 0.5, "plant.gain": 3.0}
+    p, q = values | {"dead_time": 0.2}, values | {"plant.dead_time": 0.2}
+    found, wanted = (
+        linear_plant(loop, loop.parameters.with_values(given))
+        for loop, given in ((ClosedLoop(ours, PID()), p), (ClosedLoop(theirs, PID()), q))
+    )
+    w = np.array([0.1, 1.0, 30.0])
+    exact = 3 / (0.5j * w + 1) * np.exp(-0.2j * w)
+    np.testing.assert_allclose(frequency_response(found, w), exact, rtol=1e-9)
+    np.testing.assert_allclose(frequency_response(wanted, w), exact, rtol=1e-9)
+    with pytest.raises(ModelError, match="has a dead time"):
+        add_dead_time(theirs)
+    two = replace(theirs, inputs=(Quantity("a", "V"), Quantity("b", "V")), dead_time=None)
+    with pytest.raises(ModelError, match="needs one input, got a, b"):
+        add_dead_time(two)
