@@ -273,7 +273,7 @@ def test_holding_ends_where_the_logs_reject_what_is_held(monkeypatch: pytest.Mon
     start = problem.candidates[0]
     good = solve_least_squares(problem.transcription(start), problem.method)
     first = replace(good, unidentifiable=("friction.viscous",), status=SearchEnd.UNSETTLED.status)
-    refit = replace(first, end=SearchEnd.ABANDONED, unidentifiable=("friction.coulomb",))
+    refit = replace(first, stats={**good.stats, "cost": 1e9}, unidentifiable=("friction.coulomb",))
 
     def solve(_: Transcription, method: LeastSquares) -> Fit:
         limits.append(method.max_misfit)
@@ -282,9 +282,20 @@ def test_holding_ends_where_the_logs_reject_what_is_held(monkeypatch: pytest.Mon
     monkeypatch.setattr(search, "solve_least_squares", solve)
     held, fit = search._hold_unidentifiable(problem, "start", first, is_given=True)
     assert list(held.fixed) == ["friction.viscous"]
-    assert fit.end is SearchEnd.ABANDONED
+    assert fit.stats["cost"] == 1e9
     (limit,) = limits
     assert HOPELESS_MISFIT <= limit < math.inf
+
+
+def test_a_search_that_misses_the_logs_by_far_holds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten thousand noise variances from its log it could not tell a valve's rounding, and was made twice more."""
+    problem = posed(Coulomb())
+    start = problem.candidates[0]
+    good = solve_least_squares(problem.transcription(start), problem.method)
+    far = replace(good, unidentifiable=("friction.viscous",), stats={**good.stats, "cost": 1e9})
+    monkeypatch.setattr(search, "solve_least_squares", lambda *_: far)
+    monkeypatch.setattr(search, "_hold_unidentifiable", lambda *_, **__: pytest.fail("held"))
+    assert search.fit_fixing_unidentifiable(problem, start, HOPELESS_MISFIT) == (problem, far)
 
 
 SAMPLE, NOISE = 2e-3, {"position": 2e-5, "pressure_a": 1e3, "pressure_b": 1e3}  # [s], [m], [Pa]

@@ -709,8 +709,6 @@ def test_a_search_that_is_far_off_takes_no_finer_steps(
     assert fit.stats["gap_deviation"] == stages[-1].gap
     assert 2 * fit.stats["cost"] > 3 * fit.count
     assert bool(steps) == is_refined
-    assert (fit.end is SearchEnd.ABANDONED) == (not is_refined)
-    assert is_refined or not fit.unsettled  # nothing that a caller would hold, to fit again
 
 
 @pytest.mark.parametrize("is_coarse", [True, False])
