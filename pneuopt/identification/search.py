@@ -322,7 +322,8 @@ def fit_fixing_unidentifiable(
     """
     method = replace(problem.method, max_misfit=max_misfit, known_costs=known_costs)
     first = solve_least_squares(problem.transcription(start), method)
-    if not _open_names(problem, first) or first.status.code is Code.INTERRUPTED:
+    is_left = first.status.code is Code.INTERRUPTED or 2 * first.stats["cost"] > max_misfit * first.count
+    if is_left or not _open_names(problem, first):
         return problem, first
     loose = () if first.unidentifiable else _loose_widths(problem, first)
     for is_given in (True, False) if not first.status.converged else (True,):
@@ -363,7 +364,7 @@ def _hold_unidentifiable(
         held = replace(held, fixed={**held.fixed, **{n: source.value(n) for n in names}})
         before, fit = fit, solve_least_squares(held.transcription(held.start_from(fit, label)), warm)
         fit = fit.with_effort_of(before)
-        if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED) or fit.end is SearchEnd.ABANDONED:
+        if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED) or 2 * fit.stats["cost"] > worst * fit.count:
             break
     return held, fit
 

@@ -17,7 +17,7 @@ file. Only `LevenbergMarquardt`, which takes the steps of one stage, changes its
     TOO_STIFF      the start                    a sample takes more integration steps than a search can afford
     DIVERGED       a stage's end                the model was not finite where the stage began
     DUPLICATE      a stage's end                the cost is that of a known search after the same stage
-    ABANDONED      a stage's end, the last      the misfit exceeds `LeastSquares.max_misfit`
+    ABANDONED      the first's end, the last    the misfit exceeds `LeastSquares.max_misfit`
     OPTIMUM        a shortcut, the last stage   a full undamped step would move no parameter noticeably
     UNSETTLED      the last stage               one would still move, or is not determined, and no repeat helps
     INTERRUPTED    any move                     of Ctrl-C or a spent CPU budget: the last iterate before it
@@ -593,7 +593,7 @@ def pass_stage(state: SearchState, stage: Stage) -> SearchState:
     state = replace(state, stage_ends=(*state.stage_ends, StageEnd(state.iterate.nodes, state.iterate.z, state.cost)))
     if joins_known_search(state):
         return state.end_with(SearchEnd.DUPLICATE)
-    if state.is_hopeless:
+    if stage is not last and state.is_hopeless:
         return state.end_with(SearchEnd.ABANDONED)
     return shorten(state) if stage is first else state
 

@@ -48,7 +48,7 @@ from pneuopt.identification.search import (
     liveliest_part,
     mark_order,
 )
-from pneuopt.identification.tolerances import BEST, EXCERPT_SEGMENTS, LEVELS, PART_SEGMENTS
+from pneuopt.identification.tolerances import BEST, EXCERPT_SEGMENTS, HOPELESS_MISFIT, LEVELS, PART_SEGMENTS
 from pneuopt.logs.experiment import Experiment
 from pneuopt.models.catalog import b32
 from pneuopt.models.drives import ForceDrive
@@ -265,6 +265,37 @@ def test_a_start_that_is_too_stiff_to_be_searched_holds_nothing(monkeypatch: pyt
     held, fit = search.fit_fixing_unidentifiable(problem, stiff)
     assert "so stiff that a sample takes" in fit.status.verdict
     assert (dict(held.fixed), fit.unidentifiable, calls) == ({}, (), 1)
+
+
+def test_holding_ends_where_the_logs_reject_what_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a given mass a servo's log was missed by ten million noise variances, and two more values were held there."""
+    problem, limits = posed(Coulomb()), list[float]()
+    start = problem.candidates[0]
+    good = solve_least_squares(problem.transcription(start), problem.method)
+    first = replace(good, unidentifiable=("friction.viscous",), status=SearchEnd.UNSETTLED.status)
+    refit = replace(first, stats={**good.stats, "cost": 1e9}, unidentifiable=("friction.coulomb",))
+
+    def solve(_: Transcription, method: LeastSquares) -> Fit:
+        limits.append(method.max_misfit)
+        return refit
+
+    monkeypatch.setattr(search, "solve_least_squares", solve)
+    held, fit = search._hold_unidentifiable(problem, "start", first, is_given=True)
+    assert list(held.fixed) == ["friction.viscous"]
+    assert fit.stats["cost"] == 1e9
+    (limit,) = limits
+    assert HOPELESS_MISFIT <= limit < math.inf
+
+
+def test_a_search_that_misses_the_logs_by_far_holds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten thousand noise variances from its log it could not tell a valve's rounding, and was made twice more."""
+    problem = posed(Coulomb())
+    start = problem.candidates[0]
+    good = solve_least_squares(problem.transcription(start), problem.method)
+    far = replace(good, unidentifiable=("friction.viscous",), stats={**good.stats, "cost": 1e9})
+    monkeypatch.setattr(search, "solve_least_squares", lambda *_: far)
+    monkeypatch.setattr(search, "_hold_unidentifiable", lambda *_, **__: pytest.fail("held"))
+    assert search.fit_fixing_unidentifiable(problem, start, HOPELESS_MISFIT) == (problem, far)
 
 
 SAMPLE, NOISE = 2e-3, {"position": 2e-5, "pressure_a": 1e3, "pressure_b": 1e3}  # [s], [m], [Pa]

@@ -711,6 +711,24 @@ def test_a_search_that_is_far_off_takes_no_finer_steps(
     assert bool(steps) == is_refined
 
 
+@pytest.mark.parametrize("is_coarse", [True, False])
+def test_finer_steps_are_taken_once_in_a_stage(is_coarse: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that came to the noise by finer steps refined them again, by 8 to 64 times the first ones."""
+    steps = list[int]()
+
+    def record(state: SearchState, fine: int) -> SearchState:
+        steps.append(fine)
+        return correct_residuals_by(state, fine)
+
+    monkeypatch.setattr("pneuopt.shooting.least_squares.correct_residuals_by", record)
+    monkeypatch.setattr(SearchState, "is_at_noise", True)
+    state = start_search(segment(two_logs()), LeastSquares())
+    state = enter_stage(state, OTHERS[-1], state.iterate.nodes, state.iterate.z)
+    assert state.is_coarse
+    lifted.iterate(replace(state, is_coarse=is_coarse), 1)
+    assert bool(steps) == is_coarse
+
+
 @pytest.mark.parametrize(("share", "is_left"), [(0.5, True), (2.0, False)])
 def test_a_search_that_is_far_off_before_its_last_stage_is_left(share: float, is_left: bool) -> None:
     """The last stage took a Stribeck log's first start 60 iterations, and led nowhere."""
