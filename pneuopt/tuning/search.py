@@ -653,7 +653,7 @@ def _excess(resting: Search, longer: Search, points: Array) -> Array:
 def _excess_within(search: Search, points: Array) -> Array:
     """The largest relative excess over a limit within a search's horizon, in which the response has to settle."""
     spec = search.tighten(0.0)
-    return limit_excesses(search.simulator.coarse(spec).values(points, spec), spec).max(axis=1)
+    return np.asarray(limit_excesses(search.simulator.coarse(spec).values(points, spec), spec).max(axis=1))
 
 
 def _improve(search: Search, longer: Search, held: TuningResult) -> tuple[TuningResult, bool]:
