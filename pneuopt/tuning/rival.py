@@ -40,9 +40,15 @@ def weigh_dither(search: Search, result: TuningResult, asked: Specification) -> 
     without a dither that may be left out, or where the mean was asked for by name. Ctrl-C raises.
     """
     design, space, task = result.parameters, search.space, search.task
-    may_go = DITHER_AMPLITUDE in space.names and space.parameters[DITHER_AMPLITUDE].lower == 0
     by_name = search.spec.concerns(SettlingTime) and search.spec.settling is SettlingTime
-    if not (result.status.converged and may_go and design.value(DITHER_AMPLITUDE) > 0) or by_name:
+    if not result.status.converged or DITHER_AMPLITUDE not in space.names or by_name:
+        return DitherChoice(search, result)
+    if design.value(DITHER_AMPLITUDE) == 0:  # the signal is its own mean, and told as such
+        plain = search.with_specification(asked, search.method)
+        same = plain.certify_point(end_point(result, space), agreement=result.agreement)
+        told = replace(same, stats={**result.stats, **same.stats}, finalists=result.finalists)
+        return DitherChoice(plain, told) if told.status.converged else DitherChoice(search, result)
+    if space.parameters[DITHER_AMPLITUDE].lower > 0:
         return DitherChoice(search, result)
     other = rival_search(search, result, asked)
     rival, refused = None, "no gain is free beside the dither"

@@ -179,8 +179,7 @@ def tune(
     if robust and not stopped and result.status.converged and isinstance(plants, ExpectedPlants) and plants.vetting:
         result, stopped = _harden(choice.search, result, plants.vetting)
     tuned = search.space.names
-    shakes = task.loop.dither_period(result.parameters) is not None
-    spec = search.spec if shakes else task.spec  # without a dither the signal is its own mean
+    spec = choice.search.spec
     untuned = [n for n in task.space.names if n not in tuned]
     note = f"{', '.join(untuned)} left as given: without effect on a linear loop's average" if untuned else ""
     found = {n: result.parameters.value(n) for n in tuned} if result.status.converged else {}
