@@ -10,8 +10,8 @@ on 200 fresh plants, from a stream that neither `tune` nor its verdict has drawn
 "held" are the fresh plants on which every limit holds, in per cent; "high" is what 95 of 100 of them reach of the
 objective, "median" the half; "price" is how much worse the objective is on the model than the nominal design's;
 "cpu" the seconds of the whole `tune`, with its verdict. "ended by" counts the problems by the last way to find a design
-that was tried: a way that never is the last is needless. "false" are designs whose verdict claims 95 of 100 plants while
-fewer than 90 of 100 fresh ones hold.
+that was tried: a way that never is the last is needless. "false" are designs whose verdict claims 95 of 100 plants
+while fewer than 90 of 100 fresh ones hold.
 
 Rows *.robust.held: a design by default holds on more fresh plants than the nominal one; "held.share" is the share of
 problems in which it holds on 95 of 100, or its verdict begins with the number on which it does.
