@@ -142,7 +142,6 @@ ROBUST_WAYS = (
     Way("finalists", "trying the designs that are hardly worse", lambda state: list(state.nominal.finalists), False),
     Way("worst plants", _EXCHANGE, Hardening.exchange),
     Way("worst plants, again", _EXCHANGE, Hardening.exchange),
-    Way("worst plants, a third time", _EXCHANGE, Hardening.exchange),
 )
 
 

@@ -33,6 +33,7 @@ INSIDE = {
     "problems/speed/simulation_speed.py": "times the compiled simulation, lane by lane",
     "problems/speed/t32.py": SEARCH,
     "problems/tune/random_designs.py": "confirms refusals by brute force on the search's batched simulator",
+    "problems/tune/robust_default.py": "reads the files of the commands, and the specification of random_designs",
     "problems/tune/random_kinds.py": "hands the checks of random_designs the specification that they read",
     "problems/tune/rule_comparison.py": SEARCH,
     "problems/tune/pareto.py": "times the solver along a front, and sets brute force on its designs",
