@@ -227,6 +227,7 @@ PUBLIC_NAMES = [
     "SensorLag",
     "SeriesForm",
     "SettlingTime",
+    "SettlingTimeRaw",
     "simulate",
     "simulate_stick_slip",
     "SoftL1",

@@ -82,7 +82,7 @@ def rival_search(search: Search, result: TuningResult, asked: Specification) -> 
     if not names:
         return None
     search.progress("tuning without dither")
-    plain = undithered(search.space.parameters).with_values(
+    plain = switch_off_dither(search.space.parameters).with_values(
         dict(zip(search.space.names, end_point(result, search.space).tolist(), strict=True)) | {DITHER_AMPLITUDE: 0.0}
     )
     to_beat = certified_objective(search.spec, result) * (1 + CRITERIA["SettlingTimeRaw"].relative)
@@ -90,7 +90,7 @@ def rival_search(search: Search, result: TuningResult, asked: Specification) -> 
     return Search(task, search.method, search.progress)
 
 
-def undithered(parameters: ParameterSet) -> ParameterSet:
+def switch_off_dither(parameters: ParameterSet) -> ParameterSet:
     """The parameters with the dither's amplitude fixed at 0."""
     plain = parameters.with_bounds({DITHER_AMPLITUDE: (0.0, parameters[DITHER_AMPLITUDE].upper)})
     return plain.with_values({DITHER_AMPLITUDE: 0.0}).fixed(DITHER_AMPLITUDE, DITHER_FREQUENCY)

@@ -48,7 +48,7 @@ from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult, state_promise
-from pneuopt.tuning.rival import DitherChoice, undithered, weigh_dither
+from pneuopt.tuning.rival import DitherChoice, switch_off_dither, weigh_dither
 from pneuopt.tuning.robust import harden
 from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
@@ -160,26 +160,21 @@ def tune(
     specification = specify(minimise, subject_to)
     task = prepare_task(loop, references, parameters, specification, scenarios, accept, max_steps)
     check_rig(rig, task)
-    settles = task.spec.concerns(SettlingTime)
-    swing = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band) if settles else None
-    if swing is not None:
-        warnings.warn(swing, PhysicsWarning, stacklevel=2)
+    if task.spec.concerns(SettlingTime):
+        swing = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
+        if swing is not None:
+            warnings.warn(swing, PhysicsWarning, stacklevel=2)
     search, result, is_stopped = _search(task, method, ProgressReporter(progress, "tune"))
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     if result.status.code is Code.NOT_CERTIFIED:
         result, is_stopped = confirm_refusal(search, result)
-    stopped, choice = "a second search was interrupted" if is_stopped else "", DitherChoice(search, result)
-    if not stopped:
-        try:
-            choice = weigh_dither(search, result, task.spec)
-        except KeyboardInterrupt:
-            stopped = "the search without dither was interrupted"
-    result = choice.result
+    choice, stopped = DitherChoice(search, result), "a second search was interrupted" if is_stopped else ""
+    choice, stopped = (choice, stopped) if stopped else _weigh_dither(choice, task.spec)
+    result, spec = choice.result, choice.search.spec
     plants = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
     if robust and not stopped and result.status.converged and isinstance(plants, ExpectedPlants) and plants.vetting:
         result, stopped = _harden(choice.search, result, plants.vetting)
     tuned = search.space.names
-    spec = choice.search.spec
     untuned = [n for n in task.space.names if n not in tuned]
     note = f"{', '.join(untuned)} left as given: without effect on a linear loop's average" if untuned else ""
     found = {n: result.parameters.value(n) for n in tuned} if result.status.converged else {}
@@ -304,6 +299,14 @@ def _prove_further(
         except ConvergenceError as error:
             result = replace(result, status=result.status.with_details(f"not tried on other plants: {error}"))
     return replace(result, stats={**result.stats, "seconds": time.perf_counter() - begun})
+
+
+def _weigh_dither(choice: DitherChoice, asked: Specification) -> tuple[DitherChoice, str]:
+    """The choice between the design and its rival without dither, and in words by what the search was cut short."""
+    try:
+        return weigh_dither(choice.search, choice.result, asked), ""
+    except KeyboardInterrupt:
+        return choice, "the search without dither was interrupted"
 
 
 def _harden(search: Search, result: TuningResult, plants: Scenarios) -> tuple[TuningResult, str]:
@@ -571,5 +574,5 @@ def tune_without_dither(
     check_closed_loop(loop)
     check_parameters(parameters)
     require(loop.dither is not None, "this loop has no dither to leave out: tune it with `tune`")
-    plain = undithered(loop.complete(parameters))
+    plain = switch_off_dither(loop.complete(parameters))
     return tune(loop, references, plain, minimise=minimise, **{"plants": {}, **options})
