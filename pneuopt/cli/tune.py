@@ -28,7 +28,8 @@ from pneuopt.cli.shared import (
 from pneuopt.cli.simulate import loop_view, task_metrics
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.evaluation.dither import DitherVerdict, judge_dither
-from pneuopt.evaluation.plants import expected_plants
+from pneuopt.evaluation.plants import ExpectedPlants, expected_plants
+from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.files.drive import StoredFit
 from pneuopt.files.rig import read_rig
 from pneuopt.files.tuned import write_tuned
@@ -74,7 +75,7 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     show_report(console, report_tuning(result, was=was, source=f"the gains of {tuning}"))
     dither, compared = Report(), dict[str, Any]()
     with suppress(KeyboardInterrupt):
-        compared, dither = _compare_dither(console, task, parameters, result, quiet)
+        compared, dither = _compare_dither(console, job, result, quiet)
     title = f"Tuning of {fit.name} by {tuning.name}"
     details = {"stands": f"the gains of {tuning}", "was": was, "dither": dither}
     return job.finish(result, saved, partial(_make_page, job, result, title, details), compared)
@@ -220,21 +221,20 @@ def _make_page(job: _Job, result: TuningResult, title: str, told: Mapping[str, A
     return tuning_page(head, result, job.view(result), exports=exports, **told)
 
 
-def _compare_dither(
-    console: "Console", task: Tuning, before: ParameterSet, result: TuningResult, quiet: bool
-) -> tuple[dict[str, Any], Report]:
+def _compare_dither(console: "Console", job: _Job, result: TuningResult, quiet: bool) -> tuple[dict[str, Any], Report]:
     """Show whether a certified design's dither is worth its price; returns the table of that, and what was shown.
 
     An interrupted command computes nothing more.
     """
-    nothing = dict[str, Any](), Report()
+    nothing, task = (dict[str, Any](), Report()), job.task
     if not result.status.converged or interruption_status() is not None:
         return nothing
     if result.dither is not None:
         show_report(console, result.dither.summary())
         return {"dither": _dither_record(result.dither, dict(result.rival) or None)}, result.dither.summary()
     if task.loop.dither_period(result.parameters) is not None:
-        rival = tune_rival(console, task, before, quiet)
+        plants = job.proof_options()["plants"]  # of which the rival makes as much as the design
+        rival = tune_rival(console, task, job.parameters, plants, quiet)
         if interruption_status() is not None:
             return nothing
         parameters = result.parameters
@@ -259,7 +259,9 @@ def _dither_record(verdict: DitherVerdict, rival: Mapping[str, float] | None) ->
     return {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": rival}
 
 
-def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet: bool) -> ParameterSet | None:
+def tune_rival(
+    console: "Console", task: Tuning, parameters: ParameterSet, plants: ExpectedPlants | Scenarios, quiet: bool
+) -> ParameterSet | None:
     """Values tuned without dither, with which the dither is compared; None, and said, where there are none."""
     if not set(parameters.free_names) - {DITHER_AMPLITUDE, DITHER_FREQUENCY}:
         return None
@@ -274,6 +276,8 @@ def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet
                 max_steps=task.max_steps,
                 accept=task.accept,
                 method=task.method,
+                robust=task.robust,
+                plants=plants,
                 throw=False,
                 progress=report_progress,
             )

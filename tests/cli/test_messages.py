@@ -180,7 +180,7 @@ def test_a_rival_that_cannot_be_tuned_leaves_the_dithered_result(capsys: pytest.
     given = loop.parameters.with_values({"dither.amplitude": 1.0, "pid.Kp": 100.0})
     given = given.with_bounds({"pid.Kp": (50.0, 200.0)}).freed("pid.Kp")
     task = Tuning(loop, (Step(0.02, horizon=0.1),), given, specify(SettlingTime()))
-    assert tune_rival(Console(width=400), task, given, quiet=True) is None
+    assert tune_rival(Console(width=400), task, given, {}, quiet=True) is None
     said = capsys.readouterr().out
     assert said.startswith("no gains were certified without dither: reference 0 to 0.02: the settling band of +-0.4 mm")
 
