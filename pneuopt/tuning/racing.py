@@ -108,7 +108,7 @@ class Racing:
     """
 
     members: int = 40
-    trials: int = 900
+    trials: int = 1000
     bands: tuple[float, ...] = (1.5, 2.5, 5.0)
     polish: int = 20
     margin: float = 0.015
