@@ -13,16 +13,19 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.dither import Usefulness, judge_dither
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import Overshoot, PeakControl, SettlingTime, SettlingTimeRaw
+from pneuopt.evaluation.requirements import IAE, Overshoot, PeakControl, SettlingTime, SettlingTimeRaw
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drives import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
+from pneuopt.tuning import rival
 from pneuopt.tuning.racing import Racing, compute_merits
 from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.rival import weigh_dither
+from pneuopt.tuning.search import Search
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import search_space
+from pneuopt.tuning.space import Space, search_space
 from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
 STEP, QUICK = Step(0.1, horizon=0.4), Racing(members=8, trials=40)
@@ -44,17 +47,44 @@ def found(*, mean: bool = False) -> TuningResult:
     return tune(loop, STEP, given, minimise=SettlingTime(mean=mean or None), method=QUICK, plants={})
 
 
-def test_a_dither_is_handed_out_only_where_its_own_verdict_is_useful() -> None:
-    """By the verdict against the rival that the result names, either way round."""
-    best, (loop, given) = found(), shaken()
-    assert best.status.converged
-    assert best.dither is not None
-    assert set(best.rival) == set(BOUNDS)
-    other = given.with_values(best.rival)
-    dithered, plain = (other, best.parameters) if best.rival["dither.amplitude"] > 0 else (best.parameters, other)
-    verdict = judge_dither(loop, STEP, dithered, without=plain)
-    assert verdict.usefulness is best.dither.usefulness
-    assert (verdict.usefulness is Usefulness.USEFUL) == (best.parameters.value("dither.amplitude") > 0)
+def dithered_search() -> tuple[Search, TuningResult]:
+    """A search for a small IAE, and its certified design with a dither of 20 N, which gains nothing."""
+    loop, given = shaken()
+    search = prepare_search(prepare_task(loop, STEP, given, specify(IAE())), QUICK)
+    design = search.certify_point(np.array([500.0, 9000.0, 20.0]))
+    assert design.status.converged
+    return search, design
+
+
+def test_a_dither_that_is_not_useful_is_left_out_for_the_rival() -> None:
+    """The rival is tuned without, certified, and better; the verdict and the dithered design stand beside."""
+    search, design = dithered_search()
+    choice = weigh_dither(search, design, search.spec)
+    assert choice.verdict is not None
+    assert choice.verdict.usefulness is not Usefulness.USEFUL
+    assert choice.result.status.converged
+    assert choice.result.parameters.value("dither.amplitude") == 0
+    assert choice.rival == {n: design.parameters.value(n) for n in BOUNDS}
+    assert choice.words.startswith("left out: the dither of 20 N at 80 Hz is ")
+    before, after = (float(r.requirements["certified"]["IAE"]) for r in (design, choice.result))
+    assert after < before
+
+
+def test_a_dither_that_is_useful_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    search, design = dithered_search()
+    verdict = judge_dither(search.task.loop, STEP, design.parameters)
+    useful = replace(verdict, usefulness=Usefulness.USEFUL)
+    monkeypatch.setattr(rival, "judge_dither", lambda *_, **__: useful)
+    choice = weigh_dither(search, design, search.spec)
+    assert (choice.result, choice.verdict) == (design, useful)
+    assert choice.rival["dither.amplitude"] == 0
+
+
+def test_a_dither_that_must_be_is_not_weighed() -> None:
+    search, design = dithered_search()
+    bounded = design.parameters.with_bounds({"dither.amplitude": (1.0, 50.0)})
+    kept = replace(search, task=replace(search.task, space=Space(bounded, search.space.names)))
+    assert weigh_dither(kept, design, search.spec).verdict is None
 
 
 def test_what_is_handed_out_settles_with_its_ripple() -> None:

@@ -128,7 +128,7 @@ def test_finalists_are_hardly_worse_than_the_best_and_lie_apart() -> None:
     ranges = {"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}
     given = loop.parameters.with_bounds(ranges).freed(*ranges)
     task = prepare_task(loop, Step(1.0), given, specify(IAE(), [Overshoot(0.05), PeakControl(4.0)]))
-    search = prepare_search(task, Racing(trials=100))
+    search = prepare_search(task, Racing(trials=40))
     found = search.run()
     values = search.simulator.values(found.finalists, search.spec)
     best = certified_objective(search.spec, found)
