@@ -239,6 +239,7 @@ class SettlingTime(Requirement):
         proper = isinstance(self.band, Tolerance) or 0 < self.band < 1
         message = f"{type(self).__name__}: band is a fraction between 0 and 1, got {self.band}; 2 % is 0.02"
         require(proper, f"{message}, 0.1 mm is Tolerance(1e-4)")
+        object.__setattr__(self, "mean", self.mean or None)  # false asks for nothing
         super().__post_init__()
 
 

@@ -157,7 +157,7 @@ def _tuning_template(
         least = {"amplitude": 0.0, "offset": -most}
         free = {n: Parameter(0.0, command, lower, most) for n, lower in least.items()}
         stated |= {f"dither.{n}": _value_text(p, free=True, bounds=True) for n, p in free.items()}
-    stated["minimise.settling_time"] = f'{{ band = "{BAND}", weight = 1.0 }}'
+    stated["minimise.settling_time"] = f'{{ band = "{BAND}", weight = 1.0, mean = false }}'
     stated |= {"limits.overshoot": _quote(OVERSHOOT), "limits.max_sensitivity": f"{SENSITIVITY:g}"}
     examples = {"loop.measured": _quote(loop.feedback.name), "loop.actuated": _quote(loop.command.name)}
     examples["pid.fault_output"] = _quote(write_value(0.5 * sum(ends), command))

@@ -403,7 +403,7 @@ _ENVELOPE = Key(
 )
 _BAND = Key('half width of the band, a fraction of the step or as "0.1 mm"', usual=SettlingTime.band, read=_read_band)
 EXTRA_KEYS: Mapping[str, Mapping[str, Key]] = {
-    "settling_time": {"band": _BAND, "mean": Key("true: the mean counts, not the signal with its ripple", Takes.FLAG)},
+    "settling_time": {"band": _BAND, "mean": flag("whether the mean counts, not the signal with its ripple")},
     "settling_time_raw": {"band": _BAND},
     "step_envelope": {"bounds": _ENVELOPE},
 }
