@@ -346,6 +346,9 @@ def tune_command(
         Path, typer.Argument(metavar="TUNING", help="tuning.toml: controller, references, requirements.")
     ],
     rig: RigFile = None,
+    structure: Annotated[
+        bool, typer.Option("--structure", help="Adopt another part of the controller where that is certified, better.")
+    ] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write tuned.toml.")] = None,
     json: Json = None,
     plot: Plot = None,
@@ -357,7 +360,7 @@ def tune_command(
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.tune import run_tune
 
-        raise typer.Exit(run_tune(fit, tuning, rig, Outputs(output, json, plot, report), quiet))
+        raise typer.Exit(run_tune(fit, tuning, rig, Outputs(output, json, plot, report), quiet, structure))
 
 
 @_command("certify")

@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet: bool) -> int:
-    """Tune a loop; returns the exit status."""
+def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet: bool, structure: bool = False) -> int:
+    """Tune a loop, where asked for its structure as well; returns the exit status."""
     job = _read_job(fit, tuning, rig, outputs)
     task, parameters = job.task, job.parameters
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
@@ -63,6 +63,7 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
             parameters,
             method=task.method,
             robust=task.robust,
+            structure=structure,
             progress=report_progress,
             **job.proof_options(),
         )
@@ -71,6 +72,10 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     if result.status.converged and result.on_rig is None and interruption_status() is None:
         with suppress(ConvergenceError, InputError, KeyboardInterrupt):  # the loop as given may not be simulated
             was = task_metrics(task, parameters)
+    if result.loop is not None:
+        task = replace(task, loop=result.loop)
+        parameters = result.parameters.with_values(dict(result.given))
+        job = replace(job, task=task, parameters=parameters)
     console = make_console()
     show_report(console, report_tuning(result, was=was, source=f"the gains of {tuning}"))
     dither, compared = Report(), dict[str, Any]()
@@ -177,6 +182,7 @@ class _Job:
             document |= {} if result.certificate is None else {"notes": list(result.certificate.notes)}
             document |= {} if result.validation is None else {"validation": records(result.validation.figures)}
             document |= {} if result.trail is None else {"trail": records(result.trail)}
+        document |= {} if result.structures is None else {"structures": records(result.structures)}
         status = finish(
             self.outputs,
             {},

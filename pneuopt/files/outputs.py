@@ -267,6 +267,9 @@ OUTPUTS: Mapping[str, Member] = {
         notes=Member("what the certificate notes", Holds.TEXTS, is_optional=True),
         validation=_optional(_rows("on new plants, a row a requirement", _NAMED, is_open=True)),
         trail=_optional(_rows("how a design for other plants was sought", {"way": _text("its name")}, is_open=True)),
+        structures=_optional(
+            _rows("other structures of the controller", {"structure": _text("its name")}, is_open=True)
+        ),
         dither=Member("the verdict on the dither", Holds.RECORD, _DITHER, is_optional=True),
         stats=_STATS,
         provenance=_PROVENANCE,

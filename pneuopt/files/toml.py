@@ -93,6 +93,18 @@ def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter,
         entries[key] = inline_table({"value": entry or _format_value(found.value, found)} | fields)
 
 
+def put_parameter(document: tomlkit.TOMLDocument, name: str, p: Parameter) -> None:
+    """Write a parameter in place of what stands there: with its bounds where it is free, else its value."""
+    section, _, key = name.partition(".")
+    if section not in document:
+        document[section] = tomlkit.table()
+    entries: Any = document[section]
+    text = {n: _format_value(getattr(p, n), p) for n in ("value", "lower", "upper")}
+    flags = {"log": True, "free": True} if p.log else {"free": True}
+    entries.pop(key, None)
+    entries[key] = inline_table({**text, **flags}) if p.free else text["value"]
+
+
 def construct_at(make: Callable[[], Made], where: str) -> Made:
     """Call `make`; an `InputError` that it raises gets the place in the file before its message."""
     try:

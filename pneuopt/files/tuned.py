@@ -37,7 +37,7 @@ from pneuopt.files.loop import (
     signal_units_of,
 )
 from pneuopt.files.tolerances import CHECKSUM_DIGITS, FILE_DIGITS
-from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
+from pneuopt.files.toml import inline_table, put_parameter, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, move_paths, read_tuning_table
 from pneuopt.quantities.errors import InputError, UnitError, require
 from pneuopt.quantities.output import plain_value, write_text
@@ -87,6 +87,8 @@ def write_tuned(
     for name in TUNED_SECTIONS:
         document.pop(name, None)
     move_paths(document.get("reference", []), Path(source).parent, Path(path).parent)
+    for n in result.structure:
+        put_parameter(document, n, gains[n])
     for section in TUNABLE_SECTIONS:
         for key, entry in document.unwrap().get(section, {}).items():
             if isinstance(entry, dict) and entry.get("free", False):

@@ -138,6 +138,13 @@ class TuningResult(Result):
         How a design was sought that holds on other plants, a row a way: on how many plants its best design has
         "held", what 95 of 100 of them reach of the objective, "high", the number for the "best" so far, which stands in
         the end, and CPU "seconds" since the nominal design.
+    structures : DataFrame, optional
+        Where other structures of the controller were tried, a row each: its "status", the certified "objective" (NaN
+        where none is certified), the CPU "seconds" that it took, and the gains.
+    structure : tuple of str
+        Parameters that an adopted structure has brought or settled; `loop` is the loop with it.
+    loop : ClosedLoop, optional
+        None where the given loop was kept.
     refusal : Refusal, optional
         What the search goes on by where the certificate has refused the design.
     finalists : array
@@ -164,6 +171,9 @@ class TuningResult(Result):
     dither: DitherVerdict | None = None
     rival: Mapping[str, float] = field(default_factory=dict)
     trail: "pd.DataFrame | None" = None
+    structures: "pd.DataFrame | None" = None
+    structure: tuple[str, ...] = ()
+    loop: ClosedLoop | None = field(default=None, metadata=NOT_SAVED)
     agreement: Agreement | None = field(default=None, metadata=NOT_SAVED)
     refusal: Refusal | None = field(default=None, metadata=NOT_SAVED)
     finalists: Array = field(default_factory=lambda: np.empty((0, 0)), metadata=NOT_SAVED)
@@ -288,7 +298,21 @@ def state_promise(result: TuningResult, spec: Specification, loop: ClosedLoop) -
 
     Where the design does not hold on nearly all of them, the verdict begins with that.
     """
-    tried, terms, doubt = result.validation, list[str](), ""
+    tried, terms, doubt = result.validation, describe_objective(result, spec, loop), ""
+    if terms and (tried is not None or spec.limits):
+        limits = "keeps all limits" if spec.limits else "holds"
+        terms.append(limits if tried is None else f"{limits} on {tried.held}")
+    if tried is not None and not tried.is_robust:
+        least = ceil(HIGH_SHARE * tried.count)
+        sought = result.trail is not None and result.trail["best"].max() < least
+        doubt = f"{tried.sentence}; no design found holds on {least}" if sought else tried.sentence
+    sentences = (doubt, "; ".join(terms), *result.status.sentences)
+    return replace(result, status=replace(result.status, sentences=tuple(filter(None, sentences))))
+
+
+def describe_objective(result: TuningResult, spec: Specification, loop: ClosedLoop) -> list[str]:
+    """What a certified result reaches of each term of its objective, here and on the plants that it was tried on."""
+    tried, terms = result.validation, list[str]()
     nearly_all = "" if tried is None else f"on {ceil(HIGH_SHARE * tried.count)} of {tried.count} plants"
     for q in spec.weights:
         n, unit = metric_name(q), q.metric.shown_unit(loop.command.unit, loop.feedback.unit)
@@ -299,15 +323,7 @@ def state_promise(result: TuningResult, spec: Specification, loop: ClosedLoop) -
             some = f", on {known} of {tried.count} plants at all"
             text += some if isnan(high) else f", {f'{high:.3g} {unit}'.strip()} {nearly_all}"
         terms.append(text)
-    if terms and (tried is not None or spec.limits):
-        limits = "keeps all limits" if spec.limits else "holds"
-        terms.append(limits if tried is None else f"{limits} on {tried.held}")
-    if tried is not None and not tried.is_robust:
-        least = ceil(HIGH_SHARE * tried.count)
-        sought = result.trail is not None and result.trail["best"].max() < least
-        doubt = f"{tried.sentence}; no design found holds on {least}" if sought else tried.sentence
-    sentences = (doubt, "; ".join(terms), *result.status.sentences)
-    return replace(result, status=replace(result.status, sentences=tuple(filter(None, sentences))))
+    return terms
 
 
 def report_refusal(result: TuningResult, source: str) -> Report:

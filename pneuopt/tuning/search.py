@@ -274,13 +274,14 @@ UNTRIED = "it was not tried on other plants"
 class Search:
     """Search, round the gains and certify them; search again with a wider margin where the certificate fails.
 
-    With `rests` only responses that settle within the horizon count.
+    With `rests` only responses that settle within the horizon count; it makes `attempts` at most.
     """
 
     task: TuningTask
     method: Method
     progress: ProgressCallback
     rests: bool = False
+    attempts: int = MARGINS_TO_TRY
 
     @property
     def space(self) -> Space:
@@ -311,7 +312,7 @@ class Search:
             return self._result_so_far(simulator, _interruption_result(self.space.start))
         result, start, agreement = None, self.space.start if start is None else start, None
         finder = self
-        for attempt in range(MARGINS_TO_TRY):
+        for attempt in range(self.attempts):
             margin = min(self.method.margin * 2**attempt, 0.5)
             found = finder.find(margin, start, attempt)
             if finder is not self and found.is_complete:
@@ -333,7 +334,7 @@ class Search:
                 return result or self.certifier.certify(simulator, found, self._round(found.point))
             # over a longer horizon once a design was refused for what came after its own
             late = finder is not self or (result is not None and _fails_late(result))
-            finder = self.lengthen(rests=found.status.converged) if late and attempt + 1 < MARGINS_TO_TRY else finder
+            finder = self.lengthen(rests=found.status.converged) if late and attempt + 1 < self.attempts else finder
         assert result is not None
         return result
 

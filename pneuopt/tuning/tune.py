@@ -52,6 +52,7 @@ from pneuopt.tuning.rival import DitherChoice, switch_off_dither, weigh_dither
 from pneuopt.tuning.robust import harden
 from pneuopt.tuning.search import UNTRIED, Certifier, Search, certified_objective, confirm_refusal, relax
 from pneuopt.tuning.space import Space, clip_level, search_space, whole_space
+from pneuopt.tuning.structure import StructureTrials, friction_rules, try_structures
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuning.validation import validate_design
 
@@ -75,6 +76,7 @@ def tune(
     accept: Defect | Sequence[Defect] = (),
     plants: ExpectedPlants | Scenarios | None = None,
     robust: bool = True,
+    structure: bool = False,
     rig: Rig | None = None,
     max_steps: float = MAX_STEPS,
     method: Method | None = None,
@@ -111,6 +113,11 @@ def tune(
     robust : bool
         Seek a design that holds on plants like these, by `ExpectedPlants.vetting`, of which a plain mapping has none;
         otherwise the best one on the model is the answer.
+    structure : bool
+        Try other structures of the controller, a part more or no integral, as the plant admits them, and adopt the best
+        that is certified and better; the result's `loop` is then the loop with it. They are also tried, and named in
+        the status, where no design is certified, or one that hunts or creeps; `structures` has the figures. They take
+        about as much CPU time as the tuning itself, at most.
     rig : Rig, optional
         The event-accurate model of the rig that the design is for, with its own friction, sensors and actuator: what
         breaks a limit there is not certified. The result's `on_rig` has its figures.
@@ -156,37 +163,37 @@ def tune(
     >>> best.status.converged, bool(best.certified.loc["PeakControl", "0 to 1"] <= 4.0)
     (True, True)
     """
-    begun = time.perf_counter()
+    begun, cpu = time.perf_counter(), time.process_time()
     specification = specify(minimise, subject_to)
     task = prepare_task(loop, references, parameters, specification, scenarios, accept, max_steps)
     check_rig(rig, task)
-    if task.spec.concerns(SettlingTime):
-        swing = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
-        if swing is not None:
-            warnings.warn(swing, PhysicsWarning, stacklevel=2)
-    search, result, is_stopped = _search(task, method, ProgressReporter(progress, "tune"))
-    result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
-    if result.status.code is Code.NOT_CERTIFIED:
-        result, is_stopped = confirm_refusal(search, result)
-    choice, stopped = DitherChoice(search, result), "a second search was interrupted" if is_stopped else ""
-    choice, stopped = (choice, stopped) if stopped else _weigh_dither(choice, task.spec)
-    result, spec = choice.result, choice.search.spec
+    _warn_of_swing(task)
+    search, choice, is_doubtful, stopped = _find(task, method, ProgressReporter(progress, "tune"))
+    given, tried = {n: parameters.value(n) for n in parameters.free_names}, StructureTrials()
+    if not stopped and (structure or is_doubtful):
+        tried = try_structures(choice.search, choice.result, time.process_time() - cpu)
+        stopped = tried.stopped
+    adopted = tried.better[0] if structure and tried.better and not stopped else None
+    if adopted is not None:
+        search, choice, task = adopted.search, DitherChoice(adopted.search, adopted.result), adopted.search.task
+        parameters |= adopted.change.parameters
+    result = choice.result
     plants = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
     if robust and not stopped and result.status.converged and isinstance(plants, ExpectedPlants) and plants.vetting:
         result, stopped = _harden(choice.search, result, plants.vetting)
     tuned = search.space.names
-    untuned = [n for n in task.space.names if n not in tuned]
-    note = f"{', '.join(untuned)} left as given: without effect on a linear loop's average" if untuned else ""
+    spec = choice.search.spec
     found = {n: result.parameters.value(n) for n in tuned} if result.status.converged else {}
     result = replace(
         result,
         parameters=parameters.with_values(found),
-        status=result.status.with_details(choice.words).with_remedies(note),
+        status=result.status.with_details(choice.words).with_remedies(_describe_untuned(task, tuned)),
         dither=choice.verdict,
         rival=choice.rival,
-        given={n: parameters.value(n) for n in parameters.free_names},
+        given=given,
         limits=metric_limits(spec.limits),
     )
+    result = tried.record(result, adopted, loop)
     result = _interrupt(task, result, stopped) if stopped else result
     result = _prove_further(replace(task, spec=spec), result, rig, plants, search.progress, begun)
     if throw and not result.status.converged:
@@ -347,6 +354,44 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback)
     if result.status.converged and worse:
         return search, result, found.status.code is Code.INTERRUPTED
     return other, found, False
+
+
+def _warn_of_swing(task: TuningTask) -> None:
+    """Warn the caller of `tune` where the given dither moves the measured signal out of the settling band."""
+    settles = task.spec.concerns(SettlingTime)
+    swing = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band) if settles else None
+    if swing is not None:
+        warnings.warn(swing, PhysicsWarning, stacklevel=3)
+
+
+def _find(
+    task: TuningTask, method: Method | None, progress: ProgressCallback
+) -> tuple[Search, DitherChoice, bool, str]:
+    """The search, and the design that it finds, with its dither or without.
+
+    The third says whether another structure may be needed, as no design is certified or friction rules it; the fourth
+    by what it was cut short.
+    """
+    search, result, is_stopped = _search(task, method, progress)
+    rules = friction_rules(result)
+    result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
+    if result.status.code is Code.NOT_CERTIFIED:
+        result, is_stopped = confirm_refusal(search, result)
+    stopped, choice = "a second search was interrupted" if is_stopped else "", DitherChoice(search, result)
+    if not stopped:
+        try:
+            choice = weigh_dither(search, result, task.spec)
+        except KeyboardInterrupt:
+            stopped = "the search without dither was interrupted"
+    found = choice.result
+    stopped = "the search was interrupted" if found.status.code is Code.INTERRUPTED else stopped
+    return search, choice, rules or friction_rules(found) or not found.status.converged, stopped
+
+
+def _describe_untuned(task: TuningTask, tuned: Sequence[str]) -> str:
+    """Which free parameters the search has left as given, in words; empty where there are none."""
+    untuned = [n for n in task.space.names if n not in tuned]
+    return f"{', '.join(untuned)} left as given: without effect on a linear loop's average" if untuned else ""
 
 
 def _on_signal(search: Search) -> Search:
