@@ -307,8 +307,8 @@ def try_structures(search: Search, result: TuningResult, budget: float) -> Struc
         if spent + dearest > budget:
             endings[structure.name] = "not tried, which would take longer than the tuning itself"
             continue
-        search.progress(f"trying another structure: {structure.name} ({k} of {len(suiting)})")
         try:
+            search.progress(f"trying another structure: {structure.name} ({k} of {len(suiting)})")
             found, ending = _try_structure(ground, structure, before)
         except KeyboardInterrupt:
             stopped = "the trial of other structures was interrupted"
