@@ -37,7 +37,7 @@ from pneuopt.quantities.units import write_value
 from pneuopt.tuning.result import TuningResult, describe_objective
 from pneuopt.tuning.search import Search, certified_objective, end_point
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tolerances import SAME_OBJECTIVE
+from pneuopt.tuning.tolerances import EXCHANGE_SHARE, SAME_OBJECTIVE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -307,8 +307,8 @@ def try_structures(search: Search, result: TuningResult, budget: float) -> Struc
         if spent + dearest > budget:
             endings[structure.name] = "not tried, which would take longer than the tuning itself"
             continue
-        search.progress(f"trying another structure: {structure.name} ({k} of {len(suiting)})")
         try:
+            search.progress(f"trying another structure: {structure.name} ({k} of {len(suiting)})")
             found, ending = _try_structure(ground, structure, before)
         except KeyboardInterrupt:
             stopped = "the trial of other structures was interrupted"
@@ -340,7 +340,7 @@ def _try_structure(ground: Ground, structure: Structure, before: float) -> tuple
         space = Space(parameters, (*kept, *change.parameters.free_names))
         method = search.method.successor or search.method  # the first may know linear loops only
         task = replace(task, loop=change.loop, space=space, to_beat=before)
-        short = Search(task, method.shorten(method.margin), search.progress, rests=True, attempts=2)
+        short = Search(task, method.shorten(method.margin, EXCHANGE_SHARE), search.progress, rests=True, attempts=2)
         result = short.run(space.start)
     except (ConvergenceError, InputError) as error:
         return None, f"cannot be tried: {error}"

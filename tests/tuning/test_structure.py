@@ -146,6 +146,17 @@ def test_no_more_time_is_taken_than_the_tuning_took() -> None:
     assert all(ending.startswith("not tried") for ending in tried.endings.values())
 
 
+def test_an_interrupted_trial_says_so() -> None:
+    def interrupt(_text: str) -> None:
+        raise KeyboardInterrupt
+
+    loop, given = closed_valve()
+    search = prepare_search(prepare_task(loop, STEP, given, specify(**ASKED)), QUICK, interrupt)
+    tried = try_structures(search, found(structure=False), np.inf)
+    assert tried.stopped
+    assert not tried.better
+
+
 def ground(loop: ClosedLoop, reference: Reference, form: Form = Form.PARALLEL) -> Ground:
     values = {"pid.Kp": 20.0, "pid.Ki": 10.0} if form is Form.PARALLEL else {"pid.Kp": 20.0, "pid.Ti": 2.0}
     if "valve.dead_zone" in loop.parameters:
