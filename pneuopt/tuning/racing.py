@@ -529,9 +529,9 @@ class _RacingSearch:
             self._ends.append(population)
             bests = sorted([*bests, float(merits[0])])
             self.starts, self.agreeing = len(bests), sum(b <= bests[0] * (1 + SAME_OBJECTIVE) for b in bests)
-        if self._is_beaten(bests[0]):
-            self.best = self._best_first(np.array([end[0] for end in self._ends]), self._coarse)[0][0]
-            return
+            if bests[0] > self.most:
+                self.best = self._best_first(np.array([end[0] for end in self._ends]), self._coarse)[0][0]
+                return
         if len(bests) > 1 and bests[0] > 0 and bests[1] < WORST_MERIT:
             self.spread = bests[1] / bests[0] - 1
         fine = _Phase("fine samples", self._simulator, round(FINE_SHARE * trials))
@@ -544,7 +544,7 @@ class _RacingSearch:
         self._ends.append(population)
 
     def _is_beaten(self, merit: float) -> bool:
-        """Whether a merit lags too far behind what is to be beaten; one that breaks limits may still keep them."""
+        """Whether a merit lags far behind what is to be beaten; before its start ends, one may still keep limits."""
         return self.most < merit < WORST_MERIT
 
     def _next_population(self, method: Racing) -> Array:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
-from pneuopt.evaluation.dither import CRITERIA, DitherVerdict, Usefulness, judge_dither
+from pneuopt.evaluation.dither import CRITERIA, NO_RIVAL, DitherVerdict, Usefulness, judge_dither
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import ConvergenceError, InputError
@@ -66,7 +66,9 @@ def weigh_dither(search: Search, result: TuningResult, asked: Specification) -> 
     except ConvergenceError as error:
         return DitherChoice(search, result, words=f"no verdict on the dither: {error}")
     if other is None or rival is None or without is None:
-        return DitherChoice(search, result, verdict, words=f"no gains were certified without dither: {refused}")
+        words = f"no gains were certified without dither: {refused}"
+        reasons = tuple(words if reason == NO_RIVAL else reason for reason in verdict.reasons)
+        return DitherChoice(search, result, replace(verdict, reasons=reasons), words=words)
     if verdict.usefulness is Usefulness.USEFUL:
         return DitherChoice(search, result, verdict, {n: without.value(n) for n in space.names})
     left_out = {n: design.value(n) for n in space.names}

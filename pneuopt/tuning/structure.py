@@ -7,6 +7,7 @@ tuning took leaves room for the dearest so far.
 """
 
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -29,7 +30,7 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.evaluate import respond
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ConvergenceError, InputError, require
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
@@ -64,8 +65,10 @@ class Ground:
 
     @cached_property
     def responses(self) -> tuple[Trajectory, ...]:
-        """To each reference, on the nominal plant."""
-        return tuple(respond(self.loop, r, self.parameters) for r in self.search.task.references)
+        """To each reference, on the nominal plant; what they run into refused the design already."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PhysicsWarning)
+            return tuple(respond(self.loop, r, self.parameters) for r in self.search.task.references)
 
     @property
     def is_position(self) -> bool:

