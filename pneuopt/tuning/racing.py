@@ -543,10 +543,6 @@ class _RacingSearch:
             population = self._polish(population, merits, fine.simulator, method.polish)[0]
         self._ends.append(population)
 
-    def _is_beaten(self, merit: float) -> bool:
-        """Whether a merit lags far behind what is to be beaten; before its start ends, one may still keep limits."""
-        return self.most < merit < WORST_MERIT
-
     def _next_population(self, method: Racing) -> Array:
         """The population of the next start: the given gains among designs of each kind; then others.
 
@@ -607,10 +603,6 @@ class _RacingSearch:
             if self._ends and merits[0] > LAGGING * self._wide:
                 return self._best_first(population, simulator)
             self._wide = self._wide if self._ends else float(merits[0])
-            if self.most < np.inf:
-                population, merits = self._best_first(population, simulator)
-                if self._is_beaten(merits[0]):
-                    return population, merits
         left = round((1 - sum(BAND_SHARES[: len(stages)])) * trials)
         phase = _Phase("coarse samples", simulator.coarse(spec), left, best * (1 + SAME_OBJECTIVE))
         population, merits = self.evolve(population, phase)

@@ -43,11 +43,6 @@ def weigh_dither(search: Search, result: TuningResult, asked: Specification) -> 
     by_name = search.spec.concerns(SettlingTime) and search.spec.settling is SettlingTime
     if not result.status.converged or DITHER_AMPLITUDE not in space.names or by_name:
         return DitherChoice(search, result)
-    if design.value(DITHER_AMPLITUDE) == 0:  # the signal is its own mean, and told as such
-        plain = search.with_specification(asked, search.method)
-        same = plain.certify_point(end_point(result, space), agreement=result.agreement)
-        told = replace(same, stats={**result.stats, **same.stats}, finalists=result.finalists)
-        return DitherChoice(plain, told) if told.status.converged else DitherChoice(search, result)
     if space.parameters[DITHER_AMPLITUDE].lower > 0:
         return DitherChoice(search, result)
     other = rival_search(search, result, asked)
@@ -61,6 +56,8 @@ def weigh_dither(search: Search, result: TuningResult, asked: Specification) -> 
     if rival is not None and rival.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     without = rival.parameters if rival is not None and rival.status.converged else None
+    if design.value(DITHER_AMPLITUDE) == 0:
+        return _choose_undithered(search, result, asked, other, rival)
     try:
         verdict = judge_dither(task.loop, task.references, design, without=without, band=task.spec.band)
     except ConvergenceError as error:
@@ -75,18 +72,31 @@ def weigh_dither(search: Search, result: TuningResult, asked: Specification) -> 
     return DitherChoice(other, rival, verdict, left_out, f"left out: {str(verdict).splitlines()[0]}")
 
 
-def rival_search(search: Search, result: TuningResult, asked: Specification) -> Search | None:
-    """The search without dither, which begins at the dithered gains; None where no gain beside the dither is free.
+def _choose_undithered(
+    search: Search, result: TuningResult, asked: Specification, other: Search | None, rival: TuningResult | None
+) -> DitherChoice:
+    """The better of two designs without dither; the first, whose signal is its own mean, as `asked` tells it."""
+    plain = search.with_specification(asked, search.method)
+    same = plain.certify_point(end_point(result, search.space), agreement=result.agreement)
+    told = replace(same, stats={**result.stats, **same.stats}, finalists=result.finalists)
+    choice = DitherChoice(plain, told) if told.status.converged else DitherChoice(search, result)
+    if other is None or rival is None or not rival.status.converged:
+        return choice
+    before, after = (certified_objective(s.spec, r) for s, r in ((choice.search, choice.result), (other, rival)))
+    return DitherChoice(other, rival) if after < before else choice
 
-    It is given up where it lags so far behind that no verdict could prefer it.
+
+def rival_search(search: Search, result: TuningResult, asked: Specification) -> Search | None:
+    """The search without dither, from the gains that were given; None where no gain beside the dither is free.
+
+    A start at the dithered gains would favour the dither. It is given up where its first start ends so far behind that
+    no verdict could prefer it.
     """
     names = tuple(n for n in search.space.names if n not in (DITHER_AMPLITUDE, DITHER_FREQUENCY))
     if not names:
         return None
     search.progress("tuning without dither")
-    plain = switch_off_dither(search.space.parameters).with_values(
-        dict(zip(search.space.names, end_point(result, search.space).tolist(), strict=True)) | {DITHER_AMPLITUDE: 0.0}
-    )
+    plain = switch_off_dither(search.space.parameters)
     to_beat = certified_objective(search.spec, result) * (1 + CRITERIA["SettlingTimeRaw"].relative)
     task = replace(search.task, space=Space(plain, names), spec=asked, to_beat=to_beat)
     return Search(task, search.method, search.progress)

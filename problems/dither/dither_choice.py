@@ -106,9 +106,10 @@ def main(choices: dict[int, tuple[Rig, Choice]]) -> "pd.DataFrame":
     claims = []
     for seed, (rig, found) in choices.items():
         own, other = settles(rig, found.best), settles(rig, found.rival)
+        within = f"<= {rig.step.horizon:g}"
         useful = {"USEFUL"} if found.rival.status.converged else {"USEFUL", "HELPS_THESE_GAINS"}
         is_useful = found.verdict is None or found.verdict.usefulness.name in useful
-        claims.append(Claim(f"rig{seed}.settles", own, "s", other if math.isfinite(other) else None, ""))
+        claims.append(Claim(f"rig{seed}.settles", own, "s", other if math.isfinite(other) else None, within))
         claims.append(Claim(f"rig{seed}.no_worse", int(own <= LATER * other), "1", None, ">= 1"))
         claims.append(Claim(f"rig{seed}.useful", int(is_useful), "1", None, ">= 1"))
         claims.append(Claim(f"rig{seed}.seconds", found.seconds, "s", None, "<= 120"))
