@@ -98,7 +98,7 @@ def settles(rig: Rig, found: po.TuningResult) -> float:
     """The settling time of the signal with its ripple [s]; inf without a certified design."""
     if not found.status.converged:
         return math.inf
-    value = float(po.evaluate(rig.loop, rig.step, found.parameters).loc["SettlingTimeRaw"].iloc[0])
+    value = float(po.evaluate(rig.loop, rig.step, found.parameters).loc["SettlingTimeRaw"].to_numpy(dtype=float)[0])
     return value if math.isfinite(value) else math.inf
 
 

@@ -19,7 +19,7 @@ import time
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `problems`
 
@@ -72,9 +72,9 @@ class Plant:
 
 
 def _lags(*constants: float) -> tuple[float, ...]:
-    found = np.ones(1)
+    found: Array = np.ones(1)
     for constant in constants:
-        found = np.polymul(found, [constant, 1.0])
+        found = np.asarray(np.polymul(found, [constant, 1.0]), dtype=float)
     return tuple(found.tolist())
 
 
@@ -114,7 +114,7 @@ class OwnLoop:
     def _fourier(self) -> tuple[Array, NDArray[np.complex128]]:
         """The frequencies of the transform but zero, and P there."""
         record = RECORDS * PERIODS / self.plant.ultimate[0]
-        w = 2 * np.pi / record * np.arange(1, SAMPLES // 2 + 1)
+        w: Array = np.asarray(2 * np.pi / record * np.arange(1, SAMPLES // 2 + 1), dtype=float)
         return w, self.plant.response(w)
 
     def controller(self, gains: Array, w: Array) -> NDArray[np.complex128]:
@@ -163,14 +163,17 @@ class OwnLoop:
             z = np.log(centre) + rng.normal(0.0, 0.7, len(centre))
             while not np.isfinite(self.peaks(np.exp(z))[0]):
                 z[:2] += (-0.3, 0.1)
-            found = minimize(
-                lambda z: np.log(self.iae(np.exp(z))),
-                z,
-                method="SLSQP",
-                constraints={"type": "ineq", "fun": lambda z: most - np.minimum(self.peaks(np.exp(z)), 10.0)},
-                bounds=[(v - 4, v + 4) for v in np.log(centre)],
-                options={"maxiter": 80, "ftol": 1e-9},
-            )
+            options: Any = {
+                "method": "SLSQP",
+                "constraints": {"type": "ineq", "fun": lambda z: most - np.minimum(self.peaks(np.exp(z)), 10.0)},
+                "bounds": [(v - 4, v + 4) for v in np.log(centre)],
+                "options": {"maxiter": 80, "ftol": 1e-9},
+            }
+
+            def cost(z: Array) -> float:
+                return float(np.log(self.iae(np.exp(z))))
+
+            found = minimize(cost, z, **options)
             gains = np.exp(found.x)
             value = self.iae(gains)
             if max(self.peaks(gains)) <= most * (1 + 1e-6) and value < least:

@@ -494,8 +494,8 @@ def _write_counted(path: Path, *, step: float, noise: float = 0.0, speed: bool =
 
 def test_a_loop_sees_its_speed_through_the_encoder_that_the_log_shows(tmp_path: Path) -> None:
     """One count of 20 um; where the position is noisy, or the speed was logged, no encoder is assumed."""
-    for name, given in (("counted", {"step": 0.02}), ("noisy", {"step": 0.0, "noise": 0.05})):
-        _write_counted(tmp_path / f"{name}.csv", **given)
+    _write_counted(tmp_path / "counted.csv", step=0.02)
+    _write_counted(tmp_path / "noisy.csv", step=0.0, noise=0.05)
     _write_counted(tmp_path / "tacho.csv", step=0.02, speed=True)
     for name in ("counted", "noisy", "tacho"):
         code, output = run("init", "force", "--from", str(tmp_path / f"{name}.csv"), "-o", str(tmp_path / name))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,8 @@ from pneuopt.tuning.structure import STRUCTURES, Ground, try_structures
 from pneuopt.tuning.tune import certify, prepare_search, prepare_task, tune
 
 QUICK = Racing(members=8, trials=40)
-STEP, ASKED = Step(0.1, initial=0.05, horizon=1.2), {"minimise": SettlingTime(0.02), "subject_to": [Overshoot(0.05)]}
+STEP = Step(0.1, initial=0.05, horizon=1.2)
+ASKED: dict[str, Any] = {"minimise": SettlingTime(0.02), "subject_to": [Overshoot(0.05)]}
 DRIVE = """
 [drive]
 kind = "pneumatic"
@@ -91,13 +93,14 @@ def test_the_proposed_design_is_certified_by_itself() -> None:
     """The row's gains in a loop that a user builds hold; without the inverse the same gains do not."""
     table, (loop, given) = found(structure=False).structures, closed_valve()
     assert table is not None
-    row = table.loc["dead-zone inverse"]
-    plain = given.with_values({"pid.Kp": float(row["pid.Kp"])})
+    plain = given.with_values({"pid.Kp": table["pid.Kp"].to_dict()["dead-zone inverse"]})
     inverse = replace(loop, compensators=(DeadZoneInverse(),))
     full = (inverse.parameters | plain).with_values({"dead_zone_inverse.width": 0.1 * given.value("valve.span")})
     proof = certify(inverse, STEP, full, **ASKED, plants={})
     assert proof.status.converged
-    assert proof.certified.loc["SettlingTime"].max() == pytest.approx(row["objective"], rel=1e-6)
+    assert proof.certified.loc["SettlingTime"].max() == pytest.approx(
+        table["objective"].to_dict()["dead-zone inverse"], rel=1e-6
+    )
     assert not certify(loop, STEP, plain, **ASKED, plants={}, throw=False).status.converged
 
 
@@ -120,7 +123,7 @@ def test_a_tuned_file_has_the_adopted_structure(tmp_path: Path) -> None:
     stored = read_fit(drive)
     task = read_tuning(tuning, stored.drive.system(), stored.parameters)
     given = stored.parameters | task.parameters
-    own = {"minimise": task.specification, "plants": {}, "throw": False}
+    own: dict[str, Any] = {"minimise": task.specification, "plants": {}, "throw": False}
     best = tune(task.loop, task.references, given, **own, method=QUICK, structure=True)
     assert best.structure
     write_tuned(tuned, tuning, best, fit=stored)
@@ -170,7 +173,7 @@ def ground(loop: ClosedLoop, reference: Reference, form: Form = Form.PARALLEL) -
 STEPS_TO, MOVES_TO = STEP, Move(0.05, speed=0.2, acceleration=2.0, initial=0.05)
 PNEUMATIC, FORCE, LINEAR = PneumaticDrive().system(), ForceDrive(Stribeck()).system(), FirstOrder().system()
 POSITION_PARTS = {"dead-zone inverse", "no integral", "reset integral", "pressure feedback", "acceleration feedback"}
-SETTINGS = {
+SETTINGS: dict[str, tuple[Any, ...]] = {
     "position, valve": (PNEUMATIC, "position", PID(sample_time=2e-3), STEPS_TO, POSITION_PARTS),
     "moves, valve": (PNEUMATIC, "position", PID(sample_time=2e-3), MOVES_TO, {*POSITION_PARTS, "friction feedforward"}),
     "position, continuous": (FORCE, "position", PID(), STEPS_TO, {"no integral"}),
